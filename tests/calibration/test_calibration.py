@@ -3,8 +3,6 @@
 import copy
 import pickle
 import re
-import stat
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -102,20 +100,6 @@ def test_every_element_is_its_matrix_times_raw_less_tare() -> None:
     spec = calibration.output_spec(gauge_spec())
     assert (spec.channels, spec.units) == (AXES, LOADS)
     assert spec.positions == gauge_spec().positions
-
-
-def test_eight_gauges_make_six_loads() -> None:
-    matrix = np.random.default_rng(2).normal(size=(6, 8))
-    gauges = tuple(f"g{i}" for i in range(8))
-    calibration = Calibration(
-        "d", ("A0",), gauges, ("1",) * 8, AXES, LOADS, matrices={"A0": rows(matrix)}
-    )
-    raw = np.random.default_rng(3).normal(size=(4, 1, 8))
-    assert calibration.apply(chunk_of(raw)).values.shape == (4, 1, 6)
-    np.testing.assert_allclose(
-        calibration.apply(chunk_of(raw)).values[:, 0], raw[:, 0] @ matrix.T, rtol=1e-5
-    )
-    assert calibration.output_spec(gauge_spec(1, gauges)).shape == (1, 6)
 
 
 def test_a_gain_is_a_diagonal_matrix() -> None:
@@ -275,18 +259,6 @@ def test_the_mirror_image_of_the_mirror_image_is_the_array(mirror, position, ori
     assert np.array_equal(once.apply(once.apply(chunk)).values, chunk.values)
 
 
-def test_a_whisker_s_mirror_image_by_hand() -> None:
-    """x along it, y towards its concave side: fx, fy, mz stay, fz, mx, my turn round."""
-    spec = posed((0.003, 0.002, 0.001), (1.0, 0.0, 0.0, 0.0))
-    calibration = replace(Calibration.of("d", spec), mirror=Mirror())
-    made = calibration.apply(chunk_of(np.array([[[1, 2, 3, 4, 5, 6]]])))
-    assert made.values.tolist() == [[[1, 2, -3, -4, -5, 6]]]
-    image = calibration.output_spec(spec)
-    assert image.positions == ((-0.003, 0.002, 0.001),)
-    # x to the other side, y as before, z downwards: half a turn about y
-    assert image.orientations == ((0.0, 0.0, 1.0, 0.0),)
-
-
 def test_a_simulated_left_array_becomes_the_right_one() -> None:
     pytest.importorskip("mujoco")
     pytest.importorskip("trimesh")
@@ -306,20 +278,15 @@ def test_a_simulated_left_array_becomes_the_right_one() -> None:
     [
         ("fz", "N", -1), ("fx", "N", 1), ("z", "m", -1), ("acc_z", "m/s^2", -1),
         ("mz", "N m", 1), ("bx", "T", -1), ("bz1", "T", 1), ("gyro.y", "rad/s", -1),
-        ("temperature", "K", 1), ("index", "Pa", 1),
+        ("temperature", "K", 1), ("index", "Pa", 1), ("vx", "V", 1),
     ],
 )  # fmt: skip
 def test_vectors_and_pseudovectors_are_told_by_name_and_unit(channel, unit, sign):
     assert Mirror().sign(channel, unit) == sign
 
 
-@pytest.mark.parametrize(
-    ("channel", "unit"), [("theta", "rad"), ("x", "1"), ("s0", "1"), ("grip", "N"), ("vx", "V")]
-)
+@pytest.mark.parametrize(("channel", "unit"), [("theta", "rad"), ("x", "1"), ("grip", "N")])
 def test_what_name_and_unit_do_not_tell_must_be_said(channel: str, unit: str) -> None:
-    if unit == "V":
-        assert Mirror().sign(channel, unit) == 1
-        return
     with pytest.raises(ConfigError, match=f"mirror.signs.{channel} to 1 or -1"):
         Mirror().sign(channel, unit)
     spec = replace(small_spec(), channels=("fy", channel), units=("N", unit))
@@ -381,11 +348,6 @@ def test_a_calibrated_source_passes_on_silence_and_may_be_copied() -> None:
     assert not simple.live, "what waits for its reader still does"
 
 
-def test_a_calibration_of_another_array_makes_no_source() -> None:
-    with pytest.raises(SpecMismatch):
-        CalibratedSource(ArraySource(small_spec(2), []), Calibration.of("d", small_spec(3)))
-
-
 # ---- impossible calibrations
 
 
@@ -393,23 +355,17 @@ def test_a_calibration_of_another_array_makes_no_source() -> None:
     ("changes", "what"),
     [
         ({"device": "../../etc/passwd"}, "device id '../../etc/passwd'"),
-        ({"device": ".hidden"}, "device id"),
-        ({"device": ""}, "device id ''"),
         ({"units": ("N",)}, "raw.units has 1 values for 2 raw channels"),
         ({"elements": ("A0", "A0", "A2")}, "raw.elements"),
         ({"output_channels": ("a", "a")}, "output.channels"),
         ({"output_channels": AXES}, "output.units has 2 values for 6 output channels"),
         ({"gain": (1.0,)}, "gain has 1 values for 2 raw channels"),
-        ({"gain": (1.0, np.nan)}, "gain must be finite"),
         ({"gain": (1.0, 1.0), "output_channels": AXES, "output_units": LOADS}, "give every elem"),
         ({"tare": {"A0": (1.0,)}}, "tare.A0 has 1 values for 2 raw channels"),
         ({"tare": {"a0": (1.0, 1.0)}}, "tare.a0: no raw element 'a0'; did you mean A0"),
         ({"tare": {"A0": (1.0, np.inf)}}, "tare.A0 must be finite"),
-        ({"noise": {"Z": (1.0, 1.0)}}, "noise.Z: no raw element 'Z'; there are A0, A1, A2"),
         ({"matrices": {"A1": ((1.0, 0.0),)}}, "matrix.A1 has 1 rows for 2 output channels"),
         ({"matrices": {"A1": ((1.0, 0.0), (1.0,))}}, "matrix.A1, row mz has 1 values for 2 raw"),
-        ({"matrices": {"A1": ((1.0, 0.0), (np.nan, 1.0))}}, "matrix.A1, row mz must be finite"),
-        ({"mapping": {"C2": "A3"}}, "mapping.C2: no raw element 'A3'"),
         ({"mapping": {"C2": "A1", "C1": "A1"}}, "mapping: one raw element is mapped twice"),
         ({"mirror": Mirror(signs={"my": 1})}, "mirror.signs.my: no output channel 'my'"),
     ],
@@ -472,18 +428,6 @@ def test_any_names_and_numbers_survive_a_file(tmp_path_factory, data) -> None:
     assert load_calibration(path) == calibration
 
 
-def test_a_file_explains_itself(tmp_path) -> None:
-    rng = np.random.default_rng(8)
-    path = save_calibration(whole_calibration(rng), tmp_path / "a.toml")
-    text = path.read_text()
-    assert text.startswith("# Calibration of the tactile sensor bench-7")
-    assert "output = matrix @ (raw - tare)" in text
-    assert "# columns: s0, s1, s2, s3, s4, s5" in text
-    assert ",  # mz, N m" in text
-    assert tomllib.loads(text)["version"] == 1
-    assert stat.S_IMODE(path.stat().st_mode) == 0o644
-
-
 def test_without_a_configured_folder_it_is_the_home_s(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     for unset in ("", "relative/folder"):
@@ -527,22 +471,13 @@ A1 = [[1.0, 0.0], [0.1, 1.0]]
     ("old", "new", "what"),
     [
         ("version = 1", "version = 2", "is a calibration of version 2; this release reads 1"),
-        ("version = 1", "", "is a calibration of version None"),
         ("version = 1", "version = ", ":2: not TOML: Invalid value"),
-        ("[tare]", "[taré]", "not TOML: "),
         ("[tare]", "[tarre]", "the file has no key 'tarre'; did you mean tare?"),
-        ("units =", "unit =", "raw has no key 'unit'; did you mean units?"),
-        ("units = [", "# units = [", "raw: needs a key 'units'"),
         ('device = "d"', "", "needs a key 'device'"),
         ('device = "d"', "device = 7", "device: expected text, got 7"),
         ("[1, 2.5]", "[1, 2.5, 3]", "tare.A0 has 3 values for 2 raw channels"),
         ("[1, 2.5]", '[1, "2,5"]', "tare.A0[1]: expected a number, got '2,5'"),
-        ("[1, 2.5]", "[1, nan]", "tare.A0[1]: nan is no quantity"),
-        ("A0 = [1, 2.5]", "A2 = [1, 2.5]", "tare.A2: no raw element 'A2'"),
-        ("[[1.0, 0.0], [0.1, 1.0]]", "[1.0, 0.0]", "matrix.A1[0]: expected a list, got 1.0"),
-        ("[[1.0, 0.0], [0.1, 1.0]]", "[[1.0, 0.0]]", "matrix.A1 has 1 rows for 2 output chann"),
         ("[tare]", '[mirror]\naxis = "w"\n[tare]', "mirror.axis is x, y or z, not 'w'"),
-        ("[tare]", "[mirror]\nside = 1\n[tare]", "mirror has no key 'side'; there are axis, el"),
     ],
 )
 def test_a_bad_file_is_one_line_that_names_it(tmp_path, old: str, new: str, what: str) -> None:
@@ -626,26 +561,15 @@ def pushed(rng: np.random.Generator, kind: str) -> np.ndarray:
     return values
 
 
-@pytest.mark.parametrize("kind", ["tap", "touch", "let go", "press"])
-def test_a_touched_array_is_refused(kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [(kind, "is being touched: s4 moved by") for kind in ("tap", "touch", "let go", "press")]
+    + [(kind, "drifts: s4 went by") for kind in ("drift", "slow drift")],
+)
+def test_a_touched_or_drifting_array_is_refused(kind: str, said: str) -> None:
     with pytest.raises(ConfigError) as caught:
         tare(source_of(pushed(np.random.default_rng(11), kind)), 5.0)
-    assert "gauges: element A2 is being touched: s4 moved by" in said(caught)
-
-
-@pytest.mark.parametrize("kind", ["drift", "slow drift"])
-def test_a_drifting_array_is_refused(kind: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        tare(source_of(pushed(np.random.default_rng(12), kind)), 5.0)
-    assert "gauges: element A2 drifts: s4 went by" in said(caught)
-    assert "let the sensor warm up" in said(caught)
-
-
-def test_several_troubles_are_counted() -> None:
-    values = quiet(np.random.default_rng(13))
-    values[1000:, 1:] += 500
-    with pytest.raises(ConfigError, match=r"element A1 is being touched.*\(and 2 more elements\)"):
-        tare(source_of(values), 5.0)
+    assert f"gauges: element A2 {said}" in str(caught.value)
 
 
 def test_a_dead_element_is_left_out() -> None:
@@ -753,13 +677,11 @@ def test_a_slip_of_the_pen_is_the_worst_point() -> None:
 
 def test_an_axis_never_loaded_is_named() -> None:
     raw, loads, _, _ = bench(np.random.default_rng(22), noise=10.0)
-    only, _, _, _ = bench(np.random.default_rng(22))
     loads[:, 4] = 0.0
     fit = calibrate(raw, loads)
     assert any(w.startswith("my is never loaded") for w in fit.warnings)
     assert (fit.matrix[4] == 0).all()
     assert fit.load_condition == np.inf
-    assert only.shape == raw.shape
 
 
 def test_a_weight_always_at_the_same_lever_is_named() -> None:
@@ -775,14 +697,13 @@ def test_a_weight_always_at_the_same_lever_is_named() -> None:
     assert fit.load_condition > 1e6
 
 
-def test_few_loads_are_doubted() -> None:
-    raw, loads, _, _ = bench(np.random.default_rng(24), n=8)
-    assert any("8 loads are few" in w for w in calibrate(raw, loads).warnings)
-
-
-def test_more_axes_than_channels_are_doubted() -> None:
-    raw, loads, _, _ = bench(np.random.default_rng(25))
-    assert any("6 axes cannot be told" in w for w in calibrate(raw[:, :2], loads).warnings)
+@pytest.mark.parametrize(
+    ("loads_made", "channels", "said"),
+    [(8, 6, "8 loads are few"), (60, 2, "6 axes cannot be told")],
+)
+def test_a_fit_of_too_little_is_doubted(loads_made: int, channels: int, said: str) -> None:
+    raw, loads, _, _ = bench(np.random.default_rng(24), n=loads_made)
+    assert any(said in w for w in calibrate(raw[:, :channels], loads).warnings)
 
 
 @pytest.mark.parametrize(
@@ -846,9 +767,7 @@ def test_a_table_of_times_takes_medians_of_valid_samples(tmp_path) -> None:
         ("", "is empty; its first line names the columns"),
         ("raw_a,fy\n", "needs a line of column names"),
         ("raw_a;fy\n1;2\n", "separated by semicolons; use commas"),
-        ("raw_a,raw_fx,FY\n1,2,3\n", ":1: no column 'FY'; did you mean fy?"),
         ("raw_a,weight\n1,2\n", "no column 'weight'; there are fx, fy"),
-        ("raw_,fy\n1,2\n", "no column 'raw_'; did you mean raw_m"),
         ("raw_a,fy,fy\n1,2,3\n", "column 'fy' is there twice"),
         ("raw_a\n1\n", "no load; add columns of fx"),
         ("fy\n1\n", "needs readings (raw_CHANNEL) or times"),
@@ -857,7 +776,6 @@ def test_a_table_of_times_takes_medians_of_valid_samples(tmp_path) -> None:
         ("start_s,end_s,fy\n2,1,2\n", "loads.csv:2: start_s must be 0 or more and before end_s"),
         ("raw_a,fy\n1,2\n1\n", "loads.csv:3: 1 values for 2 columns"),
         ("raw_a,fy\n1,2 N\n", "loads.csv:2: fy: expected a number, got '2 N'"),
-        ("raw_a,fy\n1,\n", "loads.csv:2: fy: expected a number, got ''"),
         ("raw_a,fy\nnan,1\n", "loads.csv:2: raw_a: nan is no quantity"),
     ],
 )

@@ -64,13 +64,6 @@ def test_what_is_not_asked_for_need_be_no_number() -> None:
     assert (got[valid] == 1).all()
 
 
-def test_an_element_that_is_not_valid_stays_so() -> None:
-    (chunk,) = cut(np.zeros((2, 3, 4)), 1000.0)
-    chunk.valid[1, 2] = False
-    _, valid = streamed(declare(ArraySource(device(), [chunk]), ROBOT))
-    assert valid.tolist() == [[True] * 3, [True, True, False]]
-
-
 def test_elements_of_the_same_names_are_not_mixed_up() -> None:
     """A device that names its elements as the array does is believed, whatever the order."""
     array = replace(ROBOT, elements=("A2", "A0", "A1"))

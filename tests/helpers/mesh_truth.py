@@ -9,6 +9,8 @@ from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from tactile_rt.sim_backend.objects.catalogue import TactileObject
+
 Floats = NDArray[np.float64]
 
 TOGETHER = 64  # triangles
@@ -136,3 +138,11 @@ def sampled(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> tuple[f
         if near.any():
             away[near] = np.minimum(away[near], to_triangles(out[near], piece.triangles))
     return float(beyond.max()), float(away.max(initial=0.0)), float(depths.max())
+
+
+def inside(thing: TactileObject, point: tuple[float, float, float]) -> bool:
+    """Whether the point is in any of the convex pieces: behind all faces of one."""
+    return any(
+        bool((((point - p.triangles[:, 0]) * p.face_normals).sum(axis=1) <= 1e-9).all())
+        for p in thing.pieces
+    )

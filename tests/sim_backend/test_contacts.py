@@ -163,8 +163,3 @@ def test_damaged_contacts_are_told(made: Path, tmp_path: Path) -> None:
     np.savez(tmp_path / "mug-1.npz", **kept)
     with pytest.raises(RecordingError, match=r"mug-1\.npz is damaged"):
         read_sweeps(tmp_path, "validation")
-
-
-def test_a_recipe_says_true_or_false() -> None:
-    with pytest.raises(ConfigError, match="contacts: expected true or false, got 1"):
-        recipe_from_dict({"contacts": 1}, "mine.toml")

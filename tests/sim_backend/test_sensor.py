@@ -463,11 +463,8 @@ def test_dropped_samples_leave_gaps_and_are_counted() -> None:
     ("given", "said"),
     [
         ({"noise_force": -1e-6}, "noise_force must be 0 or more, not -1e-06"),
-        ({"latency_ms": float("nan")}, "latency_ms must be 0 or more, not nan"),
-        ({"bias_moment": float("inf")}, "bias_moment must be at most 1e[+]06, not inf"),
         ({"jitter_ms": 1e300}, "jitter_ms must be at most 1e[+]06, not 1e[+]300"),
         ({"crosstalk_elements": 1.5}, "crosstalk_elements must lie between 0 and 1, not 1.5"),
-        ({"dead_probability": 2}, "dead_probability must lie between 0 and 1, not 2"),
         ({"drop_probability": 1}, "drop_probability must be less than 1, not 1"),
         ({"drift_time_s": 0}, "drift_time_s must be more than 0"),
     ],

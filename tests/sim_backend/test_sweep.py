@@ -216,18 +216,6 @@ def test_what_is_left_out_changes_no_load() -> None:
     np.testing.assert_allclose(loads, wanted, atol=1e-6 * np.abs(wanted).max())
 
 
-def test_a_mirrored_sweep_gives_mirrored_loads() -> None:
-    """A block is its own mirror image in the plane of motion."""
-    sweep = Sweep(gap_mm=0.3)
-    left = load_array("mouse-left")
-    right_loads = SweepSimulation(ALL, block(), sweep, REALTIME).advance(150)
-    left_loads = SweepSimulation(left, block(), sweep, REALTIME).advance(150)
-    signs = np.array([1, 1, -1, -1, -1, 1])  # fx fy mz are kept, see `arrays.mirrored`
-    assert np.abs(right_loads).max() > 1e-5
-    scale = np.abs(right_loads).max(axis=(0, 1))
-    np.testing.assert_allclose(left_loads * signs / scale, right_loads / scale, atol=2e-2)
-
-
 def test_animals_share_a_world() -> None:
     """Two mice one above the other: the lower meets the block as it does when alone."""
     above = replace(ALL.mount, position=(-6.934, -11.642, 60.0))

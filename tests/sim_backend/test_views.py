@@ -28,7 +28,7 @@ from tactile_rt.sim_backend.views.film import (
     write_video,
 )
 from tactile_rt.sim_backend.views.footage import VIEWS, Camera, Footage, framing, record
-from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign, round_number
+from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
 from tactile_rt.stream import ArraySpec
@@ -218,11 +218,6 @@ def test_states_are_those_at_the_end_of_their_frames(footage):
     simulation.show(wanted)
     np.testing.assert_array_equal(data.qpos, wanted.qpos)
     np.testing.assert_array_equal(data.mocap_pos, wanted.mocap_pos)
-
-
-@pytest.mark.parametrize(("value", "round_"), [(0.16, 0.2), (13, 10), (0.004, 0.005), (0, 1)])
-def test_scales_are_in_round_numbers(value, round_):
-    assert round_number(value) == pytest.approx(round_)
 
 
 def test_a_scale_fits_the_forces_but_not_a_rare_snap():

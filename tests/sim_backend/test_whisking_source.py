@@ -19,14 +19,12 @@ from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.whisking_drive import LAG_S, LARGEST_RAD, MOST, Drive, Whisking
 from tactile_rt.sim_backend.whisking_source import WhiskingOptions, WhiskingSource
-from tactile_rt.sim_backend.world import PROFILES, array_spec
+from tactile_rt.sim_backend.world import array_spec
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, EndOfStream, Source, concatenate
 from tactile_rt.testing import FakeCan, FakeSerial
 from tests.helpers.waiting import until
 
-REALTIME = PROFILES["realtime"]
-FEW = tuple(w for w in mouse_whiskers() if w.name in ("A1", "C2", "E3"))
 ROBOT = Path(__file__).parents[2] / "docs" / "arrays" / "robot.csv"
 Commands = list[tuple[float, Whisking]]
 
@@ -156,12 +154,9 @@ def test_the_past_stays_as_it_was() -> None:
     ("asked", "said"),
     [
         ((31.0, 0.1, 0.0), "frequency must be 0 to 30 Hz, not 31"),
-        ((-1.0, 0.1, 0.0), "frequency must be 0 to 30 Hz, not -1"),
         ((math.nan, 0.1, 0.0), "frequency must be 0 to 30 Hz, not nan"),
         ((8.0, -0.1, 0.0), "amplitude must be 0 to 1.05 rad"),
-        ((8.0, 1.2, 0.0), "amplitude must be 0 to 1.05 rad"),
         ((8.0, 0.6, 0.6), "an offset of 0.6 rad with an amplitude of 0.6 leaves the range"),
-        ((8.0, 0.6, math.nan), "leaves the range"),
         ((25.0, 0.9, 0.0), "accelerate by 22207 rad/s^2, more than 10000: whisk at 16.7 Hz"),
     ],
 )
@@ -169,9 +164,6 @@ def test_what_is_out_of_range_is_refused(asked: tuple[float, float, float], said
     with pytest.raises(ConfigError) as refused:
         Whisking(*asked)
     assert said in str(refused.value)
-
-
-# ---- in MuJoCo
 
 
 # ---- the source
@@ -266,16 +258,6 @@ def test_it_has_an_end_if_asked() -> None:
         source.read()
 
 
-def test_a_left_side_protracts_rostrally_too() -> None:
-    """The same angles, and loads that are the mirror image."""
-    left, right = (
-        WhiskingSource(f"mouse-{side}", WhiskingOptions(pace="fast")) for side in ("left", "right")
-    )
-    a, b = (concatenate([s.read() for _ in range(8)]).values for s in (left, right))
-    np.testing.assert_array_equal(a[..., 6], b[..., 6])
-    np.testing.assert_allclose(np.abs(a[..., :6]), np.abs(b[..., :6]), atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("url", "said"),
     [
@@ -284,12 +266,8 @@ def test_a_left_side_protracts_rostrally_too() -> None:
         ("whisking:mouse?amplitude_deg=50&offset_deg=30", "leaves the range of 1.05 rad"),
         ("whisking:mouse?object=mugg", "no object called 'mugg'"),
         ("whisking:mouse?position_mm=1,2", "position_mm is three numbers x,y,z"),
-        ("whisking:mouse?position_mm=1,2,nan", "position_mm is three numbers x,y,z"),
         ("whisking:mouse?size_mm=0", "size_mm must be above 0"),
         ("whisking:mouse?object=mug-1&position_mm=6,4,0", "inside the object: move it away"),
-        ("whisking:mouse?pace=slow", "no pace 'slow': there are realtime, fast"),
-        ("whisking:mouse?noise_force=-1", "noise_force must be 0 or more"),
-        ("whisking:mouse?seconds=-1", "seconds must be 0 or more"),
         ("whisking:mouse?amplitude=3", "has no option 'amplitude'; did you mean amplitude_deg?"),
     ],
 )

@@ -27,8 +27,6 @@ from tactile_rt.sim_backend.world import (
     add_whiskers,
     array_spec,
     empty_world,
-    engine_of,
-    quaternion,
     read_base_loads,
     set_damping,
 )
@@ -147,23 +145,6 @@ def test_the_spec_describes_the_array_in_si() -> None:
     turned = Rotation.from_quat([x, y, z, w]).as_matrix()
     np.testing.assert_allclose(turned, whiskers[c2].orientation, atol=1e-8)
     assert spec == array_spec(mouse_whiskers(), "mouse-right")
-
-
-def test_a_quaternion_has_one_sign() -> None:
-    turn = Rotation.from_rotvec([0.0, 0.0, 3.5])  # beyond half a turn: w would be negative
-    w, x, y, z = quaternion(turn.as_matrix())
-    assert w >= 0
-    np.testing.assert_allclose(
-        Rotation.from_quat([x, y, z, w]).as_matrix(), turn.as_matrix(), atol=1e-8
-    )
-
-
-@pytest.mark.parametrize("name", PROFILES)
-def test_a_profile_is_usable(name: str) -> None:
-    profile = PROFILES[name]
-    steps = 1.0 / profile.timestep_ms
-    assert steps == pytest.approx(round(steps)), "the step divides the output's millisecond"
-    assert profile.links >= 7 and engine_of(profile) == profile.engine
 
 
 def test_a_chain_lies_on_its_whisker() -> None:

@@ -1,6 +1,5 @@
 """The soak itself, for a moment, with faults that leave nothing out; and what it reckons with."""
 
-import itertools
 import resource
 
 import numpy as np
@@ -14,7 +13,7 @@ from bench.daemon.latencies import latencies
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import soak
-from bench.emulated import KINDS, Played, fault_beat
+from bench.emulated import KINDS, Played
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.config import RecorderConfig
@@ -162,13 +161,6 @@ def test_a_latency_begins_with_the_write_of_the_sample_that_completes_the_step()
     assert found.quiet.tolist() == [1, 2, 5]  # not what came before all had begun
     assert found.faulty.tolist() == [4]
     assert {k: v.tolist() for k, v in found.kinds.items()} == {"drop": [4.0]}
-
-
-def test_faults_come_one_after_the_other_and_leave_the_end_alone():
-    beat = fault_beat("slcan", 60.0, 4.0, 3.0)
-    assert [f.at_s for f in beat] == [4.0 + 3 * k for k in range(18)]
-    assert all(a.at_s + a.duration_s < b.at_s for a, b in itertools.pairwise(beat))
-    assert len({f.kind for f in beat}) == len(KINDS) + 1
 
 
 def test_the_model_for_more_whiskers_decides_as_the_shipped_one_on_those_it_knows(tmp_path):

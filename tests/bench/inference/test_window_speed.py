@@ -5,8 +5,6 @@ import itertools
 import numpy as np
 import pytest
 
-from tactile_rt.extras import install_extra
-
 pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
@@ -48,15 +46,6 @@ def test_times_are_beside_the_plain_network_s_and_only_full_width_has_a_bar(take
     assert not any(r.bar for r in speed._measured(windows, 0.125, 2))
     slow = speed._measured({**windows, "fp32": takes([20], [0.0, 4.0])}, 1.0, 2)
     assert [r.met for r in slow if r.bar] == [False]
-
-
-def test_without_torch_it_says_what_is_missing(monkeypatch):
-    def missing(name):
-        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-    monkeypatch.setattr(speed.importlib, "import_module", missing)
-    (record,) = speed.window_speed(quick=True)
-    assert record.how == f"needs torch ({install_extra('train')})"
 
 
 @pytest.mark.slow

@@ -1,14 +1,11 @@
 """The page of all measured figures holds what commands printed, and nothing else."""
 
-import json
 import re
-from dataclasses import asdict
 
 import pytest
 
 pytest.importorskip("mujoco")
 
-from bench.pages import benchmarks
 from bench.pages.benchmarks import PAGE, Measurement, read, row, section, written
 from tactile_rt.cli.bench import AREAS
 from tactile_rt.evidence.records import Record
@@ -45,19 +42,3 @@ def test_a_quick_look_is_marked_and_what_is_not_measured_says_so() -> None:
     looked = Measurement("tactile-rt bench sim --quick", "1", "2026-01-01", "m", ())
     assert "not a figure to quote" in section("sim", looked)
     assert "Not measured yet" in section("sim", None)
-
-
-def test_measuring_runs_the_command_itself(monkeypatch) -> None:
-    figure = Record("a.b", 1, "s")
-    printed = json.dumps([{**asdict(figure), "met": None}])
-
-    def run(words, **_):
-        with open(words[-1], "w") as file:
-            file.write(printed)
-        assert words[-5:-1] == ["bench", "align", "--quick", "--json"]
-
-    monkeypatch.setattr(benchmarks, "described", lambda: "a machine")
-    monkeypatch.setattr(benchmarks.subprocess, "run", run)
-    found = benchmarks.measure("align", quick=True)
-    assert found.command == "tactile-rt bench align --quick"
-    assert found.records == (figure,)

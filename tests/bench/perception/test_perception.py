@@ -11,11 +11,9 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sklearn")
 
-from bench.perception.area import OBJECTS, BenchmarkResults
 from bench.perception.data import FILE, SOURCE, SPLITS, Data, Portion, load, pack
 from bench.perception.generator import _without, measured
 from bench.perception.methods import Method, of_kinds
-from bench.perception.page import write_page
 from bench.perception.scores import accuracy_by_source, score
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
@@ -166,32 +164,6 @@ def test_sets_are_joined_by_the_names_of_their_kinds(data: Data) -> None:
     assert len(some.sweeps) == (test.sweeps.labels == 3).sum()
     both = joined([of_kinds(one, data.kinds) for one in (test, turned)])
     assert np.array_equal(both.sweeps.labels, np.tile(test.sweeps.labels, 2))
-
-
-def test_the_page_says_what_was_measured(data: Data, tmp_path: Path) -> None:
-    method = oracle(data)
-    figures = score(method, data.sets["test"])
-    robust = {"a dead row of whiskers": figures.top1}
-    by_source = {"someone/things": figures.top1}
-    results = BenchmarkResults(
-        data,
-        scores={OBJECTS: {method: figures}},
-        by_source={method: by_source},
-        robust={method: robust},
-        generator={method: {"60 mm/s": figures.top1}},
-        digest="0123abc",
-    )
-    write_page(results, tmp_path / "page.md")
-    page = (tmp_path / "page.md").read_text()
-    assert data.digest in page
-    assert "| oracle | the answers | 27 | 100.0 (100-100) |" in page
-    assert "| a dead row of whiskers | 100.0 (100-100) |" in page
-    assert "| things | 100.0 (100-100) |" in page
-    assert "| 60 mm/s | 100.0 (100-100) |" in page
-    assert "0123abc" in page
-    for line in page.splitlines():
-        if line.startswith("|"):
-            assert line.endswith("|")
 
 
 def test_of_several_conditions_the_worst_counts_and_strangers_are_left_out(data: Data) -> None:

@@ -48,7 +48,6 @@ MIRROR = np.diag([-1.0, 1.0, 1.0])
 FLIPS = np.array([1, 1, -1, -1, -1, 1])  # of fx fy fz mx my mz under reflection
 EXAMPLES = ROOT / "docs" / "arrays"
 NAMES = ("mouse", "mouse-left", "mouse-both", "rat", "rat-left", "rat-both")
-SIDE = {"mouse": 30, "rat": 30, "left": 30, "both": 60}
 
 
 def points(whisker: Whisker, mount: Mount, n: int = 9) -> Floats:
@@ -108,15 +107,6 @@ def test_a_mirrored_whisker_is_the_reflected_curve(animal: str) -> None:
         assert np.linalg.det(turn) == pytest.approx(1)
         assert left.curvature > 0  # y still points to the concave side
         assert mirrored(left) == right
-
-
-def test_the_left_side_alone_is_the_right_one_in_a_mirror() -> None:
-    right, left = load_array("rat"), load_array("rat-left")
-    for r, w in zip(right.whiskers, left.whiskers, strict=True):
-        assert (w.name, w.row, w.column) == (r.name, r.row, r.column)
-        np.testing.assert_allclose(
-            points(w, left.mount), points(r, right.mount) @ MIRROR, atol=1e-12
-        )
 
 
 def test_a_reflected_push_in_the_simulator_gives_reflected_loads() -> None:
@@ -262,17 +252,13 @@ def test_a_table_as_a_spreadsheet_writes_it(tmp_path: Path) -> None:
     ("text", "said"),
     [
         ("", "a.csv: is empty"),
-        ("# nothing\n", "a.csv: is empty"),
         (HEADER, "a.csv: has no whiskers"),
         (HEADER.replace(",", ";"), "a.csv:1: columns are separated by semicolons; use commas"),
         (HEADER.replace(",col", ""), "a.csv:1: no column col; add it"),
         (HEADER.replace("_length", "_lenght"), "no column 'arc_lenght_mm'; did you mean arc_"),
-        (HEADER + ",colour", "a.csv:1: no column 'colour'"),
         (HEADER + ",row", "a.csv:1: column 'row' is there twice"),
         (f"{HEADER}\n{LINE},3", "a.csv:2: 13 values for 12 columns"),
-        (f"{HEADER}\nA0,1", "a.csv:2: 2 values for 12 columns"),
         (f"#\n{HEADER}\n{LINE.replace('40', 'x')}", "a.csv:3: arc_length_mm is not a number: 'x'"),
-        (f"{HEADER}\n{LINE.replace('40', 'nan')}", "a.csv:2: arc_length_mm is not a finite number"),
         (f"{HEADER}\n{LINE.replace('40', '')}", "a.csv:2: no arc_length_mm; give it a value"),
         (
             f"{HEADER}\n{LINE.replace('40', '-4')}",
@@ -281,7 +267,6 @@ def test_a_table_as_a_spreadsheet_writes_it(tmp_path: Path) -> None:
         (f"{HEADER}\n{LINE}\n\n{LINE}", r"a.csv:4: whisker A0 is taken already \(line 2\)"),
         (f"{HEADER}\n{LINE}\nB{LINE}", r"a.csv:3: row 1, col 0 is taken already \(line 2\)"),
         (f"{HEADER}\n{LINE.replace('A0', 'A 0')}", "a.csv:2: whisker 'A 0': a name is"),
-        (f'{HEADER}\n"{LINE}', "a.csv:2: 1 values for 12 columns"),
     ],
 )
 def test_a_mistake_in_a_table_is_one_line(tmp_path: Path, text: str, said: str) -> None:
@@ -313,23 +298,15 @@ def test_a_toml_array_has_a_mount_and_defaults(tmp_path: Path) -> None:
     [
         ("name = \n", r"a.toml:1: not TOML"),
         ("", r"needs \[\[whisker\]\] tables or"),
-        (DEFAULTS, r"needs \[\[whisker\]\] tables or"),
         ("naem = 'x'" + DEFAULTS + WHISKERS, "the file has no key 'naem'; did you mean name?"),
-        ("[mount]\nposition = [0,0,0]" + DEFAULTS + WHISKERS, "did you mean position_mm?"),
         (
             "[mount]\nposition_mm = [0,0]" + DEFAULTS + WHISKERS,
             r"a.toml:2: mount.position_mm: expected a list of 3 numbers",
         ),
         (
-            "[mount]\nposition_mm = [0,0,nan]" + DEFAULTS + WHISKERS,
-            r"a.toml:2: mount.position_mm\[2\]: nan is no quantity",
-        ),
-        (
             "[mount]\nroll_pitch_yaw_rad = [0,0,-90]" + DEFAULTS + WHISKERS,
             r"a.toml: mount.roll_pitch_yaw_rad must be within a turn, 6.28, not -90: mind the unit",
         ),
-        ("name = 3" + DEFAULTS + WHISKERS, r"name: expected text, got 3"),
-        (DEFAULTS + "densty = 3\n" + WHISKERS, "a.toml:11: defaults has no key 'densty'"),
         (DEFAULTS + WHISKERS + "frction = 3", r"a.toml:22: whisker\[1\] has no key .* friction\?"),
         (WHISKERS, r"whisker\[0\] \(A0\): no curvature_a_per_mm"),
         (DEFAULTS + WHISKERS.replace('"A1"', "1"), r"whisker\[1\]: whisker is a name, in quotes"),
@@ -337,16 +314,9 @@ def test_a_toml_array_has_a_mount_and_defaults(tmp_path: Path) -> None:
             DEFAULTS + WHISKERS.replace('"A1"', '"A0"'),
             r"\[1\] \(A0\): whisker A0 is .* \(line 12: whisker",
         ),
-        (DEFAULTS + WHISKERS.replace("col = 1", "col = 0"), "row 1, col 0 is taken already"),
-        (
-            DEFAULTS + WHISKERS.replace("30", "[30]"),
-            r"whisker\[1\] \(A1\): arc_length_mm is not a finite",
-        ),
-        (DEFAULTS + "tip_radius_mm = 1\n" + WHISKERS, "tip_radius_mm 1 exceeds base_radius_mm 0.2"),
         ("[[animal]]\narray = 'mouse'\n" + WHISKERS, "tables, one of the two"),
         ("name = 'x'\n[[animal]]\narray = 'mouse'", "there is nothing else"),
         ("[[animal]]\narray = 'a.toml'", "another file, not this one"),
-        ("[[animal]]\narray = 'muose'", "did you mean mouse?"),
         ("[[animal]]\narray = 'no.csv'", "no.csv: no such file"),
         ("[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'", "a.toml: animal 2 .* in another"),
     ],
@@ -401,6 +371,3 @@ def test_arrays_come_without_a_simulator() -> None:
         "sys.exit(bool({'mujoco', 'trimesh', 'torch'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-# Streams

@@ -26,7 +26,7 @@ from tactile_rt.sim_backend.datasets.dataset import (
     simulate_sweep,
 )
 from tactile_rt.sim_backend.datasets.inventory import check_sums
-from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sim_backend.datasets.recipe_objects import ShapeObjects
 from tactile_rt.sim_backend.datasets.recipes import (
     ObjectChoice,
@@ -167,16 +167,6 @@ def test_the_raw_kilohertz_is_what_the_simulation_gave() -> None:
     assert np.array_equal(record.values[20:], loads.astype(np.float32))
 
 
-def test_another_profile_sweeps_the_same() -> None:
-    target = make_object("mug", 0)
-    coarse, fine = (
-        simulate_sweep(replace(RECIPE, length_ms=90, profile=profile), target, 1)
-        for profile in ("realtime", "dataset")
-    )
-    assert coarse.parameters == fine.parameters
-    assert not np.array_equal(coarse.values, fine.values)
-
-
 def test_several_animals_share_the_world_of_a_set(tmp_path: Path) -> None:
     path = tmp_path / "two.toml"
     path.write_text(
@@ -187,15 +177,6 @@ def test_several_animals_share_the_world_of_a_set(tmp_path: Path) -> None:
     assert describe_set(recipe).spec.elements[::30] == ("1.A0", "2.A0")
     record = simulate_sweep(recipe, make_object("mug", 0), 0)
     assert record.values.shape == (25, 60, 6)
-
-
-def test_sweeps_without_their_manifest_are_no_ones(tmp_path: Path) -> None:
-    """They may be of another recipe: a set that took them in would be a mixture."""
-    (tmp_path / "mug-1.npz").write_bytes(b"of another set")
-    (tmp_path / "six.npz").write_bytes(b"none of its business")
-    with pytest.raises(ConfigError, match=r"holds sweeps but no manifest\.json"):
-        list(make_sweeps(RECIPE, tmp_path, processes=1))
-    assert not (tmp_path / "manifest.json").exists()
 
 
 def test_a_finished_set_gets_a_lost_manifest_back(finished: Path, tmp_path: Path) -> None:
@@ -546,11 +527,3 @@ def ray_workers(session: int) -> list[int]:
             return found
         time.sleep(0.05)
     raise AssertionError("no Ray worker at a task")
-
-
-def test_the_default_recipe_is_made_by_default() -> None:
-    """What one sweep of the training set costs to describe, and that it can be made at all."""
-    recipe = read_recipe("default24")
-    name = describe_set(recipe).split["withheld"][0]
-    record = simulate_sweep(replace(recipe, length_ms=300), load_object(name), 0)
-    assert record.parameters["touches"]

@@ -10,7 +10,6 @@ import pytest
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
-from tactile_rt.sim_backend.datasets import engines
 from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tests.helpers.frail_work import FrailWork
 from tests.helpers.source_tree import ROOT
@@ -60,11 +59,6 @@ def test_one_process_works_in_order(tmp_path: Path) -> None:
     names = ["c", "a", "skips-broken", "b"]
     outcomes = list(run_processes(FrailWork(tmp_path), names, 1))
     assert outcomes == [("c", None), ("a", None), ("skips-broken", "broken"), ("b", None)]
-
-
-def test_nothing_to_do_starts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engines, "_start", None)
-    assert list(run_processes(FrailWork(tmp_path), [], 4)) == []
 
 
 def test_what_a_dead_process_was_at_is_tried_again(tmp_path: Path) -> None:

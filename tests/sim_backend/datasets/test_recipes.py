@@ -16,7 +16,6 @@ from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import (
-    DEFAULT_RECIPE,
     read_recipe,
     recipe_from_dict,
     recipe_of_set,
@@ -24,7 +23,6 @@ from tactile_rt.sim_backend.datasets.recipe_files import (
 )
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import (
-    PARAMETERS,
     ObjectChoice,
     Range,
     SweepChoice,
@@ -156,12 +154,6 @@ def test_the_draw_of_a_known_sweep_never_changes() -> None:
     assert round(sweep.yaw_deg, 6) == 300.180777
 
 
-def test_what_may_be_added_to_a_sweep_has_random_numbers_of_its_own() -> None:
-    recipe = SweepRecipe()
-    streams = [recipe.rng("mug-0", 0, k).random() for k in range(3)]
-    assert len(set(streams)) == 3
-
-
 @given(
     st.lists(st.floats(-100, 100), min_size=1, max_size=4, unique=True),
     st.lists(st.floats(1, 100), min_size=1, max_size=3, unique=True),
@@ -243,12 +235,14 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
         lead_ms = 30
         length_ms = 500
         [objects]
+        from = "varied-shapes"
         categories = ["mug", "bowl"]
         withheld = ["goblet"]
-        per_category = 5
+        outliers = ["jack"]
+        per_category = 4
         validation = 1
-        test = 2
-        per_withheld = 3
+        test = 1
+        per_withheld = 2
         [sweeps]
         draws = 2
         speed_mm_s = { each = [30, 35.5] }
@@ -257,78 +251,32 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
         noise_force = 1e-5
         [randomisation]
         friction = 0.2
+        [faults]
+        dead_row = 0.25
+        drift = 2
         """,
     )
     recipe = read_recipe(path)
-    assert recipe.objects == ObjectChoice(
-        categories=("mug", "bowl"),
-        withheld=("goblet",),
-        per_category=5,
-        validation=1,
-        test=2,
-        per_withheld=3,
-    )
     assert recipe.sweeps.speed_mm_s == Range(each=(30.0, 35.5))
     assert recipe.sweeps.yaw_deg == Range((-10.0, 10.0))
-    assert recipe.sensor.noise_force == 1e-5
-    assert recipe.randomisation.friction == 0.2
+    assert (recipe.sensor.noise_force, recipe.randomisation.friction) == (1e-5, 0.2)
     assert (recipe.lead, recipe.samples) == (30, 500)
     manifest = describe_set(recipe)
     assert manifest.spec.name == "rat-right"
     assert manifest.categories == ("mug", "bowl")
     assert manifest.split == {
-        "train": ("mug-0", "bowl-0", "mug-1", "bowl-1"),
-        "validation": ("mug-2", "bowl-2"),
-        "test": ("mug-3", "bowl-3", "mug-4", "bowl-4"),
-        "withheld": ("goblet-0", "goblet-1", "goblet-2"),
-    }
-    assert recipe_of_set(manifest.recipe) == recipe
-
-
-def test_varied_shapes_and_unknown_kinds_to_learn_from(tmp_path: Path) -> None:
-    recipe = read_recipe(
-        write(
-            tmp_path / "mine.toml",
-            """
-            [objects]
-            from = "varied-shapes"
-            categories = ["mug"]
-            withheld = ["goblet"]
-            outliers = ["jack"]
-            per_category = 3
-            validation = 1
-            test = 1
-            per_withheld = 1
-            [faults]
-            dead_row = 0.25
-            drift = 2
-            """,
-        )
-    )
-    assert recipe.faults == SensorFaults(dead_row=0.25, drift=2)
-    manifest = describe_set(recipe)
-    assert manifest.split == {
-        "train": ("varied-mug-0",),
-        "validation": ("varied-mug-1",),
-        "test": ("varied-mug-2",),
-        "withheld": ("varied-goblet-0",),
-        "outliers": ("varied-jack-0",),
+        "train": ("varied-mug-0", "varied-bowl-0", "varied-mug-1", "varied-bowl-1"),
+        "validation": ("varied-mug-2", "varied-bowl-2"),
+        "test": ("varied-mug-3", "varied-bowl-3"),
+        "withheld": ("varied-goblet-0", "varied-goblet-1"),
+        "outliers": ("varied-jack-0", "varied-jack-1"),
     }
     kinds = {n: (manifest.category(n), manifest.label(n)) for n in manifest.names()}
-    assert kinds["varied-mug-1"] == ("mug", 0)
+    assert kinds["varied-bowl-1"] == ("bowl", 1)
     assert kinds["varied-goblet-0"] == ("goblet", -1)
     assert kinds["varied-jack-0"] == ("jack", -1)
-    assert manifest.faults == recipe.faults
+    assert manifest.faults == recipe.faults == SensorFaults(dead_row=0.25, drift=2)
     assert recipe_of_set(manifest.recipe) == recipe
-
-
-def test_the_default_set_is_of_varied_shapes_in_a_wide_world() -> None:
-    recipe = read_recipe(DEFAULT_RECIPE)
-    assert (recipe.name, recipe.objects.source) == ("wide24", "varied-shapes")
-    assert recipe.sweeps.least_whiskers == 5
-    drawn = [name for name in PARAMETERS if isinstance(getattr(recipe.sweeps, name), Range)]
-    assert set(PARAMETERS) - set(drawn) == {"ramp_ms", "head_moves"}
-    assert recipe.faults.dead_row and recipe.faults.offset and recipe.faults.drift
 
 
 @pytest.mark.parametrize(
@@ -338,56 +286,38 @@ def test_the_default_set_is_of_varied_shapes_in_a_wide_world() -> None:
             "sead = 1",
             r":1: the file has no key 'sead'; did you mean seed\?",
         ),
-        ("[sweeps]\nspeed = 3", r":2: sweeps has no key 'speed'; did you mean speed_mm_s\?"),
-        ("[objects]\ncategorys = []", r"objects has no key 'categorys'; did you mean categories\?"),
         (
             "[sweeps]\nyaw_deg = { betwen = [0, 1] }",
             r"sweeps.yaw_deg has no key 'betwen'; did you mean between\?",
         ),
-        ("[sensor]\nnoise = 1", r"sensor has no key 'noise'; did you mean noise_"),
         ("[sensor]\nnoise_force = -1", r"sensor: noise_force must be 0 or more, not -1"),
         ("[randomisation]\nfriction = 2", r"randomisation: friction is relative"),
         ("seed = 1.5", "seed: expected a whole number, got 1.5"),
-        ("seed = true", "seed: expected a whole number, got True"),
         ("seed = -1", "seed must be 0 or more, not -1"),
-        ("name = 3", "name: expected text, got 3"),
         ("period_ms = 'nine'", "period_ms: expected a number, got 'nine' .in milliseconds"),
         ("period_ms = 0.5", "period_ms must be 1 or more, the simulator's own, not 0.5"),
         ("lead_ms = 2000", r"length_ms \(1476\) must exceed lead_ms \(2000\)"),
         ("profile = 'realtim'", r"no profile 'realtim'; did you mean realtime\?"),
-        ("objects = 60", "objects is a table of keys, not 60"),
         (
             "[sweeps]\nyaw_deg = [0, 90]",
             r":2: sweeps.yaw_deg: expected a number or a table, got \[0, 90\]",
         ),
         ("[sweeps]\nyaw_deg = { between = [0] }", r"sweeps.yaw_deg: expected a number, \{ between"),
-        ("[sweeps]\nyaw_deg = { each = [] }", r"sweeps.yaw_deg: expected a number, \{ between"),
         ("[sweeps]\nyaw_deg = { each = [nan] }", r"sweeps.yaw_deg.each\[0\]: nan is no quantity"),
-        ("[sweeps]\nyaw_deg = inf", "sweeps.yaw_deg: inf is no quantity"),
         ("[sweeps]\nyaw_deg = { between = [9, 1] }", "between has its lower end first, not 9, 1"),
         ("[sweeps]\nsize_mm = 1e300", "sweeps: size_mm must be within [+]-10000, not 1e[+]300"),
-        ("[sweeps]\nheight_mm = { between = [-2e4, 0] }", "must be within [+]-10000, not -20000"),
         ("length_ms = 1e12", "length_ms must be at most 600000, not 1e[+]12"),
         ("[objects]\nper_category = 1000000000", "per_category must be at most 100000, not 1e"),
-        ("[sweeps]\nsize_mm = 0", "sweeps: size_mm must be positive, not 0"),
         (
             "[sweeps]\nspeed_mm_s = { each = [30, -3] }",
             "sweeps: speed_mm_s must be positive, not -3",
         ),
-        ("[sweeps]\ngap_mm = { between = [-1, 1] }", "sweeps: gap_mm must be 0 or more, not -1"),
         ("[sweeps]\ndraws = 0", "sweeps: draws must be at least 1, not 0"),
-        ("[sweeps]\nheld_out_draws = -1", "sweeps: held_out_draws must be 0 or more"),
-        ("[objects]\ncategories = 'mug'", "objects.categories: expected a list, got 'mug'"),
         ("[objects]\ncategories = ['a', 'a']", "objects: categories: 'a' is there twice"),
         ("[objects]\ncategories = ['mug']\nwithheld = ['mug']", "'mug' is also one of the cat"),
-        ("[objects]\nwithheld = ['jack']\noutliers = ['jack']", "'jack' is also one of the withh"),
         ("[objects]\nfrom = 'varied-shape'", r"no such folder 'varied-shape'; did you mean varied"),
-        ("[objects]\noutliers = ['jack', 'jack']", "'jack' is there twice; remove one"),
         ("[faults]\ndead_row = 2", "dead_row must be between 0 and 1, not 2"),
-        ("[faults]\ndrift = -1", "drift must be between 0 and 100, not -1"),
         ("[objects]\ntest = 0.5", "objects: test must be a whole number, at least 1, not 0.5"),
-        ("[objects]\nvalidation = 0", "objects: validation must be a whole number, at least 1"),
-        ("\nseed = = 1", r"mine.toml:2: not TOML: "),
     ],
 )
 def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complaint) -> None:
@@ -403,8 +333,6 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complain
     ("text", "complaint"),
     [
         ("[objects]\ncategories = ['mugs']", r"no category 'mugs'; did you mean mug\?"),
-        ("[objects]\noutliers = ['jacks']", r"no category 'jacks'; did you mean jack"),
-        ("[objects]\nwithheld = ['goblets']", r"no category 'goblets'; did you mean goblet"),
         ("[objects]\nper_category = 16", "16 objects cannot be split with 4 .* and 12 for test"),
         ("array = 'moose'", "no simulated array 'moose': did you mean mouse"),
     ],

@@ -46,10 +46,6 @@ def test_a_tare_that_is_taken_off_hides_no_step() -> None:
     assert rounding_step((counts * 0.25 - 1.2345).astype(np.float32)) == pytest.approx(0.25)
 
 
-def test_one_reading_for_ever_has_no_step() -> None:
-    assert rounding_step(np.full(100, 3.0, np.float32)) == 0
-
-
 @given(
     rate_hz=st.floats(80, 1000),
     sigma=st.floats(1e-9, 10.0),
@@ -87,12 +83,6 @@ def test_touches_and_whatever_holds_a_whisker_are_no_rest() -> None:
     assert all(not ((rest.at_s > a - half) & (rest.at_s < b + half)).any() for a, b in away)
     assert rest.size * len(rest.levels) > 14_000
     np.testing.assert_allclose(rest.noise, 1, rtol=0.03)
-
-
-def test_less_than_three_seconds_are_no_rest() -> None:
-    x = np.random.default_rng(0).standard_normal((2500, 1)).astype(np.float32)
-    assert find_rest(x, 1000, 0) is None
-    assert find_rest(x, 500, 0) is not None
 
 
 def test_noise_behind_a_low_pass_is_all_counted() -> None:

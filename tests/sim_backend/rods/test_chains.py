@@ -107,19 +107,6 @@ def test_a_base_that_is_accelerated_pulls_every_mass_along() -> None:
     np.testing.assert_allclose(wrench[3:], moment, rtol=1e-9)
 
 
-def test_factor_and_solve() -> None:
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(12, 12))
-    matrix = root @ root.T + np.eye(12)
-    x = rng.normal(size=12)
-    lower = np.tril(matrix)
-    chains.factor(lower, 12)
-    y = matrix @ x
-    chains.solve_forth(lower, 12, y)
-    chains.solve_back(lower, 12, y)
-    np.testing.assert_allclose(y, x, rtol=1e-10)
-
-
 @pytest.mark.parametrize("ratio", [0.02, 0.32, 0.9, 1.5])
 @pytest.mark.parametrize("turn", [0.01, 0.2, 0.5])
 def test_a_matched_step_multiplies_a_mode_as_time_does(ratio: float, turn: float) -> None:
