@@ -132,80 +132,71 @@ def _calibration(nodes: SettingNode) -> Calibration:
 
 
 def _written(c: Calibration) -> str:
-    channels, units = c.output
+    outputs = list(zip(*c.output, strict=True))
     lines = [
         f"# Calibration of the tactile sensor {c.device}, for tactile-rt.",
         "# Of every element: output = matrix @ (raw - tare); then mapped, then mirrored.",
         f"version = {VERSION}",
-        f"device = {_text(c.device)}",
+        f"device = {_toml(c.device)}",
         "history = [",
-        *(f"  {_text(line)}," for line in c.history),
+        *(f"  {_toml(line)}," for line in c.history),
         "]",
         "",
         "[raw]  # what the device sends; a unit of 1 are counts",
-        f"elements = {_texts(c.elements)}",
-        f"channels = {_texts(c.channels)}",
-        f"units = {_texts(c.units)}",
+        f"elements = {_toml(c.elements)}",
+        f"channels = {_toml(c.channels)}",
+        f"units = {_toml(c.units)}",
         "",
         "[output]  # what programs get; what is left out is as in [raw]",
     ]
     if c.output_channels:
-        lines.append(f"channels = {_texts(c.output_channels)}")
+        lines.append(f"channels = {_toml(c.output_channels)}")
     if c.output_units:
-        lines.append(f"units = {_texts(c.output_units)}")
+        lines.append(f"units = {_toml(c.output_units)}")
     if c.mapping:
         lines += ["", "[mapping]  # output element = raw element, in the order of the output"]
-        lines += [f"{_key(new)} = {_text(old)}" for new, old in c.mapping.items()]
+        lines += [f"{_key(new)} = {_toml(old)}" for new, old in c.mapping.items()]
     for what, rows, meaning in (
         ("tare", c.tare, "raw reading at no load"),
         ("noise", c.noise, "standard deviation of the raw reading at no load"),
     ):
         if rows:
             lines += ["", f"[{what}]  # {meaning}: {_listed(c.channels)}"]
-            lines += [f"{_key(element)} = {_numbers(row)}" for element, row in rows.items()]
+            lines += [f"{_key(element)} = {_toml(row)}" for element, row in rows.items()]
     if c.matrices:
         lines += ["", "[matrix]  # a row per output channel: output unit per raw unit"]
     for element, matrix in c.matrices.items():
-        rows_of = zip(channels, units, matrix, strict=True)
+        lines += [f"{_key(element)} = [  # columns: {_listed(c.channels)}"]
         lines += [
-            f"{_key(element)} = [  # columns: {_listed(c.channels)}",
-            *(f"  {_numbers(row)},  # {_listed((name, unit))}" for name, unit, row in rows_of),
-            "]",
+            f"  {_toml(row)},  # {_listed(of)}" for of, row in zip(outputs, matrix, strict=True)
         ]
+        lines += ["]"]
     if c.mirror:
         lines += [
             "",
             "[mirror]  # reflect the mount frame's axis, flip the element frame's",
-            f"axis = {_text(c.mirror.axis)}",
-            f"element_axis = {_text(c.mirror.element_axis)}",
+            f"axis = {_toml(c.mirror.axis)}",
+            f"element_axis = {_toml(c.mirror.element_axis)}",
         ]
         if c.mirror.signs:
             lines += ["[mirror.signs]  # of channels whose name and unit do not tell"]
             lines += [f"{_key(channel)} = {sign}" for channel, sign in c.mirror.signs.items()]
     if c.gain:
-        gain = f"gain = {_numbers(c.gain)}  # of elements without a matrix: {_listed(c.channels)}"
+        gain = f"gain = {_toml(c.gain)}  # of elements without a matrix: {_listed(c.channels)}"
         lines.insert(lines.index("history = ["), gain)
     return "\n".join(lines) + "\n"
 
 
-def _text(value: str) -> str:
-    # JSON's strings are TOML's, but for the one control character that JSON leaves as it is.
+def _toml(value: object) -> str:
+    # JSON's strings, numbers and lists are TOML's, but for the one control character that JSON
+    # leaves as it is. Numbers are the shortest text that reads back as the same.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _texts(values: Iterable[str]) -> str:
-    return f"[{', '.join(map(_text, values))}]"
 
 
 def _listed(names: Iterable[str]) -> str:
     # for a comment: a device that describes itself may have a line's end in a name
-    return ", ".join(_text(name)[1:-1] for name in names)
+    return ", ".join(_toml(name)[1:-1] for name in names)
 
 
 def _key(name: str) -> str:
-    return name if BARE.fullmatch(name) else _text(name)
-
-
-def _numbers(values: Iterable[float]) -> str:
-    # repr is the shortest text that reads back as the same number
-    return f"[{', '.join(repr(float(v)) for v in values)}]"
+    return name if BARE.fullmatch(name) else _toml(name)

@@ -167,13 +167,13 @@ def whisk_against(
     return Touch(np.concatenate(loads).astype(np.float32), np.concatenate(touch))
 
 
-def model_input(felt: Touch, samples: int = WINDOW_SAMPLES) -> NDArray[np.float32]:
+def model_input(felt: Touch) -> NDArray[np.float32]:
     """What the network sees: from the first contact on, every 9 ms.
 
     The first sample is centred on the first contact, through the same resampler as live data.
 
     Returns:
-        (samples, element, channel) N and N m.
+        (sample, element, channel) N and N m.
 
     Raises:
         ConfigError: nothing is touched, or the trajectory ends before the window does.
@@ -182,11 +182,11 @@ def model_input(felt: Touch, samples: int = WINDOW_SAMPLES) -> NDArray[np.float3
     if first is None:
         raise ConfigError("no whisker touches it: bring it closer, or whisk further")
     period = PERIOD_NS / (SAMPLE_MS * 1e6)
-    start, stop = first - round(period), first + round(samples * period) + 1
+    start, stop = first - round(period), first + round(WINDOW_SAMPLES * period) + 1
     if start < 0 or stop > len(felt.loads):
         raise ConfigError(
-            f"first contact is at {first} ms and {samples} samples of {period:g} ms follow it: "
-            f"the trajectory must last {stop} ms or more, not {len(felt.loads)} ms, and begin "
+            f"first contact is at {first} ms and {WINDOW_SAMPLES} samples of {period:g} ms follow "
+            f"it: the trajectory must last {stop} ms or more, not {len(felt.loads)} ms, and begin "
             f"{round(period)} ms or more before the contact"
         )
     values = felt.loads[start:stop]
@@ -198,7 +198,7 @@ def model_input(felt: Touch, samples: int = WINDOW_SAMPLES) -> NDArray[np.float3
     )
     resampled = Resampler(PERIOD_NS, 1e3 / SAMPLE_MS).push(chunk)
     assert resampled is not None
-    return resampled.values[:samples]
+    return resampled.values[:WINDOW_SAMPLES]
 
 
 def write_input(

@@ -96,14 +96,11 @@ class Recorded:
         times_s: The (sample,) times from 0 on, s.
         turns: The (sample, whisker, 3) turn from the resting angles, rad.
         names: The names of the whiskers of `turns`, in their order.
-        ramp_s: The time in which motion grows from the first sample's posture to the recorded one,
-            s.
     """
 
     times_s: NDArray[np.float64]
     turns: NDArray[np.float64]
     names: tuple[str, ...]
-    ramp_s: float = 0.1
 
     @property
     def duration_s(self) -> float:
@@ -121,7 +118,7 @@ class Recorded:
         at = [self.names.index(w.name) for w in whiskers]
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
         moved = self._spline(t)
-        turns: NDArray[np.float64] = self.turns[0] + moved * _ramp(t / self.ramp_s)[:, None, None]
+        turns: NDArray[np.float64] = self.turns[0] + moved * _ramp(t / Whisk.ramp_s)[:, None, None]
         return turns[:, at]
 
 
@@ -144,7 +141,7 @@ def _slopes(row: int) -> tuple[float, float]:
     return (ELEVATION_SLOPES[row], TORSION_SLOPES[row]) if known else (0.0, 0.0)
 
 
-def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0.1) -> Recorded:
+def read_trajectory(path: Path, whiskers: tuple[Whisker, ...]) -> Recorded:
     """Read a recorded trajectory of base angles.
 
     The file has a header and one line for each time: ``time_s``, then turns from rest in degrees,
@@ -190,7 +187,7 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0
                 raise ConfigError(f"{path}: no theta_deg for whisker {whisker.name}")
             else:
                 turns[:, k, j] = turns[:, k, 0] * _slopes(whisker.row)[j - 1]
-    return Recorded(times - times[0], turns, tuple(w.name for w in whiskers), ramp_s)
+    return Recorded(times - times[0], turns, tuple(w.name for w in whiskers))
 
 
 def _letter(row: int) -> str:

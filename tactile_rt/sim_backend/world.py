@@ -8,7 +8,7 @@ the tip as much as the cell's piece of the Euler-Bernoulli beam would (see `join
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
 import mujoco
@@ -126,26 +126,12 @@ def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
     """
     if len(animals) == 1:
         return array_spec(animals[0].whiskers, animals[0].name)
-    head_specs = [array_spec(a.whiskers, a.name) for a in animals]
-    turns = [a.mount.rotation for a in animals]
-    places = [
-        (turn @ np.array(w.base) + np.array(a.mount.position)) * 1e-3
-        for a, turn in zip(animals, turns, strict=True)
-        for w in a.whiskers
-    ]
-    return ArraySpec(
-        name=" and ".join(a.name for a in animals),
-        elements=tuple(e for spec in head_specs for e in spec.elements),
-        grid=tuple(cell for spec in head_specs for cell in spec.grid),
+    whiskers = [(a.mount.rotation, a.mount.position, w) for a in animals for w in a.whiskers]
+    places = [(turn @ np.array(w.base) + np.array(at)) * 1e-3 for turn, at, w in whiskers]
+    return replace(
+        array_spec(tuple(w for _, _, w in whiskers), " and ".join(a.name for a in animals)),
         positions=tuple((float(x), float(y), float(z)) for x, y, z in places),
-        orientations=tuple(
-            quaternion(turn @ w.orientation)
-            for a, turn in zip(animals, turns, strict=True)
-            for w in a.whiskers
-        ),
-        channels=CHANNELS,
-        units=UNITS,
-        rate_hz=1e3 / SAMPLE_MS,
+        orientations=tuple(quaternion(turn @ w.orientation) for turn, _, w in whiskers),
         frame="world",
     )
 

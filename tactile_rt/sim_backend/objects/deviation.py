@@ -116,8 +116,8 @@ class TriangleSurface:
         reach: The farthest that a point of a tile is from its tile's middle.
     """
 
-    def __init__(self, triangles: Floats, size: float = TILE) -> None:
-        self.tiles = tiles(triangles, size)
+    def __init__(self, triangles: Floats) -> None:
+        self.tiles = tiles(triangles)
         self.middles = self.tiles.mean(axis=1)
         corners = np.unique(triangles.reshape(-1, 3), axis=0)
         self.points = np.concatenate([self.middles, corners])

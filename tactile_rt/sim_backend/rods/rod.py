@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 
 SAG_MM = 7e-4  # how far the chord of a segment may be from the resting curve
 FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should
+SAMPLE_MS = 1.0
 HEARD_HZ = 500.0  # resonances above are beyond what samples at 1 kHz can hold
 
 
@@ -47,7 +48,7 @@ class Rod:
     to_element: Floats
 
 
-def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: float = 1.0) -> Rod:
+def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
     """Cut a whisker into equal cells, and choose a step with which it rings as it should.
 
     A step that is long against a period makes a mode slower and damps it more. Both are taken back
@@ -57,7 +58,6 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     Args:
         links: how many cells; one more link.
         steps_per_sample: the fewest steps in a sample.
-        sample_ms: length of a sample, ms.
     """
     s = link_nodes(whisker, links)
     nodes = whisker.centreline(s)
@@ -82,14 +82,14 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     omegas, shapes = _modes(mass, stiffness)
     ratios = damping @ shapes**2 / (2 * omegas)  # of each mode
     steps, resonance_hz = steps_per_sample, float(omegas[0] / (2 * np.pi) * 1e3)
-    found = [matched(w, z, sample_ms / steps) for w, z in zip(omegas, ratios, strict=True)]
+    found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
     while found[0][1] < 0 and resonance_hz < HEARD_HZ and steps < FINEST * steps_per_sample:
         steps *= 2
-        found = [matched(w, z, sample_ms / steps) for w, z in zip(omegas, ratios, strict=True)]
+        found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
     ratio = float(ratios[0])
     if found[0][1] < 0:  # more than is wanted without any: what backward Euler leaves
-        decay = math.log1p((omegas[0] * sample_ms / steps) ** 2) / 2
-        ratio = decay / math.hypot(decay, math.atan(omegas[0] * sample_ms / steps))
+        decay = math.log1p((omegas[0] * SAMPLE_MS / steps) ** 2) / 2
+        ratio = decay / math.hypot(decay, math.atan(omegas[0] * SAMPLE_MS / steps))
     # Mode by mode; the modes are those of the whisker at rest.
     heavier = np.array([m if beta >= 0 else 1.0 for m, beta in found])
     drags = np.array([max(beta, 0.0) for _, beta in found]) * omegas**2

@@ -48,18 +48,17 @@ class Film:
     def __init__(
         self,
         footage: Footage,
-        view: Camera | str = "oblique",
+        view: str = "oblique",
         title: str = "",
         detail: str = "",
         pixels: int = 1280,
     ) -> None:
         self.footage = footage
         width, height = scene_size(pixels)
-        if isinstance(view, str):
-            view = camera_of(footage, view, width / height)
-        scale = ForceScale.fitting(footage.forces, view.extent_mm)
-        self._stage = Stage(footage, view, scale, width, height)
-        self._sheet = Sheet(footage, view, scale, title, detail, pixels)
+        camera = camera_of(footage, view, width / height)
+        scale = ForceScale.fitting(footage.forces, camera.extent_mm)
+        self._stage = Stage(footage, camera, scale, width, height)
+        self._sheet = Sheet(footage, camera, scale, title, detail, pixels)
         self.size = self._sheet.size
 
     def picture(self, moment: int) -> Pixels:

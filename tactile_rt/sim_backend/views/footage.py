@@ -2,17 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS
 from tactile_rt.stream import ArraySpec
 
-__all__ = ["VIEWS", "Camera", "Footage", "Simulation", "framing", "record"]
+__all__ = ["VIEWS", "Camera", "Footage", "framing", "record"]
 
 # Azimuth and elevation (degrees) of the named views. `side` and `front` face the animal, `top` has
 # its nose upward; `oblique` looks outward from behind the cheek, whiskers before the object.
@@ -110,22 +110,6 @@ def framing(
     return Camera(azimuth, elevation, (x, y, z), extent)
 
 
-class Simulation(Protocol):
-    """What `record` runs, e.g. a `SweepSimulation`."""
-
-    duration_ms: float
-
-    @property
-    def model(self) -> mujoco.MjModel:
-        """What pictures are drawn of."""
-
-    def show(self, data: mujoco.MjData) -> None:
-        """Put everything in the model's data where it is now."""
-
-    def advance(self, samples: int) -> NDArray[np.float64]:
-        """Simulate the next samples of 1 ms: (samples, element, 6) base loads, N and N m."""
-
-
 @dataclass(frozen=True)
 class Footage:
     """A simulation as it went, moment by moment.
@@ -172,21 +156,17 @@ class Footage:
         mujoco.mj_kinematics(self.model, data)
 
 
-def _ignore(done: float) -> None:
-    pass
-
-
 def record(
-    simulation: Simulation,
+    simulation: SweepSimulation,
     spec: ArraySpec,
     period_ms: int = 4,
-    progress: Callable[[float], None] = _ignore,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> Footage:
     """Run a simulation to its end.
 
     Args:
-        simulation: fresh or advanced; it goes on from where it is. All whiskers of the array
-            must be in it: a `SweepSimulation` is to be made with `whole=True`.
+        simulation: made with `whole=True`, so that it has all whiskers of the array; fresh or
+            advanced, it goes on from where it is.
         period_ms: between moments, whole ms.
         progress: called with the share that is done, 0 to 1.
     """
