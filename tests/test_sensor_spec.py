@@ -86,7 +86,6 @@ def test_without_a_sensor_only_forces_and_moments_are_believed() -> None:
     "what, why",
     [
         ({"range": 0.0}, "range must be more than 0"),
-        ({"range": float("inf")}, "range must be 0 or more, not inf"),
         ({"noise_density": 0.0}, "noise_density, its resolution, or both"),
         ({"noise_density": -1.0}, "noise_density must be 0 or more"),
         ({"of": {"fq": 1.0}}, f"of has no 'fq': it knows {', '.join(LOADS)}"),
@@ -94,7 +93,6 @@ def test_without_a_sensor_only_forces_and_moments_are_believed() -> None:
         ({"field": "w"}, "field must be x, y or z"),
         ({"field": "x", "of": {"fx": 1.0}}, "not both"),
         ({"name": "volts"}, "volts is no load; say what it reads with of"),
-        ({"unit": "V"}, "mz is in N m; say what it reads"),
     ],
 )
 def test_channels_that_cannot_be(what: dict, why: str) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from tactile_rt.stream import Chunk, EndOfStream, Source, SourceStats
+from tactile_rt.stream import Chunk, EndOfStream, Source, SourceStats, concatenate
 from tests.helpers.waiting import PATIENCE_S
 
 AT_ONCE_S = 0.5  # nobody sleeps that long by accident, and a busy machine is forgiven
@@ -58,6 +58,16 @@ class Run:
 
 def _parts(chunk: Chunk) -> tuple[np.ndarray, ...]:
     return chunk.seq, chunk.t_ns, chunk.values, chunk.valid
+
+
+def take(source: Source, samples: int) -> Chunk:
+    """Read until there are at least so many samples."""
+    chunks: list[Chunk] = []
+    while sum(map(len, chunks)) < samples:
+        chunk = source.read()
+        assert chunk is not None
+        chunks.append(chunk)
+    return concatenate(chunks)
 
 
 @functools.cache

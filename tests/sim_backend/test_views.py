@@ -137,11 +137,6 @@ def test_a_named_view_shows_all_that_it_frames(view, left):
     )
 
 
-def test_an_unknown_view_is_refused():
-    with pytest.raises(ConfigError, match="no camera 'above': there are front, side, top, oblique"):
-        framing("above", np.zeros((1, 3)))
-
-
 # ---- the scene
 
 

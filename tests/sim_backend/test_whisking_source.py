@@ -23,6 +23,7 @@ from tactile_rt.sim_backend.world import array_spec
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, EndOfStream, Source, concatenate
 from tactile_rt.testing import FakeCan, FakeSerial
+from tests.helpers.source_contract import take
 from tests.helpers.waiting import until
 
 ROBOT = Path(__file__).parents[2] / "docs" / "arrays" / "robot.csv"
@@ -171,16 +172,6 @@ def test_what_is_out_of_range_is_refused(asked: tuple[float, float, float], said
 
 def fast(**options: object) -> WhiskingSource:
     return WhiskingSource(str(ROBOT), WhiskingOptions(pace="fast", **options))  # type: ignore[arg-type]
-
-
-def take(source: WhiskingSource, samples: int) -> Chunk:
-    chunks, n = [], 0
-    while n < samples:
-        chunk = source.read()
-        assert chunk is not None
-        chunks.append(chunk)
-        n += len(chunk)
-    return concatenate(chunks)
 
 
 def test_it_describes_the_array_with_its_angle() -> None:

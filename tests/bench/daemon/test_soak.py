@@ -10,12 +10,9 @@ pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
 from bench.daemon.accounts import RecordedSamples, account
 from bench.daemon.latencies import latencies
-from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import soak
 from bench.emulated import KINDS, Played
-from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
@@ -23,8 +20,6 @@ from tactile_rt.daemon.recorder import Recorder
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
-from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
-from tactile_rt.stream import Chunk
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 MS = 1_000_000
@@ -161,16 +156,3 @@ def test_a_latency_begins_with_the_write_of_the_sample_that_completes_the_step()
     assert found.quiet.tolist() == [1, 2, 5]  # not what came before all had begun
     assert found.faulty.tolist() == [4]
     assert {k: v.tolist() for k, v in found.kinds.items()} == {"drop": [4.0]}
-
-
-def test_the_model_for_more_whiskers_decides_as_the_shipped_one_on_those_it_knows(tmp_path):
-    wide, narrow = whisker_array(), finger_array(1000.0)
-    write_wide_model(tmp_path / "wide.onnx", wide)
-    a, b = Classifier(tmp_path / "wide.onnx", wide), Classifier(shipped_model(), narrow)
-    decided = []
-    for chunk in SyntheticSource("35x6", SyntheticOptions(1000.0, 2.0, pace="fast")):
-        mine = a.push(chunk)
-        known = Chunk(chunk.seq, chunk.t_ns, chunk.values[:, :30].copy(), chunk.valid[:, :30])
-        decided += list(zip(mine, b.push(known), strict=True))
-    assert len(decided) == 22
-    assert all(np.array_equal(x.probabilities, y.probabilities) for x, y in decided)

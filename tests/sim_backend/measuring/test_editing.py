@@ -46,14 +46,6 @@ def test_a_value_changes_and_nothing_else() -> None:
     assert after == TEXT.replace(was, changed)
 
 
-def test_what_was_measured_before_is_forgotten() -> None:
-    path = ("defaults", "damping_ratio")
-    once = edit_text(FILE, TEXT, [Edit(path, 0.1, "0.1 +- 1 %")])
-    twice = edit_text(FILE, once, [Edit(path, 0.2, "0.2 +- 2 %")])
-    assert once.endswith("damping_ratio = 0.1 # measured: 0.1 +- 1 %\n")
-    assert twice.endswith("damping_ratio = 0.2 # measured: 0.2 +- 2 %\n")
-
-
 def test_a_new_value_comes_after_the_last_of_its_table() -> None:
     after = edit_text(FILE, TEXT, [Edit(DRIFT, 1e-8, "so")])
     assert "my = 0.1 } # linear\ndrift = 1e-08 # measured: so\n\n[defaults]" in after
