@@ -1,7 +1,5 @@
 """`tactile-rt align`: does a model represent touch as barrel cortex does?"""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from math import isfinite
 from pathlib import Path
@@ -11,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
@@ -42,12 +40,10 @@ def write_brain(
     (brain,) = take_sets("align example", sets or (), Brain)
     console = Console(stderr=True)
     with progress_bar(console, "recording", total=1.0) as update:
-        try:
+        with needing("align"):
             recordings, models = write_example(
                 folder, brain, seed, lambda share: update(completed=share)
             )
-        except ModuleNotFoundError as error:
-            raise needs("align", error) from None
     names = ", ".join(sorted(path.name for path in models.iterdir()))
     for line in (
         f"{recordings}: {brain.mice} mice; {models}: {names}",
@@ -90,7 +86,7 @@ def build_benchmark(
     console = Console(stderr=True)
     selection = Selection.of(task, sessions or (), depth, cells)
     with progress_bar(console, "building", total=1.0) as update:
-        try:
+        with needing("align"):
             made = build(
                 recordings,
                 protocol,
@@ -100,8 +96,6 @@ def build_benchmark(
                 selection,
                 clock,
             )
-        except ModuleNotFoundError as error:
-            raise needs("align", error) from None
     save_benchmark(made, out)
     told = {
         "benchmark": out, "animals": len(made.targets), "reliable": len(made.reliable),
@@ -131,7 +125,7 @@ def score_models(
     """Score every layer of some models against a benchmark."""
     for file in (json, page):
         check_output(file)
-    with needing_torch():
+    with needing("train"):
         if page:
             import matplotlib  # noqa: F401
         from tactile_rt.models.alignment.benchmark import load_benchmark
@@ -213,7 +207,7 @@ def decode_stimuli(
 ) -> None:
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
-    with needing_torch():
+    with needing("train"):
         from tactile_rt.models.alignment.benchmark import load_strict
         from tactile_rt.models.alignment.building import animal_means
         from tactile_rt.models.alignment.decoding import (
@@ -256,17 +250,8 @@ def decode_stimuli(
         _show_decoded(rows)
 
 
-@contextmanager
-def needing_torch() -> Iterator[None]:
-    """Say which extra brings what the block imports, where it is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
-
-
 def _write_report(results: "Results", path: Path) -> None:
-    with needing_torch():
+    with needing("train"):
         from tactile_rt.models.alignment.html_page import write_page
         from tactile_rt.models.alignment.report import report_page
 

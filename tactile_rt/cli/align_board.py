@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.align import align, needing_torch
-from tactile_rt.cli.app import check_output, needs
+from tactile_rt.cli.align import align
+from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Page, Seed, Sessions, Stimuli
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
@@ -73,12 +73,10 @@ def fetch_recordings(
         return
     if folder is None:
         raise ConfigError("name a folder to write to, or give --list")
-    try:
+    with needing("align"):
         with progress_bar(console, "fetching", total=1.0) as update:
             done = fetch(files, folder, _shown(update))
         mice, units, notes = counted([folder / file.name for file in files])
-    except ModuleNotFoundError as error:
-        raise needs("align", error) from None
     for note in notes:
         console.print(note, highlight=False, markup=False)
     size = sum(file.size for file in files)
@@ -125,7 +123,7 @@ def write_board(
     if not data:
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
     parts, models = list(dict.fromkeys(part or ["all"])), models or []
-    with needing_torch():
+    with needing("train"):
         from tactile_rt.models.alignment.board import joined, with_cells
         from tactile_rt.models.alignment.datasets import find_dataset
         from tactile_rt.models.alignment.loading import check_models, told_apart

@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperCommand
 
-from tactile_rt.cli.align import align, needing_torch
-from tactile_rt.cli.app import check_output
+from tactile_rt.cli.align import align
+from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Stimuli
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError, TactileError
@@ -79,7 +79,7 @@ def _gate(
         raise ConfigError("name a --benchmark to score on, or the --reference it was exported from")
     if baseline is not None and benchmark is None:
         raise ConfigError("--baseline needs the --benchmark that it was scored on")
-    with needing_torch():
+    with needing("train"):
         from tactile_rt.models.alignment.benchmark import load_strict
         from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
         from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import typer
 
-from tactile_rt.errors import ConfigError, TactileError
+from tactile_rt.errors import ConfigError
 from tactile_rt.extras import lacking
 from tactile_rt.version import VERSION
 
@@ -30,7 +30,6 @@ __all__ = [
     "check_text",
     "leaving",
     "needing",
-    "needs",
     "starting",
 ]
 
@@ -81,6 +80,8 @@ def starting() -> Iterator[None]:
     def note(number: int, frame: FrameType | None) -> None:
         nonlocal asked
         asked = True
+        if callable(before):
+            before(number, frame)
         raise KeyboardInterrupt
 
     before = signal.signal(signal.SIGINT, note)
@@ -103,7 +104,7 @@ def needing(extra: str) -> Iterator[None]:
         with starting():
             yield
     except ModuleNotFoundError as error:
-        raise needs(extra, error) from None
+        raise lacking("this needs", extra, error) from None
 
 
 @contextmanager
@@ -219,8 +220,3 @@ def check_new(file: Path, force: bool) -> None:
     from tactile_rt.recording.writer import check_not_recorded
 
     check_not_recorded(file)
-
-
-def needs(extra: str, error: ModuleNotFoundError) -> TactileError:
-    """The error to raise when a command's import fails: which extra brings it."""
-    return lacking("this needs", extra, error)

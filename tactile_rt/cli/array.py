@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.app import app, check_output, needing, starting
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, show_table, told_as_json
 from tactile_rt.errors import ConfigError
@@ -31,13 +31,10 @@ def show(json: Json = None) -> None:
 
     An animal's name takes a side: mouse-left, mouse-both.
     """
-    try:
-        with starting():
-            from tactile_rt import extensions
-            from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_animals
-            from tactile_rt.sim_backend.transducer import device_spec
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"):
+        from tactile_rt import extensions
+        from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_animals
+        from tactile_rt.sim_backend.transducer import device_spec
     found = []
     for name in (*SPECIES, *ROBOTS, *extensions.added_names(extensions.ARRAYS)):
         spec = device_spec(load_animals(name))
@@ -84,11 +81,8 @@ def fit(
         raise ConfigError(f"{described}: no such file")
     url = f"replay:{recording}?speed=0" if Path(recording).is_file() else recording
     check_source(url)
-    try:
-        with starting():
-            from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"):
+        from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
     from tactile_rt.calibration.taring import record
     from tactile_rt.files import write_whole
     from tactile_rt.stream import concatenate

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_folder, check_output, needs
+from tactile_rt.cli.app import app, check_folder, check_output, needing
 from tactile_rt.cli.options import Accelerator, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -36,12 +36,10 @@ def grid(
     wanted = read_grid(plan)
     if waiting_tasks(wanted, folder):
         SweepManifest.read(Path(wanted.data))
-    try:
+    with needing("train"):
         from tactile_rt.models.grid.picture import draw_grid
         from tactile_rt.models.grid.pool import run_grid
         from tactile_rt.models.grid.results import GridResults, gather, write_results
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     console = Console(stderr=True)
 
     def conclude() -> GridResults:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Json, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -61,19 +61,16 @@ def sweep(
         told_as_json({"set": folder, "files": files}, json)
         console.print(f"{folder}: {files} files are as they were written")
         return
-    try:
-        with starting():
-            from tactile_rt.sim_backend.arrays.files import load_animals
-            from tactile_rt.sim_backend.datasets.dataset import (
-                describe_set,
-                finished_objects,
-                make_sweeps,
-            )
-            from tactile_rt.sim_backend.datasets.inventory import tally
-            from tactile_rt.sim_backend.sweep_simulation import ringing
-            from tactile_rt.sim_backend.world import PROFILES
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"):
+        from tactile_rt.sim_backend.arrays.files import load_animals
+        from tactile_rt.sim_backend.datasets.dataset import (
+            describe_set,
+            finished_objects,
+            make_sweeps,
+        )
+        from tactile_rt.sim_backend.datasets.inventory import tally
+        from tactile_rt.sim_backend.sweep_simulation import ringing
+        from tactile_rt.sim_backend.world import PROFILES
     asked = {"profile": profile, "seed": seed}
     given = [f"{key}={value}" for key, value in asked.items() if value is not None]
     chosen = _recipe(folder, recipe, [*given, *(sets or ())])
@@ -109,11 +106,9 @@ def sweep(
 
 
 def _write_card(folder: Path) -> None:
-    try:
+    with needing("train"):
         import matplotlib  # noqa: F401
         import sklearn  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     from tactile_rt.models.svm import fit
     from tactile_rt.sim_backend.datasets.card import write_card
 

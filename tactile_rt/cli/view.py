@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.errors import ConfigError
@@ -49,7 +49,7 @@ def view(
     """Show a sweep: the scene with force arrows, the map of forces, their traces."""
     check_output(out)
     try:
-        with starting():
+        with needing("view"):
             from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
@@ -64,8 +64,6 @@ def view(
             )
             from tactile_rt.sim_backend.views.footage import VIEWS, record
             from tactile_rt.sim_backend.world import PROFILES, world_spec
-    except ModuleNotFoundError as error:
-        raise needs("view", error) from None
     except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver
         if "MUJOCO_GL" not in os.environ:
             raise

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, Json, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -66,20 +66,17 @@ def whisk(
         check_output(file)
     if json is not None and json.resolve() == beside.resolve():
         raise ConfigError(f"{json} goes beside {out} and says what is in it: name another")
-    try:
-        with starting():
-            import numpy as np
+    with needing("sim"):
+        import numpy as np
 
-            from tactile_rt.sim_backend.arrays.files import load_array
-            from tactile_rt.sim_backend.objects.catalogue import load_object
-            from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
-            from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input
-            from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
-            from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
-            from tactile_rt.sim_backend.whisking_source import Placing, parse_point
-            from tactile_rt.sim_backend.world import PROFILES, array_spec
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+        from tactile_rt.sim_backend.arrays.files import load_array
+        from tactile_rt.sim_backend.objects.catalogue import load_object
+        from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
+        from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input
+        from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
+        from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
+        from tactile_rt.sim_backend.whisking_source import Placing, parse_point
+        from tactile_rt.sim_backend.world import PROFILES, array_spec
     if profile not in PROFILES:
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
     animal = load_array(array)
