@@ -2,7 +2,6 @@
 
 import shlex
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -36,15 +35,6 @@ def test_from_a_checkout_it_is_the_checkout_that_is_installed(environment, tmp_p
     words = shlex.split(extras.install_extra("sim,view"))
     assert words[1:] == ["-m", "pip", "install", "--editable", f"{folder}[sim,view]"]
     assert words[0] == str(environment / "python")
-
-
-def test_this_is_a_checkout():
-    assert shlex.split(extras.install_extra("sim"))[-1] == f"{Path(__file__).parents[1]}[sim]"
-
-
-def test_otherwise_it_is_what_is_installed(environment, installed):
-    words = shlex.split(extras.install_extra("sim"))
-    assert words == [str(environment / "python"), "-m", "pip", "install", "tactile-rt[sim]"]
 
 
 def test_where_there_is_no_pip_uv_installs(environment, installed, monkeypatch):

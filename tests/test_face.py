@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import tactile_rt
 
 README = Path(tactile_rt.__file__).parents[1] / "README.md"
@@ -19,13 +17,6 @@ def test_every_name_is_there_and_listed_once_in_order() -> None:
     for name in tactile_rt.__all__:
         assert getattr(tactile_rt, name) is not None
     assert set(tactile_rt.__all__) <= set(dir(tactile_rt))
-
-
-def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="has no attribute 'Classifer'"):
-        tactile_rt.Classifer  # noqa: B018
-    with pytest.raises(ImportError):
-        from tactile_rt import Classifer  # noqa: F401
 
 
 def test_names_are_loaded_when_they_are_used() -> None:

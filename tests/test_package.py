@@ -146,19 +146,6 @@ def test_shipped_helpers_need_no_test_framework() -> None:
     assert not loaded & {"pytest", "_pytest", "hypothesis"}
 
 
-def test_every_error_a_user_can_make_is_one_line() -> None:
-    """No traceback, exit code 2."""
-    code = "import sys; from tactile_rt.cli import main; sys.argv[0] = 'tactile-rt'; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "run", "--source", "smi:mouse"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert "did you mean sim:?" in done.stderr
-
-
 def test_what_is_pinned_installs_with_the_oldest_python() -> None:
     """Such as Debian 12's, which is older than what these tests mostly run with."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -10,7 +10,7 @@ import pytest
 
 import tactile_rt
 from tests.helpers.commands import commands, options_of
-from tests.helpers.followed_page import Block, blocks, check_printed, follow
+from tests.helpers.followed_page import follow
 from tests.helpers.source_tree import ROOT
 
 DOCS = ROOT / "docs"
@@ -54,18 +54,6 @@ def test_a_page_that_lies_is_caught(tmp_path, monkeypatch) -> None:
         monkeypatch.setattr(Path, "read_text", lambda self, *a, text=text: text)
         with monkeypatch.context() as patch, pytest.raises(AssertionError, match=said):
             follow(page, here, patch)
-
-
-def test_what_is_printed_is_compared_word_by_word() -> None:
-    check_printed("one  two\nthree", "one two three\n")
-    check_printed("took 0.3 s\n", "took ... s")
-    with pytest.raises(AssertionError, match="but this is printed"):
-        check_printed("one two", "one")
-
-
-def test_blocks_are_found_with_their_titles() -> None:
-    page = '# A\n```toml title="a.toml"\nx = 1\n```\ntext\n```sh\nls\n```\n'
-    assert blocks(page) == [Block("toml", "a.toml", "x = 1\n", 2), Block("sh", "", "ls\n", 6)]
 
 
 # links

@@ -52,7 +52,6 @@ def test_each_takes_what_it_knows():
     ("fields", "said"),
     [
         ({"bade": "1"}, "sensor has no option 'bade'; did you mean baud?"),
-        ({"zzz": "1"}, "sensor has no option 'zzz'; there are baud, dtr"),
         ({"baud": "fast"}, "sensor: baud: expected a whole number, got 'fast'"),
         ({"baud": "0x" + 5000 * "f"}, "sensor: baud: expected a whole number, got '0xffff"),
         ({"dtr": "maybe"}, "sensor: dtr: expected true or false, got 'maybe'"),
@@ -134,11 +133,8 @@ def test_a_document_becomes_a_struct():
     [
         ("kind = 'fats'", "x.toml:1: kind: 'fats' is not one of slow, fast; did you mean fast?"),
         ("name = 'A'", "x.toml:1: name: 'A' is no word: a to z"),
-        ("name = 3", "x.toml:1: name: expected text, got 3"),
         ("knid = 1", "x.toml:1: the file has no key 'knid'; did you mean kind?"),
-        ("zzz = 1", "x.toml:1: the file has no key 'zzz'; there are kind, name, elements, limit,"),
         ("\n[elements.A]\ngird = 1", "x.toml:3: elements.A has no key 'gird'; did you mean grid?"),
-        ("elements = 3", "x.toml:1: elements: expected a table, got 3"),
         ("[elements]\nA0 = 3", "x.toml:2: elements.A0 is a table of keys, not 3"),
         ("[elements.A0]\ngrid = [1]",
          "x.toml:2: elements.A0.grid: expected a list of 2 whole numbers, got [1]"),
@@ -158,7 +154,6 @@ def test_a_document_becomes_a_struct():
         ("[matrix]\nB0 = [[1, 2], [3, 'x']]",
          "x.toml:2: matrix.B0[1][1]: expected a number, got 'x'"),
         ("level = 10", "x.toml:1: level: expected a whole number <= 9, got 10"),
-        ("level = 'x'", "x.toml:1: level: expected a whole number, got 'x'"),
         ("texts = []", "x.toml:1: texts: must not be empty"),
     ],
 )  # fmt: skip

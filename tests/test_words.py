@@ -33,12 +33,6 @@ def test_every_word_stands_once_and_is_explained() -> None:
         assert len(meaning.split()) >= 5, word
 
 
-def test_each_table_is_in_the_order_of_the_alphabet() -> None:
-    for table in PAGE.read_text("utf-8").split("\n## ")[1:]:
-        words = re.findall(r"^\| ([^|`]+?) \|", table, re.M)[1:]
-        assert words == sorted(words, key=str.casefold)
-
-
 def test_the_names_in_code_are_there() -> None:
     named = {name for *_, code in rows() for name in re.findall(r"`(\w+)`", code)}
     assert len(named) > 20

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 from urllib.parse import unquote
 
 import typer
@@ -17,6 +18,9 @@ import typer
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import lacking
 from tactile_rt.version import VERSION
+
+if TYPE_CHECKING:
+    from tactile_rt.stream import Source
 
 __all__ = [
     "INTERRUPTED",
@@ -30,6 +34,7 @@ __all__ = [
     "check_text",
     "leaving",
     "needing",
+    "open_url",
     "starting",
 ]
 
@@ -95,6 +100,14 @@ def starting() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if asked:
         raise KeyboardInterrupt
+
+
+def open_url(url: str) -> "Source":
+    """Open a source of samples; Ctrl-C ends it even where a library swallows it."""
+    from tactile_rt.sources.opening import open_source
+
+    with starting():
+        return open_source(url)
 
 
 @contextmanager

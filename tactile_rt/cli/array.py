@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app, check_output, needing, starting
+from tactile_rt.cli.app import app, check_output, needing, open_url
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, show_table, told_as_json
 from tactile_rt.errors import ConfigError
@@ -75,7 +75,7 @@ def fit(
     """
     for file in (out, json):
         check_output(file)
-    from tactile_rt.sources.opening import check_source, open_source
+    from tactile_rt.sources.opening import check_source
 
     if not described.is_file():
         raise ConfigError(f"{described}: no such file")
@@ -87,8 +87,7 @@ def fit(
     from tactile_rt.files import write_whole
     from tactile_rt.stream import concatenate
 
-    with starting():
-        source = open_source(url)
+    source = open_url(url)
     with source:
         read_described(described, source.spec)  # a mistake is told before the reading
         chunks = record(source, seconds)

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_records
 from tactile_rt.errors import ConfigError, name_some
 
@@ -55,7 +55,7 @@ def bench(
         raise ConfigError("--resume goes with faults: tactile-rt bench faults --resume FILE")
     console, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
-        with working(console, f"measuring {name}"):
+        with progress_bar(console, f"measuring {name}"):
             with needing(AREAS.get(name, "train")):
                 if name == FAULTS:
                     rig = _rig("daemon", "faults")

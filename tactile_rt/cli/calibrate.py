@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.app import app, check_output, open_url
 from tactile_rt.cli.options import STDOUT, Json, Url
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError, name_some
 
@@ -47,19 +47,17 @@ def tare(
     """
     from tactile_rt.calibration import Calibration, calibration_path, save_calibration
     from tactile_rt.calibration import tare as measure
-    from tactile_rt.sources.opening import open_source
 
     for file in (out, json):
         check_output(file)
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     with opened:
         raw, before = _find_raw(opened, source)
         name = device or (before.device if before else _own_id(raw))
         path = out or calibration_path(name)
         known = _existing(path, device) or before or Calibration.of(name, raw.spec)
         known.output_spec(raw.spec)  # refuses another array now, not after the reading
-        with working(Console(stderr=True), f"do not touch {raw.spec.name}"):
+        with progress_bar(Console(stderr=True), f"do not touch {raw.spec.name}"):
             measured = measure(raw, seconds)
     untared = set(measured.untared)
     tared = [i for i, e in enumerate(raw.spec.elements) if e not in untared]
@@ -187,13 +185,11 @@ def _existing(path: Path, device: str) -> "Calibration | None":
 def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
     """The raw samples that the times of a table are of."""
     from tactile_rt.calibration.taring import record
-    from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import concatenate
 
     if not url:
         raise ConfigError(f"{table} has times: name the recording they are in with --source")
-    with starting():
-        opened = open_source(url)
+    opened = open_url(url)
     with opened:
         raw, _ = _find_raw(opened, url)
         return concatenate(record(raw, float(loads.times.max()))), raw.spec

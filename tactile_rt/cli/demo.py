@@ -25,7 +25,7 @@ from rich.text import Text
 
 from tactile_rt.cli.app import app, leaving, needing
 from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
@@ -117,7 +117,7 @@ def demo(
         do = "leave out --recorded" if simulated else install_extra("sim")
         raise ConfigError(f"--fast and --seed are for a simulation: {do}")
     recorded |= not simulated
-    with needing("sim"), working(Console(stderr=True), "building the array and the objects"):
+    with needing("sim"), progress_bar(Console(stderr=True), "building the array and the objects"):
         demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     with leaving(seconds), demonstration:
         if console.width < WIDTH or not console.is_terminal or console.is_dumb_terminal:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, leaving, starting
+from tactile_rt.cli.app import app, check_output, leaving, open_url
 from tactile_rt.cli.options import STDOUT, Json, Seconds, Url
 from tactile_rt.cli.tables import show_table, told_as_json
 
@@ -116,10 +116,9 @@ def describe(
     import msgspec
 
     from tactile_rt.files import write_whole
-    from tactile_rt.sources.opening import open_source
 
     check_output(out)
-    with starting(), open_source(source) as opened:
+    with open_url(source) as opened:
         text = msgspec.json.format(opened.spec.to_json().encode(), indent=1) + b"\n"
     if out is None:
         typer.echo(text, nl=False)
@@ -132,10 +131,7 @@ def echo(source: Url, seconds: Seconds = None) -> None:
     """Print every sample as one line of JSON: seq, t_ns, values (element by channel), valid."""
     import msgspec
 
-    from tactile_rt.sources.opening import open_source
-
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     with opened, leaving(seconds):
         for chunk in opened:
             for k in range(len(chunk)):
@@ -153,11 +149,9 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     """Print once a second: the rate, the jitter of arrival, what was lost, the device's state."""
     import numpy as np
 
-    from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import EndOfStream
 
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     looks: list[dict[str, Any]] = []
     with opened, leaving(None):
         spec = opened.spec

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, leaving, needing, starting
+from tactile_rt.cli.app import app, leaving, needing, open_url
 from tactile_rt.cli.options import Fast, Faults, ProjectFolder, set_option
 from tactile_rt.errors import ConfigError
 
@@ -63,7 +63,6 @@ def emulate(
     from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
     from tactile_rt.drivers.emulation.faults import read_faults
     from tactile_rt.drivers.opening import make_codec
-    from tactile_rt.sources.opening import open_source
 
     fields = codec_options(sets or [])
     if project is not None:
@@ -97,8 +96,7 @@ def emulate(
         "seconds": seconds,
         "log": False,
     }
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     device: EmulatedDevice | None = None
     with leaving(None), opened:
         if wire == "serial":

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_records
 
 
@@ -32,6 +32,6 @@ def evaluate(
     SweepManifest.read(data)
     with needing("train"):
         from tactile_rt.evidence.classification import evaluate_model
-    with working(Console(stderr=True), "evaluating"):
+    with progress_bar(Console(stderr=True), "evaluating"):
         records = evaluate_model(model, data, svm, pictures, quick)
     show_records(records, json)

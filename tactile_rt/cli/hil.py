@@ -8,10 +8,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, leaving, starting
+from tactile_rt.cli.app import INTERRUPTED, app, leaving, open_url
 from tactile_rt.cli.emulate import codec_options, open_project
 from tactile_rt.cli.options import Faults, Json, Model, ProjectFolder, set_option
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError
 
@@ -58,7 +58,6 @@ def hil(
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.drivers.emulation.faults import read_faults
     from tactile_rt.evidence.hil import Loop, check_line
-    from tactile_rt.sources.opening import open_source
 
     fields = codec_options(sets or [])
     if project is not None:
@@ -82,14 +81,13 @@ def hil(
     elif sweeps is not None:
         raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
     console = Console(stderr=True)
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     try:
         loop = Loop(opened, file, wire, codec, fields, schedule, seconds)
     except BaseException:
         opened.close()
         raise
-    with leaving(None), working(console, f"{codec} over {wire}"):
+    with leaving(None), progress_bar(console, f"{codec} over {wire}"):
         loop.run()
     report = loop.report()
     told = {

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, starting
 from tactile_rt.cli.options import Force, Json
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 
@@ -61,7 +61,7 @@ def import_file(
     check_new(output, force)
     if decimal not in ("", ",", "."):
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
-    with starting(), working(Console(stderr=True), f"reading {log}"):
+    with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
         from tactile_rt.drivers.logs import read_log
         from tactile_rt.recording.importing.bag import import_bag, is_bag
         from tactile_rt.recording.importing.csv import csv_form, read_table

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output
 from tactile_rt.cli.options import STDOUT, Json
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
 from tactile_rt.errors import ModelError
 
@@ -132,7 +132,7 @@ def bench(
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
     check_output(json)
-    with working(Console(stderr=True), "measuring"):
+    with progress_bar(Console(stderr=True), "measuring"):
         records = measure_model(Subject("model", file), steps)
     show_records(records, json)
 

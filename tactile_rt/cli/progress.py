@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import partial
 
 from rich.console import Console
@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["progress_bar", "working"]
+__all__ = ["progress_bar"]
 
 A_DAY_S = 86_400.0
 LINE_S = 10.0  # between lines where there is no terminal
@@ -37,9 +37,7 @@ def progress_bar(
     reads a log file sees that it goes on; what is done before then says nothing.
 
     Args:
-        console: where.
-        what: is going on.
-        total: of the work; None until it is known.
+        total: of the work; None where its end is not known.
         completed: was done before, and says nothing about the time left.
         counted: show how many of the total are done, not what share.
 
@@ -71,11 +69,6 @@ def progress_bar(
             done.set()
             if progress.disable:
                 lines.join()
-
-
-def working(console: Console, what: str) -> AbstractContextManager[Update]:
-    """Show that work goes on whose end is not known, as `progress_bar` does."""
-    return progress_bar(console, what)
 
 
 def _print_lines(console: Console, task: Task, counted: bool, done: threading.Event) -> None:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leaving, starting
+from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leaving, open_url
 from tactile_rt.cli.options import Force, Json, Seconds, Url
-from tactile_rt.cli.progress import working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import no_such
@@ -40,15 +40,13 @@ def record(
     makes a whole file, too.
     """
     from tactile_rt.recording import StreamWriter
-    from tactile_rt.sources.opening import open_source
 
     for file in (output, json):
         check_output(file)
     check_is_mcap(output)
     check_new(output, force)  # before a device is opened and started
     session = _notes(note or [])
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     with (
         opened,
         StreamWriter(output, opened, url=source, session=session, force=force) as writer,
@@ -125,7 +123,7 @@ def recover(
 
     for file in (out, json):
         check_output(file)
-    with working(Console(stderr=True), f"reading {recording}"):
+    with progress_bar(Console(stderr=True), f"reading {recording}"):
         made = recovered(recording, out, force)
         n, first, last = 0, 0, 0
         for chunk in Recording(made):
@@ -179,7 +177,7 @@ def convert(
     check_output(json)
     console = Console(stderr=True)
     if to:
-        with working(console, f"writing for {to}"):
+        with progress_bar(console, f"writing for {to}"):
             told = _as_folder(to, files, fps, task, video or [], force)
         _tell(told, json)
         return
@@ -187,7 +185,7 @@ def convert(
         raise ConfigError("name a recording and what to write, or say what --to")
     recording, output = files
     check_new(output, force)
-    with working(console, f"converting {recording}"):
+    with progress_bar(console, f"converting {recording}"):
         samples = converted(recording, output)
     _tell({"output": output, "samples": samples}, json)
 

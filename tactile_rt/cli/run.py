@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, leaving, starting
+from tactile_rt.cli.app import app, leaving, open_url
 from tactile_rt.cli.daemon import Settings, serve
 from tactile_rt.cli.options import Model, Seconds
 from tactile_rt.errors import ConfigError, SpecMismatch
@@ -59,13 +59,12 @@ def run(
     from tactile_rt.classifier.classifier import Classifier
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.classifier.session import Session
-    from tactile_rt.sources.opening import check_model, is_made_up, open_source
+    from tactile_rt.sources.opening import check_model, is_made_up
 
     file = model or shipped_model()
     samples = printed = 0
     check_model(file, source)
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     with opened:
         try:
             classifier = Classifier(file, opened.spec)

@@ -1,7 +1,6 @@
 """`tactile-rt sniff`: which codec, speed or columns fit a port, a bus, or a file."""
 
 import shlex
-import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 from urllib.parse import quote, urlencode
@@ -65,7 +64,7 @@ def sniff(
     with starting(), leaving(None):
         if target.startswith("can:"):
             _sniff_bus(target, seconds, candidates, ask, told)
-        elif target.startswith(("serial:", "socket:", "rfc2217:")) or _is_port(path):
+        elif target.startswith(("serial:", "socket:", "rfc2217:")) or path.is_char_device():
             port = str(path) if path.exists() else target.removeprefix("serial:")
             _sniff_port(port, seconds, baud, candidates, ask, told)
         elif path.exists():
@@ -110,13 +109,6 @@ class _Told:
         self.say(f"{what}{f': {hint}' if hint else ''}")
         told_as_json(self._all, self._json)
         raise typer.Exit(NOTHING)
-
-
-def _is_port(path: Path) -> bool:
-    try:
-        return stat.S_ISCHR(path.stat().st_mode)
-    except OSError:
-        return False
 
 
 # lines

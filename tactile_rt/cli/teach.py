@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactile_rt.cli.app import app, check_folder, check_output, check_text, leaving, starting
+from tactile_rt.cli.app import app, check_folder, check_output, check_text, leaving, open_url
 from tactile_rt.cli.options import Json, Seconds, Url
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
@@ -60,7 +60,6 @@ def teach(
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.locks import alone_in
     from tactile_rt.recording.labels import LABELS
-    from tactile_rt.sources.opening import open_source
     from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
@@ -78,8 +77,7 @@ def teach(
     if json is not None and json.resolve() in {one.resolve() for one in kept}:
         raise ConfigError(f"--json {json} is a file of the lesson, or its model: name another")
     lesson = _begun_before(folder, base)
-    with starting():
-        opened = open_source(source)
+    opened = open_url(source)
     with opened, alone_in(folder), Orders(at) as orders, leaving(seconds):
         lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
         orders.teacher = Teacher(lesson, wanted, touches)

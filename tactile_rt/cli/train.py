@@ -9,7 +9,7 @@ from rich.console import Console
 
 from tactile_rt.cli.app import app, check_folder, check_output, needing
 from tactile_rt.cli.options import Accelerator, Json, Seed, set_option
-from tactile_rt.cli.progress import progress_bar, working
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_table, told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.locks import alone_in
@@ -215,7 +215,7 @@ def export(
     with needing("train"):
         from tactile_rt.export.release import release
     console = Console(stderr=True)
-    with working(console, "calibrating, exporting and checking parity"):
+    with progress_bar(console, "calibrating, exporting and checking parity"):
         card = release(
             checkpoint,
             model,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.errors import ConfigError
-from tactile_rt.teaching.head import FEWEST, LeftOut
+from tactile_rt.teaching.head import FEWEST, LeftOut, check_enough
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
 
 __all__ = [
@@ -97,9 +97,7 @@ def fit_further(card: ModelCard, features: Floats, labels: Sequence[str]) -> Fur
             class has fewer than two touches.
     """
     check_further(card, labels)
-    for name in dict.fromkeys(labels):
-        if list(labels).count(name) < FEWEST:
-            raise ConfigError(f"there is one touch of {name!r}; a class needs {FEWEST} at least")
+    check_enough(labels)
     assert card.embeddings is not None
     means, covariance = card.embeddings.arrays(len(card.classes), card.embedding)
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)

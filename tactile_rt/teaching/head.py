@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
 
-__all__ = ["FEWEST", "LeftOut", "TouchClasses", "fit_classes", "leave_out"]
+__all__ = ["FEWEST", "LeftOut", "TouchClasses", "check_enough", "fit_classes", "leave_out"]
 
 FEWEST = 2  # touches of a class
 AXES = 16  # directions in which touches of a class differ
@@ -94,7 +94,7 @@ def fit_classes(
     Raises:
         ConfigError: a class with fewer than two touches.
     """
-    _check(labels)
+    check_enough(labels)
     left_out = left_out or leave_out(features, labels, kinds)
     nearest = left_out.distances.min(axis=2)  # (touch, step)
     rank = min(len(labels) - 1, int(np.ceil((1 - REFUSED) * (len(labels) + 1))) - 1)
@@ -120,7 +120,7 @@ def leave_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -
     Raises:
         ConfigError: a class with fewer than two touches.
     """
-    _check(labels)
+    check_enough(labels)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
     turn = np.empty(len(own), dtype=int)
     for k in range(len(classes)):
@@ -137,7 +137,8 @@ def leave_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -
     return LeftOut(distances, distances[:, -1].argmin(axis=1) == own)
 
 
-def _check(labels: Sequence[str]) -> None:
+def check_enough(labels: Sequence[str]) -> None:
+    """Refuse labels of which one has fewer than two touches."""
     for name in dict.fromkeys(labels):
         if list(labels).count(name) < FEWEST:
             raise ConfigError(f"there is one touch of {name!r}; a class needs {FEWEST} at least")

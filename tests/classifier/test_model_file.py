@@ -57,20 +57,10 @@ def test_a_batch_frozen_into_the_graph_is_refused_unless_it_is_one(tmp_path: Pat
         load_model(write_model(tmp_path / "m.onnx", GRAPH.replace("[B", "[2")))
 
 
-@pytest.mark.parametrize("content", [b"", b"garbage" * 100, b"\x08\x08", b"PK\x03\x04"])
-def test_a_file_that_is_not_onnx_is_named_in_one_line(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "m.onnx"
-    path.write_bytes(content)
-    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: .+") as caught:
-        load_model(path)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("content", "said"),
     [
         (b"", "it is empty"),
-        (b"garbage" * 100, "it is text"),
         (b'{\n\t"version": 2}', "it is text"),
         (
             b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
@@ -84,8 +74,11 @@ def test_what_is_often_taken_for_a_model_is_named(
 ) -> None:
     path = tmp_path / "m.onnx"
     path.write_bytes(content)
-    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: .*{said}"):
-        read_model(path)
+    with pytest.raises(
+        ModelError, match=f"^{path} is not a readable ONNX model: .*{said}"
+    ) as caught:
+        load_model(path)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -119,13 +112,6 @@ def test_other_names_are_found_without_running_it(
             read_model(path)
     stored = GRAPH.replace("float[B,3,2] sigma,", "float[B,3,2] sigma, int64[1] one,")
     assert read_model(write_model(tmp_path / "m.onnx", stored))[0] == CARD
-
-
-def test_a_model_cut_short_is_named(tmp_path: Path) -> None:
-    path = write_model(tmp_path / "m.onnx")
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ModelError, match=f"^{path} "):
-        load_model(path)
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
@@ -166,8 +152,6 @@ def card_with(**fields: object) -> str:
     ("metadata", "complaint"),
     [
         ("{", "has damaged metadata"),
-        ("[1]", "has damaged metadata"),
-        (card_with(version=2), "has metadata of version 2; this release reads 3"),
         ("{}", "has metadata of version None; this release reads 3"),
         (card_with(version=4), "has metadata of version 4; this release reads 3"),
         ('{"version": 3}', "has damaged metadata: .*missing required field"),
@@ -243,20 +227,12 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"period_ns": 0}, "period_ns must be positive"),
         ({"steps": 0}, "steps must be positive"),
         ({"temperature": 0.0}, "temperature must be positive"),
-        ({"temperature": -1.0}, "temperature must be positive"),
         ({"floor": (1e-3,)}, "1 values of floor for 2 channels"),
-        ({"clip": (1.0, 1.0, 1.0)}, "3 values of clip for 2 channels"),
-        ({"scale": ()}, "0 values of scale for 2 channels"),
         ({"floor": (1e-3, 0.0)}, "floor must be positive"),
-        ({"steps": 10**9}, "1000000000 steps"),
         ({"period_ns": 1}, "4 steps of 3 sub-steps of 1 ns"),
-        ({"period_ns": 10**13}, "4 steps of 3 sub-steps of 10000000000000 ns"),
         ({"substeps": 10**12}, "samples of shape 1000000000000x3x2"),
         ({"labels": ("a", "a", "b", "c", "d")}, "labels are missing or repeat"),
-        ({"labels": ()}, "labels are missing or repeat"),
         ({"labels": ("a", "b", "c", "d", "\x1b[2J")}, "labels must be 1 to 200 printable"),
-        ({"labels": ("a", "b", "c", "d", "")}, "labels must be 1 to 200 printable characters"),
-        ({"labels": ("a", "b", "c", "d", "e" * 201)}, "labels must be 1 to 200 printable"),
         ({"name": "x" * 3_000_000}, "a name of 3000000 characters"),
         ({"license": "\x1b[2J"}, "a licence must be at most 200 printable characters"),
         ({"steps": 1_000_000}, "an episode of 18000000 values"),
@@ -269,21 +245,16 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"state": (CARD.state[0], StateTensor("total", (1,), "object"))}, "total of type"),
         ({"probe": ((0.0,) * 5,) * 3}, "the probe is not 4 steps of 5 logits"),
         ({"embedding": 0}, "an embedding of 0 units"),
-        ({"embedding": -2}, "an embedding of -2 units"),
         ({"sensor": "quiet"}, r"Expected `object`, got `str` - at `\$.sensor`"),
         ({"refusals": ("steps",)}, "refusals are not the last of the labels"),
         ({"refusals": LABELS}, "there are no labels but refusals"),
         ({"unknown": replaced(UNKNOWN, score="")}, "unknown.score must be 1 to 200 printable"),
         ({"unknown": replaced(UNKNOWN, output="state")}, r"Invalid enum .*\$.unknown.output"),
         ({"unknown": replaced(UNKNOWN, thresholds=())}, "unknown.thresholds: 0 values, neither 1"),
-        ({"unknown": replaced(UNKNOWN, thresholds=(1.0, 2.0))}, "unknown.thresholds: 2 values, ne"),
-        ({"unknown": replaced(UNKNOWN, thresholds=(None,))}, r"Expected `float`.*unknown.thresh"),
         ({"candidates": (PROMISE, replaced(PROMISE, coverage=1.0))},
          r"candidates\[1\].coverage is 1, not between 0 and 1"),
-        ({"candidates": (replaced(PROMISE, coverage=0.0),)}, r"candidates\[0\].coverage is 0, not"),
         ({"candidates": (replaced(PROMISE, quantiles=(0.1,)),)},
          r"candidates\[0\].quantiles: 1 values for 4 steps"),
-        ({"candidates": (replaced(PROMISE, score="\x1b[2J"),)}, r"candidates\[0\].score must be 1"),
         ({"candidates": (replaced(PROMISE, objects=0),)}, r"candidates\[0\].objects is 0, must be"),
         ({"candidates": (replaced(PROMISE, noise=-1.0),)}, r"candidates\[0\].noise is -1, must be"),
         ({"kind": "window"}, "a window has no state"),

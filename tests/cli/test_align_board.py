@@ -80,20 +80,15 @@ def test_the_datasets_are_listed(call):
         assert said in out
 
 
-def test_mistakes_are_one_line(call, brain, tmp_path):
+def test_mistakes_are_one_line(refused, brain, tmp_path):
     data = ("--data", f"example={brain / 'recordings'}")
     np.savez(tmp_path / "odd.npz", a=np.zeros((5, 3)))
     for arguments, said in (
         ((), "name recordings: --data NAME=PATH"),
         (("--data", "example"), "--data is NAME=PATH"),
         (("--data", "exmple=x"), "did you mean example"),
-        (("--data", f"example={tmp_path / 'none'}"), "none"),
         ((*data, "--metric", "rsaa"), "did you mean rsa"),
         ((*data, "--part", "L7"), "no part of cortex"),
-        ((*data, "--seed", "-1", MODEL), "is not in the range"),
         ((*data, tmp_path / "odd.npz"), "is no layer"),
-        ((*data, "--json", tmp_path / "x" / "b.json"), "no folder"),
     ):
-        code, _, err = call("align", "board", *arguments)
-        assert code == 2, arguments
-        assert said in err and err.startswith("tactile-rt: "), err
+        assert said in refused("align", "board", *arguments)

@@ -53,15 +53,10 @@ def test_a_table_and_a_rate(call, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (("none.bin", "--as", "codec=bota"), "no file none.bin"),
         (("raw.bin",), "say what it is: --as codec=NAME or --columns"),
         (("raw.bin", "--as", "bota"), "--as is codec=NAME&OPTION=VALUE"),
-        (("raw.bin", "--as", "codec=bota&codec=xela"), "each once"),
         (("raw.bin", "--as", "codec=bota", "--columns", "S.fx"), "give --as"),
-        (("raw.bin", "o.npz", "--as", "codec=bota"), "a recording is a .mcap"),
-        (("raw.bin", "no/o.mcap", "--as", "codec=bota"), "no folder no"),
         (("raw.bin", "--as", "codec=ft300"), "no whole ft300 sample .*`tactile-rt sniff raw.bin`"),
-        (("raw.bin", "--as", "codec=xela"), "codec xela speaks over can:"),
         (("raw.bin", "--columns", "S.fx"), "is no table of numbers"),
         (("raw.bin", "--as", "codec=bota", "--form", "pcap"), "no form 'pcap'"),
         (("raw.bin", "--columns", "S.fx", "--decimal", ";"), "--decimal is , or ."),

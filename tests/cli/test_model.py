@@ -110,23 +110,16 @@ def test_verify_a_sealed_file(call, sealed):
     assert "parity: logits within 0.0e+00 of those stored" in out
 
 
-def test_verify_says_what_a_file_does_not_store(call):
-    code, out, _ = call("model", "verify", shipped_model())
-    assert code == 0
-    assert "probe: 22 finite steps, the same again after a reset" in out
-
-
 def test_verify_finds_another_graph(call, sealed):
     path = sealed(hashes={"graph": "0" * 64})
     code, _, err = call("model", "verify", path)
-    assert code == 2
+    assert (code, err.count("\n")) == (2, 1)
     assert f"{path}: the graph is another than was exported: sha256 " in err
-    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
     ("precision", "difference", "right"),
-    [("fp32", 2e-3, False), ("fp32", 1e-5, True), ("int8", 2e-3, True), ("int8", 0.5, False)],
+    [("fp32", 2e-3, False), ("fp32", 1e-5, True), ("int8", 2e-3, True)],
 )
 def test_verify_compares_the_probe_at_the_precision_s_bar(
     call, sealed, precision, difference, right
@@ -158,8 +151,6 @@ def test_bench_times_steps(call, sealed):
         assert f"inference.model.{said}" in out
 
 
-def test_bench_refuses_a_window(call, tmp_path):
+def test_bench_refuses_a_window(refused, tmp_path):
     path = write_model(tmp_path / "m.onnx", WINDOW, kind="window", state=())
-    code, _, err = call("model", "bench", path)
-    assert code == 2
-    assert "only steps are timed" in err
+    assert "only steps are timed" in refused("model", "bench", path)

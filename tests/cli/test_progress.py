@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from tactile_rt.cli import progress
-from tactile_rt.cli.progress import describe_task, progress_bar, working
+from tactile_rt.cli.progress import describe_task, progress_bar
 from tests.helpers.waiting import until
 
 
@@ -61,7 +61,7 @@ def test_shares_are_per_cent_and_long_times_are_minutes_and_hours(bar):
 def test_a_log_file_gets_a_line_whenever_one_is_due(monkeypatch):
     monkeypatch.setattr(progress, "LINE_S", 0.01)
     console = Console(file=io.StringIO())
-    with working(console, "[x] reading") as update:
+    with progress_bar(console, "[x] reading") as update:
         until(lambda: console.file.getvalue().startswith("[x] reading: 0 s so far\n"))
         update(description="fitting")
         until(lambda: "\nfitting: " in console.file.getvalue())
@@ -71,6 +71,6 @@ def test_what_is_done_or_fails_before_a_line_is_due_says_nothing():
     console = Console(file=io.StringIO())
     with progress_bar(console, "objects", total=2) as update:
         update(advance=1)
-    with pytest.raises(ZeroDivisionError), working(console, "objects"):
+    with pytest.raises(ZeroDivisionError), progress_bar(console, "objects"):
         raise ZeroDivisionError
     assert console.file.getvalue() == ""

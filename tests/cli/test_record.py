@@ -1,27 +1,15 @@
 """`tactile-rt record`, `recover` and `convert`: what they write, say and refuse."""
 
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from tactile_rt.recording import Recording
 from tactile_rt.testing import FakeSerial
+from tests.helpers.processes import start_program
 
 SOURCE = "synthetic:2x3?pace=fast&seconds=0.3"
-PROGRAM = "import sys; from tactile_rt.cli import main; sys.argv[0] = 'tactile-rt'; main()"
-
-
-def start(*arguments):
-    """Run the command line in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
 
 
 @pytest.fixture
@@ -57,7 +45,7 @@ def test_a_device_s_packets_are_recorded_and_it_tells_how_it_goes(call, path):
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_a_whole_file(end, path):
-    with start("record", "synthetic:2x3", path) as process:
+    with start_program("record", "synthetic:2x3", path) as process:
         assert process.stderr.readline().split()[1] == "samples,"
         process.send_signal(end)
         out, _ = process.communicate(timeout=10)
@@ -66,14 +54,12 @@ def test_a_signal_ends_it_with_a_whole_file(end, path):
     assert samples(path) == int(out.split()[1]) > 500
 
 
-def test_what_is_left_of_a_killed_one_is_recovered(call, path):
-    with start("record", "synthetic:2x3", path) as process:
+def test_what_is_left_of_a_killed_one_is_recovered(call, refused, path):
+    with start_program("record", "synthetic:2x3", path) as process:
         told = int(process.stderr.readline().split()[0])
         process.kill()
         process.communicate(timeout=10)
-    code, _, err = call("convert", path, path.with_name("out.npz"))
-    assert code == 2
-    assert "`tactile-rt recover" in err
+    assert "`tactile-rt recover" in refused("convert", path, path.with_name("out.npz"))
     assert not path.with_name("out.npz").exists()
     code, out, err = call("recover", path)
     made = path.with_name("run.recovered.mcap")
@@ -108,7 +94,7 @@ def test_a_bag_is_made_of_one_recording_or_more(call, path):
     assert call("convert", path, path, bag, "--to", "ros2", "--force")[1] == f"{bag}: 600 samples\n"
 
 
-def test_a_lerobot_dataset_is_made(call, path):
+def test_a_lerobot_dataset_is_made(call, refused, path):
     pytest.importorskip("pyarrow")
     call("record", SOURCE, path)
     made = path.with_name("run-lerobot")
@@ -116,15 +102,15 @@ def test_a_lerobot_dataset_is_made(call, path):
     assert (code, out, err) == (0, f"{made}: 300 samples, 1 episodes\n", "")
     precious = path.with_name("precious")
     precious.mkdir()
-    code, _, err = call("convert", path, precious, "--to", "lerobot", "--force")
-    assert code == 2 and "nothing that --to lerobot made" in err
+    assert "nothing that --to lerobot made" in refused(
+        "convert", path, precious, "--to", "lerobot", "--force"
+    )
 
 
-def test_a_file_that_is_there_is_not_written_over(call, path):
+def test_a_file_that_is_there_is_not_written_over(call, refused, path):
     path.write_bytes(b"precious")
-    code, out, err = call("record", SOURCE, path)
-    assert (code, out) == (2, "")
-    assert err == f"tactile-rt: {path} is there already: name another file, or give --force\n"
+    said = refused("record", SOURCE, path)
+    assert said == f"tactile-rt: {path} is there already: name another file, or give --force\n"
     assert path.read_bytes() == b"precious"
     assert call("record", SOURCE, path, "--force")[0] == 0
     assert samples(path) == 300
@@ -147,7 +133,7 @@ def test_what_another_process_is_recording_is_not_replaced(
     assert call("record", SOURCE, "whole.mcap")[0] == 0
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:-200])
     there = sorted(tmp_path.iterdir())
-    other = start("record", "synthetic:2x3", path)
+    other = start_program("record", "synthetic:2x3", path)
     try:
         assert "samples" in other.stderr.readline()  # it is at it
         said = f"tactile-rt: {path.name} is being recorded right now: "
@@ -166,27 +152,16 @@ def test_what_another_process_is_recording_is_not_replaced(
     [
         (("record", SOURCE, "none/x.mcap"), "no folder none to write x.mcap in"),
         (("record", SOURCE, "run.csv"), "run.csv: a recording is a .mcap; `tactile-rt convert`"),
-        (("record", SOURCE, "."), "is a folder: name a file"),
-        (("record", "syntetic:", "x.mcap"), "did you mean synthetic:?"),
         (("record", SOURCE, "x.mcap", "--note", "who"), "--note is NAME=VALUE, not 'who'"),
         (("recover", "none.mcap"), "no recording none.mcap"),
-        (("convert", "none.mcap", "x.npz"), "no recording none.mcap"),
         (("convert", "none.mcap", "x.txt"), "none of .npz, .csv, .h5"),
         (("convert", "text.mcap", "x.csv"), "text.mcap is not an MCAP file"),
-        (("convert", "text.mcap", "x.mcap"), "x.mcap is none of .npz, .csv, .h5"),
         (("convert", "text.mcap"), "name a recording and what to write, or say what --to"),
         (("convert", "text.mcap", "--to", "ros"), "did you mean ros2?"),
-        (("convert", "text.mcap", "--to", "ros2"), "text.mcap is not an MCAP file"),
-        (("convert", "none.mcap", "--to", "lerobot"), "no recording none.mcap"),
-        (("run", "--source", "replay:text.mcap"), "text.mcap is no recording: it is neither MCAP"),
-        (("run", "--source", "replay:"), "replay: needs a file"),
     ],
 )
-def test_a_mistake_is_one_line(arguments, said, call, tmp_path, monkeypatch):
+def test_a_mistake_is_one_line(arguments, said, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "text.mcap").write_text("no recording at all\n")
-    code, out, err = call(*arguments)
-    assert (code, out) == (2, "")
-    assert said in err
-    assert err.count("\n") == 1
+    assert said in refused(*arguments)
     assert [p.name for p in tmp_path.iterdir()] == ["text.mcap"]  # nothing half-written

@@ -152,20 +152,22 @@ def test_a_check_names_the_first_difference(nth, fields, said, call, live, tmp_p
     assert f"decision {nth + 1} " in err
 
 
-def test_a_check_needs_the_model_that_decided(call, live, tmp_path):
+def test_a_check_needs_the_model_that_decided(call, refused, live, tmp_path):
     path, model = live
     other = tiny_model.write_model(tmp_path / "other.onnx", temperature=2.0)
     (key,) = (k for k in Recording(path).description.session if k.endswith(".left"))
     known = again(path, tmp_path / "known.mcap", **{key: f"{model} sha256:{'0' * 64}"})
     for arguments in (("--model", model), ("--model", other)):
-        code, _, err = call("replay", known, "--check", "--name", "left", *arguments)
-        assert code == 2
-        assert "needs the model that decided, sha256 0000000000000000" in err
-    code, _, err = call("replay", known, "--name", "left")
-    assert code == 2 and "is not there any more: name one by --model" in err
+        assert "needs the model that decided, sha256 0000000000000000" in refused(
+            "replay", known, "--check", "--name", "left", *arguments
+        )
+    assert "is not there any more: name one by --model" in refused(
+        "replay", known, "--name", "left"
+    )
     moved = again(path, tmp_path / "moved.mcap", **{key: "/gone/tiny.onnx sha256:"})
-    code, _, err = call("replay", moved, "--name", "left")
-    assert code == 2 and "/gone/tiny.onnx (sha256 unknown), is not there any more" in err
+    assert "/gone/tiny.onnx (sha256 unknown), is not there any more" in refused(
+        "replay", moved, "--name", "left"
+    )
     # another model is what a replay is for, as long as it is not to be the same
     mine = call("replay", path, "--name", "left")
     others = call("replay", path, "--name", "left", "--model", other)
@@ -191,15 +193,15 @@ def test_rotated_files_are_one_stream(call, tmp_path):
     assert call("replay", *paths, "--codec", "recorded")[0] == 2
 
 
-def test_a_folder_and_several_sources_are_named(call, live, tmp_path):
+def test_a_folder_and_several_sources_are_named(refused, live, tmp_path):
     again(live[0], tmp_path / "left.mcap")
     again(live[0], tmp_path / "right.mcap", daemon_source="right")
-    code, _, err = call("replay", tmp_path)
-    assert code == 2
-    assert "recordings of left (left.mcap ...), right (right.mcap ...)" in err
-    code, _, err = call("replay", tmp_path / "left.mcap", tmp_path / "right.mcap")
-    assert code == 2
-    assert "recordings of several sources: left, right" in err
+    assert "recordings of left (left.mcap ...), right (right.mcap ...)" in refused(
+        "replay", tmp_path
+    )
+    assert "recordings of several sources: left, right" in refused(
+        "replay", tmp_path / "left.mcap", tmp_path / "right.mcap"
+    )
 
 
 def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
@@ -230,24 +232,18 @@ def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
         (("{path}",), "several models decided live: choose by --name left, last"),
         (("{path}", "--name", "best"), "no model 'best' decided live; there are left, last"),
         (("{path}", "--speed", "fast"), "--speed is max, or times the recorded pace, not 'fast'"),
-        (("{path}", "--speed", "0"), "--speed is max"),
         (("{path}", "--name", "left", "--model", "x.onnx"), "model x.onnx cannot be read"),
-        (("none.mcap",), "no recording none.mcap"),
-        (("{path}", "--out", "none/x"), "no folder none to write x in"),
         (("{path}", "--name", "left", "--codec", "natve"), "did you mean native?"),
         (("{path}", "--codec", "native?speed=3"), "are not options of a codec"),
     ],
 )
-def test_a_mistake_is_one_line(arguments, said, call, live):
-    code, out, err = call("replay", *(a.format(path=live[0]) for a in arguments))
-    assert (code, out) == (2, "")
-    assert said in err
-    assert err.count("\n") == 1
+def test_a_mistake_is_one_line(arguments, said, refused, live):
+    assert said in refused("replay", *(a.format(path=live[0]) for a in arguments))
 
 
-def test_without_a_daemon_there_is_nothing_to_check(call, tmp_path):
+def test_without_a_daemon_there_is_nothing_to_check(call, refused, tmp_path):
     path = tmp_path / "run.mcap"
     call("record", "synthetic:2x3?pace=fast&seconds=0.3", path)
-    code, _, err = call("replay", path, "--check")
-    assert code == 2
-    assert "nothing to check: no model decided while it was recorded" in err
+    assert "nothing to check: no model decided while it was recorded" in refused(
+        "replay", path, "--check"
+    )

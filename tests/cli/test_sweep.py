@@ -44,7 +44,7 @@ def made(folder):
     return recipe_of_set(SweepManifest.read(folder).recipe)
 
 
-def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path):
+def test_a_set_is_made_gone_on_with_described_and_checked(call, refused, recipe, tmp_path):
     folder = tmp_path / "set"
     options = ("--seed", 3, "--set", "sweeps.draws=1", "--processes", 1)
     code, out, err = call("sweep", folder, "--recipe", recipe, *options, "--split", "test")
@@ -65,47 +65,36 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path
     assert call("sweep", folder, "--card")[0] == 0
     assert "3 simulated sweeps of 3 objects" in (folder / "README.md").read_text()
     (folder / "mug-1.npz").write_bytes(b"")
-    code, _, err = call("sweep", folder, "--verify")
-    assert code == 2
-    assert "missing or damaged: mug-1.npz" in err.replace("\n", " ")
+    assert "missing or damaged: mug-1.npz" in refused("sweep", folder, "--verify")
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (("--recipe", "tiny"), "no recipe 'tiny'; there are default24,"),
-        (("--recipe", "none.toml"), "none.toml: no such file"),
         (
             ("--set", "objects.per_category=2"),
             "2 objects cannot be split with 4 for validation and 12 for test",
         ),
         (("--set", "sweeps.draws=0"), "sweeps: draws must be at least 1, not 0"),
-        (("--set", "objects.validation=0"), "objects: validation must be a whole number"),
-        (("--set", "objects=2"), "objects is a table of keys, not 2"),
         (("--set", "contacs=true"), "--set contacs=true: no key 'contacs'; did you mean contacts?"),
-        (("--set", "objects.tset=1"), "objects has no key 'tset'; did you mean test?"),
         (("--verify",), "has no SHA256SUMS"),
         (("--set", "objects.validation=nan"), "--set objects.validation=nan: nan is no quantity"),
-        (("--set", "objects.test=inf"), "--set objects.test=inf: inf is no quantity"),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_nothing(call, tmp_path, monkeypatch, options, said):
+def test_a_mistake_is_one_line_and_leaves_nothing(refused, tmp_path, monkeypatch, options, said):
     monkeypatch.chdir(tmp_path)
-    code, out, err = call("sweep", tmp_path / "set", *options)
-    assert (code, out) == (2, "")
-    assert err.startswith("tactile-rt: ")
-    assert err.count("\n") == 1
-    assert said in err
+    assert said in refused("sweep", tmp_path / "set", *options)
     assert not (tmp_path / "set").exists()
 
 
 @pytest.mark.usefixtures("here")
-def test_another_profile_of_a_set_goes_elsewhere(call, recipe, tmp_path):
+def test_another_profile_of_a_set_goes_elsewhere(call, refused, recipe, tmp_path):
     folder = tmp_path / "set"
     assert call("sweep", folder, "--recipe", recipe, "--split", "test", "--processes", 1)[0] == 0
-    code, _, err = call("sweep", folder, "--profile", "accurate")
-    assert code == 2
-    assert "holds another sweep set (other recipe.profile, " in err
+    assert "holds another sweep set (other recipe.profile, " in refused(
+        "sweep", folder, "--profile", "accurate"
+    )
 
 
 @pytest.mark.usefixtures("here")
@@ -116,9 +105,9 @@ def test_sweeps_that_miss_are_told(call, recipe, tmp_path):
     assert "6 sweeps at profile realtime; 6 miss the array" in err.replace("\n", " ")
 
 
-def test_a_ray_cluster_is_named_by_host_and_port(call, recipe, tmp_path):
+def test_a_ray_cluster_is_named_by_host_and_port(refused, recipe, tmp_path):
     pytest.importorskip("ray")
     options = ("--recipe", recipe, "--ray", "head")
-    code, _, err = call("sweep", tmp_path / "set", *options)
-    assert code == 2
-    assert "no Ray cluster at head: give its HOST:PORT" in err
+    assert "no Ray cluster at head: give its HOST:PORT" in refused(
+        "sweep", tmp_path / "set", *options
+    )

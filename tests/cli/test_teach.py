@@ -136,22 +136,17 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
     folder, _ = lesson
     for arguments, said in (
         (("synthetic:3x2", tmp_path / "a", "--classes", "a/b"), "cannot be part of a file's name"),
-        (("synthetic:3x2", tmp_path / "a", "--classes", "a,a"), "names 'a' twice"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "has a meaning of its own"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is an order to who teaches"),
         (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page is HOST:PORT"),
-        (("synthetic:3x2", tmp_path / "a", "--page", "localhost:²"), "--page is HOST:PORT"),
         (("synthetic:3x2", tmp_path / "a\udcff", "--classes", "a"), "is no UTF-8: rename it"),
         (("synthetic:3x2", folder, "--json", folder / LABELS), "is a file of the lesson, or its"),
-        (("synthetic:3x2", folder, "--json", folder / "session-1.mcap"), "is a file of the lesson"),
         (("synthetic:3x2", folder, "--classes", "a"), "or teach in another folder"),
-        (("synthetic:3x2", folder / LABELS, "--classes", "a"), "is not a folder"),
         (("serial:/dev/none?codec=bota", tmp_path / "a", "--classes", "a"), "no such port"),
         (
             ("synthetic:3x2?pace=fast&seconds=3", tmp_path / "b", "--classes", ""),
             "touches kept: 0, too few",
         ),
-        (("synthetic:3x2", tmp_path / "a", "--model", tmp_path / "no"), "no model file"),
         (("synthetic:mouse", tmp_path / "a", "--model", "shipped", "--classes", "mug"), "knows"),
     ):
         code, _, err = call("teach", *arguments, "--seconds", "2")
@@ -202,7 +197,7 @@ def test_ctrl_c_at_rest_leaves_nothing_behind(tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, tmp_path):
+def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, refused, tmp_path):
     pytest.importorskip("numba")
     objects = ",".join(f"teapot-{i}" for i in range(3))
     source = f"sim:mouse?objects={objects}&sweeps=3&pace=fast"
@@ -214,8 +209,9 @@ def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, tmp_path):
     base = load_model(shipped_model())[1]
     (first, *_) = Lesson.read(tmp_path / "a").touches
     assert first.features.shape == (base.steps, base.embedding + len(base.labels))
-    code, _, err = call("teach", source, tmp_path / "a", "--model", tmp_path / "a" / "model.onnx")
-    assert code == 2 and "holds a lesson of another model" in err
+    assert "holds a lesson of another model" in refused(
+        "teach", source, tmp_path / "a", "--model", tmp_path / "a" / "model.onnx"
+    )
 
 
 def test_the_page_shows_and_obeys():
@@ -234,11 +230,8 @@ def test_the_page_shows_and_obeys():
         assert orders == ["undo"]
         for path, data, headers, status in (
             ("order", b'{"order": ""}', {"content-type": "application/json"}, 400),
-            ("order", b"order=undo", {}, 415),
-            ("state", b"{}", {"content-type": "application/json"}, 405),
             ("order", b'{"order": "undo"}',
              {"content-type": "application/json", "origin": "http://elsewhere.example"}, 403),
-            ("nothing", None, {}, 404),
         ):  # fmt: skip
             with pytest.raises(urllib.error.HTTPError) as refused:
                 ask(path, data, **headers)

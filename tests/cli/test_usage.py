@@ -1,6 +1,5 @@
 """What the command line says to words that it does not know, and how its tables print."""
 
-import json
 import os
 import pty
 import re
@@ -9,13 +8,9 @@ import sys
 from contextlib import suppress
 
 import pytest
-from rich.console import Console
-from rich.table import Table
 
-from tactile_rt.cli.tables import print_table
 from tactile_rt.drivers.catalogue import CODECS
-
-CALL = "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main; main()"
+from tests.helpers.processes import PROGRAM
 
 
 @pytest.mark.parametrize(
@@ -45,9 +40,7 @@ def test_misuse_of_the_gate_is_not_an_undecided_test(call):
     [
         ("eval", "m.onnx", "set", "--json", "m.onnx"),
         ("align", "score", "--json=./a.onnx", "a.onnx", "--benchmark", "b"),
-        ("export", "best.pt", "new.onnx", "--json", "sub/../new.onnx"),
         ("align", "gate", "m.onnx", "--reference=best.pt", "--json", "best.pt"),
-        ("hz", "replay:a.onnx?speed=0", "--json", "a.onnx"),
         ("import", "m.onnx", "--as", "codec=can-dbc&mapping=best.pt", "--json", "best.pt"),
         ("hil", "--source=sim:mouse?objects=mug,sub/../%61.onnx&sweeps=1", "--json=a.onnx"),
         ("hz", "replay:%00a.onnx?speed=0", "x.json", "--json", "x.json"),
@@ -68,7 +61,6 @@ def test_json_never_goes_over_another_file_of_the_command(call, tmp_path, monkey
     "words",
     [
         ("record", "replay:run.mcap?speed=0", "./run.mcap"),
-        ("replay", "run.mcap", "--out", "run.mcap"),
         ("replay", "run.mcap", "--out=sub/../run.mcap"),
     ],
 )
@@ -104,20 +96,11 @@ def test_of_one_codec_all_is_told(call):
     assert "cannot detect: " in out
 
 
-def test_a_table_as_json_is_all_of_it_and_nothing_else(call, tmp_path):
-    code, out, _ = call("codecs", "--json", "-")
-    records = json.loads(out)
-    assert code == 0
-    assert {(one["wire"], one["codec"]) for one in records} == set(CODECS)
-    assert call("codecs", "--json", tmp_path / "codecs.json")[0] == 0
-    assert json.loads((tmp_path / "codecs.json").read_text()) == records
-
-
 def test_a_terminal_too_narrow_for_a_table_shows_a_fact_a_line():
     master, slave = pty.openpty()
     environment = {**os.environ, "COLUMNS": "24", "TERM": "xterm"}
     with subprocess.Popen(
-        [sys.executable, "-c", CALL, "codecs"],
+        [sys.executable, "-c", PROGRAM, "codecs"],
         stdout=slave, stderr=slave, stdin=slave, env=environment,
     ) as child:  # fmt: skip
         os.close(slave)
@@ -129,18 +112,6 @@ def test_a_terminal_too_narrow_for_a_table_shows_a_fact_a_line():
     assert child.returncode == 0
     plain = re.sub(r"\x1b\[[0-9;]*m", "", said.decode()).replace("\r", "")
     assert "codec: ft300\nwire: serial\ndevice: " in plain
-
-
-@pytest.mark.parametrize("width", [20, 40, 200])
-def test_no_word_of_a_table_is_lost_at_any_width(width, capsys):
-    table = Table("a", "b", box=None)
-    words = [f"word{i}" for i in range(12)]
-    table.add_row(" ".join(words[:6]), " ".join(words[6:]))
-    for terminal in (True, False):
-        print_table(table, Console(width=width, force_terminal=terminal))
-        out = capsys.readouterr().out
-        assert all(word in out for word in words)
-        assert "…" not in out
 
 
 def test_the_folder_is_what_a_lone_recording_lacks(refused):

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
+QUICK = "--profile realtime --set protraction_deg=45 --set duration_s=1.3".split()
 ROBOT = """whisker,row,col,arc_length_mm,curvature_a_per_mm,base_x_mm,base_y_mm,base_z_mm,\
 base_theta_rad,base_phi_rad,base_zeta_rad,base_radius_mm,tip_radius_mm
 top,1,0,20,0.005,3.7,-2,1,1.2,0.2,0.5,0.06,0.03
@@ -27,16 +28,8 @@ def test_a_stimulus_is_written_with_its_parameters(call, tmp_path, robot):
     out = tmp_path / "out.npz"
     code, _, err = call(
         *("whisk", out, "--array", robot, "--stimulus", "concave-close,convex-close"),
-        *(
-            "--profile",
-            "realtime",
-            "--set",
-            "protraction_deg=45",
-            "--set",
-            "duration_s=1.3",
-            "--set",
-            "radius_mm=70",
-        ),
+        *QUICK,
+        *("--set", "radius_mm=70"),
     )
     assert code == 0, err
     assert "first contact at" in err
@@ -87,18 +80,10 @@ def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
         (("out.npz", "--json", "./out.json"), "out.json goes beside out.npz and says what is in"),
         (("out.npz", "--stimulus", "convex"), "no stimulus 'convex': there are convex-close"),
         (("out.npz", "--stimulus", "all", "--object", "mug"), "exclude each other"),
-        (("out.npz", "--object", "mugg"), "no object called 'mugg'"),
         (("out.npz", "--object", "mug", "--set", "size_mm=-3"), "size_mm must be above 0"),
-        (("out.npz", "--object", "mug", "--set", "position_mm=1,2"), "position_mm is three"),
-        (("out.npz", "--set", "positon_mm=1,2,3"), "; did you mean position_mm?"),
         (("out.npz", "--set", "frequency_hz"), "a setting is KEY=VALUE; there are frequency_hz,"),
         (("out.npz", "--set", "step_mm=a"), "step_mm is three numbers"),
-        (("out.npz", "--set", "step_mm=1,nan,0"), "step_mm is three numbers"),
-        (("out.npz", "--object", "mug", "--set", "yaw_deg=nan"), "yaw_deg=nan: nan is no quantity"),
         (("out.npz", "--profile", "best"), "no profile 'best'"),
-        (("out.npz", "--array", "cat"), "'cat'"),
-        (("out.npz", "--set", "frequency_hz=-1"), "frequency_hz must be"),
-        (("out.npz", "--trajectory", "none.csv"), "none.csv: no such file"),
         (("out.npz", "--array", "robot.csv", "--set", "duration_s=0.4"), "trajectory must last"),
         (("out.npz", "--array", "robot.csv", "--object", "mug", "--set", "position_mm=99,0,0",
           "--set", "duration_s=0.1"), "mug-0: no whisker touches it"),
@@ -126,15 +111,7 @@ def test_the_left_side_meets_the_mirror_image(call, tmp_path, robot):
     felt = []
     for array in (robot, mirrored):
         out = tmp_path / f"{array.stem}.npz"
-        options = (
-            "--stimulus",
-            "convex-close",
-            "--profile",
-            "realtime",
-            "--set",
-            "protraction_deg=45",
-        )
-        code, _, err = call("whisk", out, "--array", array, *options, "--set", "duration_s=1.3")
+        code, _, err = call("whisk", out, "--array", array, "--stimulus", "convex-close", *QUICK)
         assert code == 0, err
         with np.load(out) as arrays:
             felt.append(arrays["values"])

@@ -26,12 +26,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.processes import PROGRAM
 from tests.helpers.source_tree import ROOT
 
 FENCE = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.M | re.S)
 TERMINAL = "another terminal"
 OF_A_SHELL = re.compile(r"[|&;<>$*]")
-CLI = "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main; main()"
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Reader:
         """In the folder, with the commands of this tree first on the path."""
         tools = self.folder.parent / f"{self.folder.name}-bin"
         tools.mkdir()
-        for name, words in (("tactile-rt", ["-c", CLI]), ("python", [])):
+        for name, words in (("tactile-rt", ["-c", PROGRAM]), ("python", [])):
             call = shlex.join([sys.executable, *words])
             (tools / name).write_text(f'#!/bin/sh\nexec {call} "$@"\n')
             (tools / name).chmod(0o755)
