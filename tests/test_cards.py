@@ -71,13 +71,3 @@ def test_the_data_s_card_says_how_many_sweeps_there_are() -> None:
     assert card["size_categories"] == ["1K<n<10K"]
     assert 1_000 < sweeps < 10_000
     assert card["license"] == PROJECT["license"].lower()
-
-
-@pytest.mark.parametrize(("page", "kind"), [(MODEL, "ModelCard"), (DATA, "DatasetCard")])
-def test_the_hub_reads_them(page: Path, kind: str) -> None:
-    hub = pytest.importorskip("huggingface_hub")
-    data = getattr(hub, kind)(page.read_text("utf-8")).data.to_dict()
-    card, _ = parts(page)
-    assert {name: data[name] for name in card if name != "model-index"} == {
-        name: value for name, value in card.items() if name != "model-index"
-    }
