@@ -108,24 +108,6 @@ def test_a_calibration_that_is_no_file_is_a_devices_name(tmp_path):
     )
 
 
-def test_settings_reach_every_key(tmp_path):
-    loaded = load(
-        tmp_path,
-        SMALL + '[[publisher]]\nkind = "jsonl"\n',
-        "source.whiskers.url=synthetic:35x6?seed=3",
-        "page.port=9000",
-        "page.token=1234567890123456",  # text, though it looks like a number
-        "publisher.jsonl.options.state_s=2",
-        "log.level=error",
-        "limits.stop_s=1.5",
-    )
-    config = loaded.config
-    assert config.source[0].url == "synthetic:35x6?seed=3"
-    assert (config.page.port, config.page.token) == (9000, "1234567890123456")
-    assert config.publisher[0].options == {"state_s": 2}
-    assert (config.log.level, config.limits.stop_s) == ("error", 1.5)
-
-
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
@@ -352,15 +334,3 @@ def test_no_configuration_raises_anything_but_a_clear_error(folder, text, sets):
         assert str(error) and "Traceback" not in str(error)
     else:
         assert load(folder, config_text(loaded.config)).config.source == loaded.config.source
-
-
-@settings(max_examples=300)
-@given(data=st.binary(max_size=60), at=st.integers(0, len(EXAMPLE)), cut=st.integers(0, 40))
-def test_no_damage_to_a_file_raises_anything_but_a_clear_error(folder, data, at, cut):
-    file = folder / "damaged.toml"
-    whole = EXAMPLE.replace("# ", "").encode()
-    file.write_bytes(whole[:at] + data + whole[at + cut :])
-    try:
-        check_config(load_config(file))
-    except ConfigError as error:
-        assert str(error)

@@ -94,12 +94,6 @@ def _heard(process, say):
     raise AssertionError("it heard nothing")
 
 
-def test_examples_are_short():
-    for kind in ("jsonl", "zmq", "zenoh"):
-        code = [x for x in example(kind).splitlines() if x and not x.startswith("#")]
-        assert len(code) <= 15
-
-
 def test_the_example_configuration_is_right(tmp_path):
     (text,) = blocks("reference/daemon.md", "toml")
     (tmp_path / "robot.toml").write_text(text)

@@ -19,7 +19,7 @@ from tactile_rt.daemon.http import Refused
 from tactile_rt.daemon.items import Control, Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.page import feed as feed_module
-from tactile_rt.daemon.page.feed import Feed, array_line, map_axes
+from tactile_rt.daemon.page.feed import Feed, map_axes
 from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, Guard, PageClient
 from tactile_rt.errors import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -196,11 +196,6 @@ def test_places_that_span_no_plane_leave_each_element_its_own_axes():
         np.testing.assert_array_equal(map_axes(one)[0] @ [1.0, 2.0, 9.0], [1.0, -2.0])
 
 
-def test_the_array_line_tells_the_grid():
-    line = json.loads(array_line(opened()))
-    assert line["elements"] == list(SPEC.elements) and line["grid"] == [list(c) for c in SPEC.grid]
-
-
 def test_a_client_that_does_not_read_loses_the_oldest_and_they_are_counted():
     client = PageClient("a")
     for i in range(MAX_LINES + 30):
@@ -226,17 +221,6 @@ def test_a_browser_sees_what_happens(serve):
     finally:
         stream.close()
     until(lambda: page.details()["browsers"] == 0)
-
-
-def test_a_page_opens_again_after_it_was_closed(serve):
-    page, port = serve()
-    stream = Stream(port)
-    stream.until("hello")
-    page.close()
-    stream.answer.read()  # raises if the stream was cut off instead of ended
-    stream.close()
-    page.open(FakeView())
-    assert ask(port)[0] == 200
 
 
 # who is refused

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.errors import RecordingError
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut
@@ -20,7 +20,6 @@ from tests.helpers.recordings import (
     noise,
     parts,
     record_device,
-    write,
 )
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -238,14 +237,3 @@ def test_of_a_killed_recorder_all_but_the_last_second_is_recovered(seconds, path
     assert np.array_equal(seq, np.arange(-1, len(seq) - 1))
     assert seq[-1] >= last - 1000  # at 1 kHz
     assert Recording(back).description.recovered
-
-
-def test_a_file_that_is_there_is_not_written_over(path):
-    path.write_bytes(b"precious")
-    with pytest.raises(ConfigError, match="is there already"):
-        StreamWriter(path, ArraySource(SPEC, []))
-    assert path.read_bytes() == b"precious"
-    write(path, cut(noise(10), 1000.0), force=True)
-    assert len(list(Recording(path))) == 2
-    with pytest.raises(ConfigError, match="no folder"):
-        StreamWriter(path.parent / "none" / "x.mcap", ArraySource(SPEC, []))

@@ -9,10 +9,9 @@ import pytest
 from tactile_rt.recording import Recording
 from tactile_rt.recording import writer as module
 from tactile_rt.recording.description import describe
-from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.writer import RecordingWriter
-from tactile_rt.testing import ArraySource, cut
-from tests.helpers.recordings import SPEC, all_parts, noise
+from tactile_rt.testing import ArraySource
+from tests.helpers.recordings import SPEC
 
 # Begins a file, killed at each line of the writer in turn.
 PROGRAM = """
@@ -141,18 +140,3 @@ def test_forced_it_follows_a_link_and_writes_into_what_is_no_file(path, tmp_path
     null.symlink_to(os.devnull)
     begun(null, force=True).close()
     assert not os.path.isfile(os.devnull)
-
-
-def test_it_counts_what_it_writes_and_what_may_be_lost(path):
-    chunks = cut(noise(30), 1000.0, samples=10)
-    made = begun(path, dropped=(7, 3))
-    for k, chunk in enumerate(chunks):
-        made.add("samples", encode_samples(chunk), k)
-        if k == 1:
-            made.flush()
-    assert made.disown(made.flushed) == (10, 0)
-    made.close()
-    stats = made.stats
-    assert (stats.samples, stats.dropped_samples, stats.dropped_packets) == (20, 7, 3)
-    assert stats.bytes == path.stat().st_size
-    assert all_parts(Recording(path)) == all_parts(chunks)

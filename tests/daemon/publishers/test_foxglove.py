@@ -9,7 +9,6 @@ import json
 import socket
 import struct
 
-import msgspec
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -276,12 +275,6 @@ def test_others_can_look_only_if_asked_and_then_it_is_told():
     assert FoxgloveOptions().host == "127.0.0.1"
     with running(FoxglovePublisher("f", FoxgloveOptions(host="0.0.0.0", port=0))) as view:
         assert view.reports == [("publisher.f", "exposed", "warning")]
-
-
-@pytest.mark.parametrize("options", [{"port": -1}, {"rate_hz": 0}, {"host": ""}, {"samples": True}])
-def test_wrong_options_are_refused(options):
-    with pytest.raises(msgspec.ValidationError):
-        msgspec.convert(options, FoxgloveOptions)
 
 
 def test_turns_take_x_to_any_direction():

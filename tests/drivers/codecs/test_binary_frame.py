@@ -8,6 +8,7 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.binary_frame import BinaryFrame, BinaryFrameOptions
+from tactile_rt.drivers.codecs.framing import crc16_modbus
 from tactile_rt.drivers.codecs.optoforce import OptoForceOptions, OptoForceSerial
 from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.errors import ConfigError
@@ -94,15 +95,10 @@ def test_it_says_what_a_codec_by_hand_says_whatever_comes(tmp_path):
 
 
 def test_a_frame_by_hand():
-    """As the example's comment describes it; the CRC bit by bit."""
+    """As the example's comment describes it."""
     body = bytes.fromhex("a55a 0201 10270000 80 0100 ffff 0080 ff7f 00 01 02 ff")
-    crc = 0xFFFF
-    for byte in body:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
     codec = example()
-    samples = codec.feed(body + crc.to_bytes(2, "little") + b"\r", T0)
+    samples = codec.feed(body + crc16_modbus(body).to_bytes(2, "little") + b"\r", T0)
     assert samples is not None and samples.valid.all()
     assert samples.values[0, :, 0] == pytest.approx([0.25e-3, -0.25e-3, -8.192, 8.19175], rel=1e-6)
     assert samples.values[0, :, 1].tolist() == [0.0, 500.0, 1000.0, 127_500.0]

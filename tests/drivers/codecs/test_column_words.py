@@ -4,7 +4,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.column_words import compress_columns, expand_columns
 from tactile_rt.errors import ConfigError
 
@@ -54,9 +53,3 @@ def test_what_is_shortened_is_the_same(words):
 def test_taxels_become_short():
     words = [f"p{i:02d}=T{i}.fz:N" for i in range(36)]
     assert compress_columns(["time:s", *words]) == "time:s,p{00..35}=T{0..35}.fz:N"
-
-
-def test_a_board_of_many_taxels_is_described_in_a_word():
-    codec = AsciiLine(AsciiLineOptions(columns="time:ms,T{0..11}.pressure:1"))
-    samples = codec.feed(b"\n5," + b",".join(b"%d" % k for k in range(12)) + b"\n", 1)
-    assert samples.values.ravel().tolist() == list(range(12))

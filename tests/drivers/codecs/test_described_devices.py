@@ -96,8 +96,3 @@ def test_a_device_is_described_in_thirty_lines_and_found_by_its_name(name: str) 
         values[..., codec.spec.units.index("K")] += 300
     sent = codec.encode(chunk_of(codec, values))
     assert {len(packet) for packet in sent} == {codec.frame.mapping.length}
-
-
-def test_its_name_stands_in_what_goes_wrong() -> None:
-    assert frame_codec("flexitac").__name__ == "flexitac"
-    assert frame_codec("flexitac").__doc__.startswith("FlexiTac")

@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import MessageType
 from tactile_rt.errors import ConfigError
@@ -121,30 +120,6 @@ def test_an_echo_is_not_answered() -> None:
     nan = device.whisk(float("nan"), 0, 0).send
     assert device.respond(nan) == frame(MessageType.ACK, b"\x05\x02") and device.whisking is None
     assert device.respond(frame(MessageType.WHISK, b"short")) == frame(MessageType.ACK, b"\x05\x01")
-
-
-def test_both_formats_may_be_mixed() -> None:
-    devices = [native(), native(format="int16")]
-    packets = [device.encode(chunk_of(device, signal(1)))[0] for device in devices]
-    samples = native().feed(b"".join(packets), T0)
-    assert np.abs(samples.values - signal(1).astype(np.float32)).max(axis=(1, 2)) == pytest.approx(
-        [0, 1.5e-6], abs=2e-6
-    )
-
-
-def test_a_device_describes_itself_and_starts_when_told() -> None:
-    device, host = native(), NativeSerial(NativeOptions())
-    assert not device.streaming
-    for step in host.commands(Command.START):
-        answer = device.respond(step.send)
-        assert step.expect is None or step.expect in answer
-        host.feed(answer, T0)
-    assert host.spec == SPEC and device.streaming
-    for step in host.commands(Command.STOP):
-        device.respond(step.send)
-    assert not device.streaming
-    device.respond(host.whisk(8.0, 0.5, -0.1).send)
-    assert device.whisking == pytest.approx((8.0, 0.5, -0.1))
 
 
 def test_a_sample_of_another_array_is_refused() -> None:

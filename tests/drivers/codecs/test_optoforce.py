@@ -145,17 +145,6 @@ def test_frames_of_others_on_can_are_passed_over() -> None:
     assert codec.stats.skipped == 3
 
 
-def test_damage_is_counted() -> None:
-    codec = serial()
-    sent = codec.encode(chunk_of(codec, counts(1, 3)))
-    sent[3] = sent[3][:9] + bytes((sent[3][9] ^ 4,)) + sent[3][10:]
-    sent[7] = b"\xab" + sent[7][1:]
-    sent[8] = sent[8][:5]
-    host = serial()
-    damaged = stacked(decode(host, b"".join(sent)), "damaged")
-    assert damaged[3] == 1 and damaged[6] == 2 and damaged.sum() == host.stats.corrupt == 3
-
-
 @pytest.mark.parametrize(
     ("status", "valid"),
     [

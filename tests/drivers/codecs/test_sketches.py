@@ -45,7 +45,6 @@ SKETCHES = {
         [[[1.5e-6, nan, 30e-6]], [[1e-6, 2e-6, 3e-6]]],
     ),
     "Python list": ("A0.fx,B0.fx", "[0.25, -1.5]\n[1, null]\n", [[[0.25], [-1.5]], [[1], [nan]]]),
-    "Python tuple": ("A0.fz:gf,A0.temperature:K", "(40.12,669.0)\n", [[[0.39344278, 669.0]]]),
     "time of the host": (
         "time:iso,A0.fx,B0.fx",
         "2024-05-10 09:48:16.222  6.37 13.16\n2024-05-10 09:48:16.232  6.38 13.17\n",
@@ -61,27 +60,16 @@ SKETCHES = {
 
 # What a search for what boards print found, when the reader of lines was finished.
 FOUND = {
-    "RobTillaart ACS712, averaged": (
-        "weight=S.weight,value=S.value,mA=S.current",
-        "MidPoint: 512\r\nNoise mV: 21\r\nweight: 0.90 value: 12 mA: 13.41\r\n",
-        [[[0.9, 12, 13.41]]],
-    ),
     "force-sensitive resistor, a page each time": (
         "Raw Value=A0.raw,Force=A0.fz:N",
         "Press the FSR sensor...\r\n\r\n--- FSR Data ---\r\nRaw Value: 512\r\nForce: 3.25 N\r\n"
         "⚠ IMPACT DETECTED!\r\n\r\n--- FSR Data ---\r\nRaw Value: 13\r\nForce: 0.00 N\r\n\r\n",
         [[[512, 3.25]], [[13, 0]]],
     ),
-    "force and potentiometer": ("A0.force,A0.pot", "Force: 512 | Pot: 300\r\n", [[[512, 300]]]),
     "Infineon TLV493D, Cartesian": (
         "M0.bx:mT,M0.by:mT,M0.bz:mT",
         "X = 0.10 mT; Y = -0.20 mT; Z = 1.00 mT\r\n",
         [[[1e-4, -2e-4, 1e-3]]],
-    ),
-    "Infineon TLV493D, spherical": (
-        "Amount=M0.amount:mT,Azimuth angle (rad)=M0.azimuth:rad,Polar angle (rad)=M0.polar:rad",
-        "Amount = 1.20 mT; Azimuth angle (rad) = 0.50 ; Polar angle (rad) = 1.25\r\n",
-        [[[1.2e-3, 0.5, 1.25]]],
     ),
     "BME280 with a spinner": (
         "Temperature=S.temperature:degC,Pressure=S.pressure*0.1:kPa",
@@ -90,21 +78,6 @@ FOUND = {
         [[[298.15, 101325]]],
     ),
     "three flex sensors": ("A0.x,B0.x,C0.x", "FLEX:512,513,514\r\n", [[[512], [513], [514]]]),
-    "flex sensor with a state": (
-        "time:ms,A0.x,-",
-        "10,512,ACTIVE\r\n20,490,IDLE\r\n",
-        [[[512]], [[490]]],
-    ),
-    "four voltages, a line each": (
-        "Vout0=A0.v:V,Vout1=B0.v:V,Vout2=C0.v:V,Vout3=D0.v:V",
-        "Vout0 = 1.25\r\nVout1 = 1.50\r\nVout2 = 0.02\r\nVout3 = 4.99\r\n",
-        [[[1.25], [1.5], [0.02], [4.99]]],
-    ),
-    "photo cell, in words": (
-        "Analog reading=A0.light",
-        "Analog reading = 512 - Very Bright\r\nAnalog reading = 7 - Dark\r\n",
-        [[[512]], [[7]]],
-    ),
     "Adafruit MLX90393, for MotionCal": (
         "Raw.6=M0.bx*0.1:uT,Raw.7=M0.by*0.1:uT,Raw.8=M0.bz*0.1:uT",
         "Raw:0,0,0,0,0,0,-104,55,7\r\nUni:0,0,0,0,0,0,-10,5,0\r\n",
