@@ -5,7 +5,6 @@ import re
 import select
 import subprocess
 import sys
-import types
 from pathlib import Path
 from unittest import mock
 
@@ -110,42 +109,17 @@ def test_every_metric_and_exit_code_is_in_the_table():
         assert f"\n| {code.value} | " in guide
 
 
-def stubs(monkeypatch, **modules):
-    """Modules that are not installed here, as far as the examples need them."""
-    made = {}
-    for name, members in modules.items():
-        name = name.replace("__", ".")
-        parts = name.split(".")
-        for n in range(1, len(parts) + 1):
-            part = ".".join(parts[:n])
-            if part not in made:
-                made[part] = types.ModuleType(part)
-                monkeypatch.setitem(sys.modules, part, made[part])
-                if n > 1:
-                    setattr(made[".".join(parts[: n - 1])], parts[n - 1], made[part])
-        for key, value in members.items():
-            setattr(made[name], key, value)
-
-
-def loaded(name):
-    namespace: dict = {"__name__": name}
-    exec(compile((DOCS / "publishers" / f"{name}.py").read_text("utf-8"), name, "exec"), namespace)
-    return namespace
-
-
 @pytest.mark.usefixtures("still_clock")
 def test_the_mqtt_example_does_as_it_says_to_a_stub(monkeypatch):
     client = mock.MagicMock()
     client.loop_start.return_value = 0
     client.publish.side_effect = [mock.Mock(rc=0), mock.Mock(rc=15)]
-    stubs(
-        monkeypatch,
-        paho__mqtt__client={
-            "Client": lambda *a, **k: client, "CallbackAPIVersion": mock.Mock(), "MQTTv5": 5,
-            "MQTT_ERR_SUCCESS": 0, "MQTT_ERR_QUEUE_SIZE": 15,
-        },
-    )  # fmt: skip
-    names = loaded("mqtt")
+    stub = mock.MagicMock(Client=lambda *a, **k: client, MQTT_ERR_SUCCESS=0, MQTT_ERR_QUEUE_SIZE=15)
+    paho = mock.Mock(**{"mqtt.client": stub})
+    for name, module in (("", paho), (".mqtt", paho.mqtt), (".mqtt.client", stub)):
+        monkeypatch.setitem(sys.modules, f"paho{name}", module)
+    names: dict = {"__name__": "mqtt"}
+    exec((DOCS / "publishers" / "mqtt.py").read_text("utf-8"), names)
     options = names["MqttOptions"](host="broker", state_s=0)
     publisher = names["MqttPublisher"]("m", options)
     with running(publisher):

@@ -93,17 +93,27 @@ def port():
         return s.getsockname()[1]
 
 
+@pytest.fixture
+def configured(port, tmp_path):
+    """Load a configuration with a page."""
+
+    def load(text):
+        file = tmp_path / "robot.toml"
+        file.write_text(f'version = 1\n{text}[page]\nport = {port}\n[log]\nfile = "log"\n')
+        return load_config(file)
+
+    return load
+
+
 LIVE = "+document.getElementById('link').dataset.rate > 0"
 
 
-def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, tmp_path):
-    file = tmp_path / "robot.toml"
-    file.write_text(
-        'version = 1\n[[source]]\nname = "first"\nurl = "synthetic:30x6"\n'
+def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, configured):
+    loaded = configured(
+        '[[source]]\nname = "first"\nurl = "synthetic:30x6"\n'
         '[[source]]\nname = "second"\nurl = "synthetic:5x2?rate_hz=50"\n'
-        f'[page]\nport = {port}\n[log]\nfile = "log"\n'
     )
-    daemon = Daemon(load_config(file))
+    daemon = Daemon(loaded)
     daemon.start()
     try:
         one = tab()
@@ -126,7 +136,7 @@ def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, tmp_path):
         assert daemon.stop() == []
     one.has("document.getElementById('banner').textContent.includes('lost')")
     assert one.text("#link") == "not connected"
-    again = Daemon(load_config(file))
+    again = Daemon(loaded)
     again.start()
     try:
         one.has("document.getElementById('banner').textContent.includes('restarted')")
@@ -138,13 +148,9 @@ def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, tmp_path):
     assert one.faults() == []
 
 
-def test_without_an_array_it_says_why(tab, port, tmp_path):
-    file = tmp_path / "robot.toml"
-    file.write_text(
-        'version = 1\n[[source]]\nname = "finger"\nurl = "serial:/dev/gone?codec=native"\n'
-        f'[page]\nport = {port}\n[log]\nfile = "log"\n'
-    )
-    daemon = Daemon(load_config(file))
+def test_without_an_array_it_says_why(tab, port, configured):
+    source = '[[source]]\nname = "finger"\nurl = "{}"\n'
+    daemon = Daemon(configured(source.format("serial:/dev/gone?codec=native")))
     daemon.start()
     try:
         one = tab()
@@ -152,8 +158,7 @@ def test_without_an_array_it_says_why(tab, port, tmp_path):
         one.has("document.getElementById('empty').textContent.includes('/dev/gone: no such port')")
         one.has("document.getElementById('link').textContent === 'connected, no samples'")
         assert one.page.locator("#map-card").is_hidden()
-        file.write_text(file.read_text().replace("serial:/dev/gone?codec=native", "synthetic:3x6"))
-        daemon.reload(load_config(file))
+        daemon.reload(configured(source.format("synthetic:3x6")))
         one.has(LIVE)
         assert one.page.locator("#map-card").is_visible()
         assert one.page.locator("#empty-card").is_hidden()
@@ -267,13 +272,8 @@ def test_a_wrong_token_opens_nothing_and_the_right_one_lasts(tab, port):
 
 
 @pytest.mark.parametrize(("url", "shown"), [("synthetic:mouse", True), ("replay:demo", False)])
-def test_beside_decisions_on_made_up_touches_it_says_so(tab, port, tmp_path, url, shown):
-    file = tmp_path / "robot.toml"
-    file.write_text(
-        f'version = 1\n[[source]]\nname = "a"\nurl = "{url}"\n[[model]]\n'
-        f'[page]\nport = {port}\n[log]\nfile = "log"\n'
-    )
-    daemon = Daemon(load_config(file))
+def test_beside_decisions_on_made_up_touches_it_says_so(tab, port, configured, url, shown):
+    daemon = Daemon(configured(f'[[source]]\nname = "a"\nurl = "{url}"\n[[model]]\n'))
     daemon.start()
     try:
         one = tab()

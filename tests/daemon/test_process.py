@@ -14,9 +14,7 @@ import termios
 import pytest
 
 from bench.daemon.process import free_port, messages_of
-from tactile_rt.cli import main
 from tactile_rt.daemon.config import EXAMPLE
-from tactile_rt.daemon.process import SIGNALS
 from tactile_rt.daemon.threads import ADMISSION
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -52,15 +50,6 @@ options = { file = "out.jsonl" }
 def folder(tmp_path):
     (tmp_path / "robot.toml").write_text(SMALL)
     return tmp_path
-
-
-@pytest.fixture(autouse=True)
-def handlers_as_before():
-    """A process that is to be a daemon notes signals to its end; this one goes on."""
-    before = {number: signal.getsignal(number) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -101,16 +90,9 @@ def ended(process):
     return process.returncode, log
 
 
-def call(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
-    with pytest.raises(SystemExit) as left:
-        main()
-    return left.value.code or 0, *capsys.readouterr()
-
-
-def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, monkeypatch, capsys):
+def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, call):
     first = started()
-    code, out, err = call(monkeypatch, capsys, "run", folder / "robot.toml")
+    code, out, err = call("run", folder / "robot.toml")
     assert code == 3 and out == ""
     assert f"robot.toml is in use by process {first.pid}\n" in err
     (folder / "robot.toml").write_text(SMALL.replace("2x2", "2by2"))
@@ -204,30 +186,25 @@ def test_the_example_decides_what_was_touched(tmp_path):
     assert process.returncode == 0
 
 
-def test_what_is_made_up_is_said_to_be(folder, monkeypatch, capsys):
+def test_what_is_made_up_is_said_to_be(folder, monkeypatch, call):
     monkeypatch.chdir(folder)
     (folder / "robot.toml").write_text(EXAMPLE)
     url = "source.whiskers.url=synthetic:mouse"
-    _, said, _ = call(monkeypatch, capsys, "config", "check", "robot.toml", "--set", url)
+    _, said, _ = call("config", "check", "robot.toml", "--set", url)
     assert said.endswith("source whiskers is made up: what is decided on it means nothing\n")
-    _, said, _ = call(monkeypatch, capsys, "config", "check", "robot.toml")
+    _, said, _ = call("config", "check", "robot.toml")
     assert "made up" not in said
-    _, _, err = call(monkeypatch, capsys, "run", "--source", "synthetic:mouse?seconds=0.1")
+    _, _, err = call("run", "--source", "synthetic:mouse?seconds=0.1")
     assert err.startswith("synthetic:mouse?seconds=0.1 is made up: what is decided on it means")
 
 
-def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch, capfd):
-    (folder / "robot.toml").write_text(SMALL.replace('options = { file = "out.jsonl" }', ""))
-    code, out, err = call(
-        monkeypatch, capfd, "run", folder / "robot.toml",
-        "--set", "source.a.url=synthetic:2x2?seconds=1&pace=fast",
-        "--set", "publisher.jsonl.options.samples=true",
-    )  # fmt: skip
+def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, call):
+    url = "source.a.url=synthetic:2x2?seconds=1&pace=fast"
+    samples = "publisher.jsonl.options.samples=true"
+    code, _, err = call("run", folder / "robot.toml", "--set", url, "--set", samples)
     assert code == 0, err
-    messages = [json.loads(line) for line in out.splitlines()]
-    assert sum(len(m["seq"]) for m in messages if m["type"] == "samples") == 1000
-    assert messages[-1]["state"] == "stopped" or messages[-1]["type"] == "health"
-    code, out, err = call(monkeypatch, capfd, "run", folder / "robot.toml", "--seconds", "0.5")
+    assert sum(len(m["seq"]) for m in messages_of(folder / "out.jsonl", "samples")) == 1000
+    code, err = second(folder)
     assert code == 0 and "source.a stopped" in err
 
 
@@ -304,25 +281,23 @@ def test_what_hangs_at_the_end_is_left_behind(folder, started):
         (["config", "example", "gone/robot.toml"], "no folder gone to write"),
     ],
 )
-def test_a_users_mistake_is_one_line(folder, monkeypatch, capsys, arguments, message):
+def test_a_users_mistake_is_one_line(folder, monkeypatch, call, arguments, message):
     monkeypatch.chdir(folder)
-    code, out, err = call(monkeypatch, capsys, *arguments)
+    code, out, err = call(*arguments)
     assert code == 2 and out == "" and message in err and err.count("\n") == 1
 
 
-def test_config_commands(folder, monkeypatch, capsys):
+def test_config_commands(folder, monkeypatch, call):
     monkeypatch.chdir(folder)
-    assert call(monkeypatch, capsys, "config", "check", "robot.toml") == (
+    assert call("config", "check", "robot.toml") == (
         0, "robot.toml: 1 source, 0 models, 1 publisher: all right\n", "",
     )  # fmt: skip
-    _, shown, _ = call(
-        monkeypatch, capsys, "config", "show", "robot.toml", "--set", "log.level=error"
-    )
+    _, shown, _ = call("config", "show", "robot.toml", "--set", "log.level=error")
     assert 'level = "error"' in shown and f"{folder}/out.jsonl" in shown
-    assert call(monkeypatch, capsys, "config", "example")[1] == EXAMPLE
-    assert call(monkeypatch, capsys, "config", "example", "new.toml")[0] == 0
-    assert call(monkeypatch, capsys, "config", "check", "new.toml")[0] == 0
-    _, said, _ = call(monkeypatch, capsys, "config", "example", "rö bot.toml")
+    assert call("config", "example")[1] == EXAMPLE
+    assert call("config", "example", "new.toml")[0] == 0
+    assert call("config", "check", "new.toml")[0] == 0
+    _, said, _ = call("config", "example", "rö bot.toml")
     assert said.endswith("run it with: tactile-rt run 'rö bot.toml'\n")
     assert shlex.split(said.partition("with: ")[2]) == ["tactile-rt", "run", "rö bot.toml"]
 
