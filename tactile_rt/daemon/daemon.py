@@ -35,7 +35,6 @@ class Daemon:
     """Everything that a configuration asks for; a `View` for its consumers.
 
     Args:
-        loaded: the configuration, checked.
         locks: that keep a second daemon away; None: none.
         on_over: called once, from another thread, when all streams are over.
         freeze: whether to keep what is there after the start out of the garbage collector, which

@@ -63,7 +63,6 @@ class PartState:
     """A supervised part.
 
     Attributes:
-        name: The name of the part, as in `Event.part`.
         state: ``starting``; ``running``; ``stalled``: in a call that does not return, also while it
             starts; ``waiting``: it broke and is tried again after a pause; ``failed``: it cannot
             work as it is configured, and is not tried again; ``ended``: its stream is over;

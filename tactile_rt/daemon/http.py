@@ -122,7 +122,6 @@ class Response:
     Attributes:
         body: The body; or a generator of its pieces, which is closed when the peer goes or the
             server ends. What it raises before the first piece becomes the answer instead.
-        kind: The media type of the body.
         headers: Beside those that all answers of the server carry.
     """
 
@@ -138,7 +137,6 @@ class HttpServer:
     Args:
         listening: The socket, see `listen`; closed with the server.
         answer: The application, called in the thread of the server.
-        headers: Headers that every answer carries.
         failed: Told why when a request could not be answered for a fault of our own.
 
     Attributes:
@@ -358,7 +356,6 @@ def listen(host: str, port: int, *, both: bool = False) -> socket.socket:
 
     Args:
         host: The address, or a name that means one; IPv6 with or without brackets.
-        port: The TCP port.
         both: Whether an IPv6 address takes IPv4, too, and a name means its IPv4 address.
 
     Raises:

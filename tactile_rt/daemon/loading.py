@@ -29,7 +29,6 @@ class Loaded:
     Attributes:
         config: The configuration, with all names filled in and all paths absolute.
         nodes: The tree that the configuration was made of, which knows the lines.
-        path: The path of the file, as the user named it.
     """
 
     config: Config

@@ -136,7 +136,6 @@ def unit_text(
     Args:
         command: The program with absolute paths, and its arguments.
         config: The configuration that it will run; see `check_folders`.
-        user: The name of the service's user.
         watchdog_s: The time of silence after which it is started anew, s.
 
     Raises:
@@ -163,7 +162,6 @@ def install_script(unit: str, again: Sequence[str], user: str) -> str:
     """Return the shell script that installs the unit as root.
 
     Args:
-        unit: The name of the unit's file.
         again: The command that writes the unit once more, into the folder added as ``--out``.
         user: The name of the service's user, made if there is none.
     """
@@ -174,7 +172,6 @@ def check_folders(loaded: Loaded, user: str) -> None:
     """Refuse a folder that systemd does not make for the service, or that is another's.
 
     Args:
-        loaded: The configuration.
         user: The name of the service's user, who need not be there yet.
 
     Raises:

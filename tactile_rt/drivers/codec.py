@@ -272,7 +272,6 @@ class SampleBatch:
         """All samples so far, or None; each list is empty or of one entry per sample.
 
         Args:
-            shape: Shape of a sample, (element, channel).
             t_ns: Host time at which the samples arrived, ns.
         """
         n = len(self.values)

@@ -67,7 +67,6 @@ class CanBus:
     """A CAN network interface.
 
     Attributes:
-        name: Name of the network interface, such as ``can0``.
         bitrate: Speed of the bus, bit/s; 0 where the kernel does not know it.
         url: The URL to begin with; its codec is left to the user.
     """

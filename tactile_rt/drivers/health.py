@@ -22,7 +22,6 @@ class Health:
     """What is known of a device at one moment.
 
     Attributes:
-        state: State of the device's stream.
         since_ns: Host time (CLOCK_MONOTONIC) since which the stream is in this state, ns.
         reason: Why the device is not streaming, in words; empty when it is.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.

@@ -58,7 +58,6 @@ class SerialLink(Link[bytes]):
     """Any port that pyserial opens: a device, a pty, ``socket://``, ``rfc2217://``.
 
     Args:
-        port: Name or URL of the port.
         baud: Speed of the line, bit/s.
         parity: Parity of the line: ``N``, ``E`` or ``O``.
         dtr: Whether to assert DTR; boards that reset when DTR rises are left alone with False.

@@ -159,9 +159,7 @@ def encode(frames: Iterable[CanFrame], stamp_ms: int | None = None) -> bytes:
     return end.join(lines)
 
 
-def opening(
-    bitrate: int, data_bitrate: int | None = None, listen_only: bool = False
-) -> tuple[bytes, ...]:
+def opening(bitrate: int) -> tuple[bytes, ...]:
     """What a host sends, one after the other, to open the channel; each is answered.
 
     The first empties what an adapter has of an unfinished line, the second closes the channel: an
@@ -170,15 +168,10 @@ def opening(
     Raises:
         ConfigError: slcan has no such bit rate.
     """
-    for rate, known, what in (
-        (bitrate, BITRATES, "bitrate"),
-        (data_bitrate, DATA_BITRATES, "data_bitrate"),
-    ):
-        if rate is not None and rate not in known:
-            rates = ", ".join(str(r) for r in sorted(known))
-            raise ConfigError(f"slcan has no {what} {rate}: there are {rates}")
-    data = () if data_bitrate is None else (DATA_BITRATES[data_bitrate] + CR,)
-    return (CR * 3, b"C\r", BITRATES[bitrate] + CR, *data, b"L\r" if listen_only else b"O\r")
+    if bitrate not in BITRATES:
+        rates = ", ".join(str(r) for r in sorted(BITRATES))
+        raise ConfigError(f"slcan has no bitrate {bitrate}: there are {rates}")
+    return (CR * 3, b"C\r", BITRATES[bitrate] + CR, b"O\r")
 
 
 def closing() -> bytes:

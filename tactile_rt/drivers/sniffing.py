@@ -240,21 +240,17 @@ def line_speeds() -> list[tuple[int, str]]:
     return usual + [(s, "N") for s in SPEEDS if (s, "N") not in usual]
 
 
-def hear_port(
-    port: str, seconds: float, speeds: list[tuple[int, str]], dtr: bool = True
-) -> Iterator[Heard]:
+def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Iterator[Heard]:
     """Listen to a serial port, which is opened once, at each of these speeds.
 
     Args:
-        port: the port.
         seconds: how long to listen at each, s.
         speeds: (baud, parity) of each.
-        dtr: whether to assert DTR, at which many boards begin anew.
 
     Raises:
         SourceError: it cannot be opened, or is gone.
     """
-    link = SerialLink(port, *speeds[0], dtr)
+    link = SerialLink(port, *speeds[0])
     try:
         wait = FIRST_S
         for k, (baud, parity) in enumerate(speeds):

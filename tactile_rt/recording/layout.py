@@ -46,7 +46,6 @@ class Raw:
 
     Attributes:
         t_ns: The time under which it was recorded, host monotonic time, ns.
-        data: The bytes of the encoded message.
     """
 
     topic: str

@@ -52,7 +52,6 @@ class Episode:
     """An episode: a recording.
 
     Attributes:
-        index: The number of the episode, from 0.
         statistics: The statistics of each feature, as `Statistics.found` gives them.
     """
 

@@ -65,8 +65,6 @@ class StreamWriter:
 
     Attributes:
         path: The path of the file that is being written, or was last.
-        about: The description of that file.
-        files: The number of files that were begun.
 
     Raises:
         ConfigError: the file is there already, its folder is not, or the extra is not installed.

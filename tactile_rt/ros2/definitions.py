@@ -33,9 +33,7 @@ class Field(NamedTuple):
     """A field of a message.
 
     Attributes:
-        name: The name of the field.
         kind: The kind of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``.
-        many: Whether the field is a sequence of any length.
     """
 
     name: str

@@ -168,8 +168,6 @@ class CombinedSource(Source):
 
     Args:
         sources: What to combine; closed with this one.
-        parts: The name and pose of each.
-        name: The name of the combined array and of its frame.
     """
 
     def __init__(

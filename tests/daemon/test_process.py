@@ -305,8 +305,8 @@ def test_config_commands(folder, monkeypatch, call):
 def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
     code = (
         "import sys, tactile_rt.daemon.daemon, tactile_rt.daemon.checks, "
-        "tactile_rt.daemon.publishers.jsonl\n"
-        "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib'} & set(sys.modules))"
+        "tactile_rt.daemon.publishers.jsonl, tactile_rt.recording.importing.bag\n"
+        "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib', 'rosbags'} & {*sys.modules})"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(

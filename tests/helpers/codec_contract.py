@@ -178,6 +178,22 @@ class CodecContract:
                 assert np.isfinite(samples.values[samples.valid]).all()
         assert held(codec) < 200_000
 
+    def test_what_no_wire_can_carry_is_invalid_or_at_its_end(self) -> None:
+        device, signal = self.case.make(), self.case.signal().astype(float)
+        most = signal[:, 0, 0].max()
+        signal[1:4, 0, 0] = np.nan, 1e9, -1e9
+        samples = decode(self.case.make(), join(device, device.encode(chunk_of(device, signal))))
+        values, valid = stacked(samples, "values"), stacked(samples, "valid")
+        assert np.isfinite(values[valid]).all()
+        assert not valid[2, 0] or values[2, 0, 0] > 0.99 * most
+
+    def test_frames_of_others_are_passed_over(self, sent: tuple[Any, np.ndarray]) -> None:
+        codec = self.case.make()
+        if codec.wire == "can":
+            others = [f._replace(extended=not f.extended) for f in sent[0][:9]]
+            assert codec.feed([*others, sent[0][0]._replace(remote=True)], T0) is None
+            assert (codec.stats.skipped, codec.stats.corrupt) == (len(others) + 1, 0)
+
     def test_respond_takes_anything(self, sent: tuple[Any, np.ndarray]) -> None:
         codec = self.case.make()
         draw = random.Random(4)

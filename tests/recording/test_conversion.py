@@ -7,7 +7,6 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -16,10 +15,9 @@ from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.extras import install_extra
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.conversion import convert
-from tactile_rt.recording.layout import encode_samples
-from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
+from tests.helpers.recordings import odd_chunks, write_as_daemon
 
 h5py = pytest.importorskip("h5py")
 
@@ -29,46 +27,16 @@ TOPICS = ("samples", "decisions", "events", "health")
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def odd_chunks(seed=0):
-    """Gaps, lost elements, all kinds of NaN, -0, numbers at the ends of what there is."""
-    values = np.random.default_rng(seed).normal(size=(60, *SPEC.shape)).astype(np.float32)
-    chunks = cut(values, 1000.0, samples=7, start_ns=123_456_789)
-    values, valid = chunks[1].values.copy(), chunks[1].valid.copy()
-    values[0, 0], values[1, 1] = np.nan, -0.0
-    values[2, 2] = np.float32(1e-45), np.finfo(np.float32).max
-    values[3, 1] = np.inf, -np.inf
-    values.view(np.uint32)[4, 2] = 0xFFC01234, 0x7F800001  # NaN that carry something
-    valid[0, 0] = valid[5, 1] = False
-    chunks[1] = replace(chunks[1], values=values, valid=valid)
-    chunks[3:] = [replace(c, seq=c.seq + 10**15, t_ns=c.t_ns + 2**60) for c in chunks[3:]]
-    chunks[5] = Chunk(*(getattr(chunks[5], n)[:1] for n in ("seq", "t_ns", "values", "valid")))
-    return chunks
-
-
-def described(**changes):
-    return replace(
-        Description(
+def described():
+    return Description(
             SPEC, 1_700_000_000_123_456_789, "serial:x", codec="native", clock="device",
             calibration=replace(Calibration.of("it", SPEC), gain=(2.0, 1.5)),
             session={"who": "Ada\n\u2028", "daemon_source": "left"},
-        ),
-        **changes,
     )  # fmt: skip
 
 
-def write(path, chunks, about=None):
-    """A recording with everything; when things were recorded is not when they happened."""
-    about = about or described()
-    with path.open("wb") as file:
-        made = McapFile(file, about)
-        for k, chunk in enumerate(chunks):
-            made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]) + 777 * k)
-            text = {"type": "decision", "label": f"m\u00fcg \u2028 {k}\n", "p": 0.1 * k}
-            made.add("decisions", msgspec.json.encode(text), int(chunk.t_ns[-1]) - 10**9)
-        made.add("events", b'{"type": "contact",  "touching": true}', 5)
-        made.add("health", b"{}", 2**60)
-        made.finish()
-    return path
+def write(path, chunks):
+    return write_as_daemon(path, described(), chunks)
 
 
 @pytest.fixture

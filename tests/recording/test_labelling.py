@@ -92,15 +92,6 @@ def test_lost_samples_and_recordings_without_labels_are_told(night, tmp_path):
     assert "touches outside every interval: 4, " in said
 
 
-def test_if_nothing_is_left_the_reasons_are_the_error(night, tmp_path):
-    found = labelled(night, tmp_path, "night.mcap,0,1,mug,\n")
-    with pytest.raises(
-        ConfigError, match="no touch can be used: touches outside every interval: 4"
-    ):
-        write_set(tmp_path / "set", found)
-    assert not (tmp_path / "set").exists()
-
-
 def test_a_set_is_there_whole_or_not_at_all(night, tmp_path):
     found = find_labelled([night], intervals_of_all([night]))
 

@@ -7,20 +7,17 @@ import json
 from dataclasses import replace
 from fractions import Fraction
 
-import msgspec
 import numpy as np
 import pytest
 
 from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_lerobot import write_dataset
-from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.lerobot_film import film_of
 from tactile_rt.recording.lerobot_meta import Statistics
-from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
-from tests.helpers.recordings import noise
+from tests.helpers.recordings import noise, write_as_daemon
 
 pytest.importorskip("pyarrow")
 import pyarrow.parquet as pq
@@ -42,14 +39,7 @@ def odd_chunks(n=1000):
 
 def write(path, chunks, spec=SPEC, **session):
     about = Description(spec, 1_700_000_000_123_456_789, "serial:x", session=session)
-    with path.open("wb") as file:
-        made = McapFile(file, about)
-        for k, chunk in enumerate(chunks):
-            made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]) + 777 * k)
-            made.add("decisions", msgspec.json.encode({"step": k, "l": "m\u00fcg\n"}), 10**9 + k)
-        made.add("health", b"{}", 2**60)
-        made.finish()
-    return Recording(path)
+    return Recording(write_as_daemon(path, about, chunks))
 
 
 def samples(folder, episode=0):

@@ -11,11 +11,15 @@ from tactile_rt.calibration import Calibration
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_ros2 import write_bag
-from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.replay import DEMO
-from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
-from tests.helpers.recordings import SPEC, all_parts, noise, record_device
+from tests.helpers.recordings import (
+    SPEC,
+    all_parts,
+    noise,
+    record_device,
+    write_as_daemon,
+)
 
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap_ros2")
@@ -56,16 +60,7 @@ def whole(path, **about):
     )  # fmt: skip
     chunks = cut(noise(40, (1, 3)), 1000.0, samples=10)
     chunks[1] = replace(chunks[1], valid=np.zeros((10, 1), np.bool_))
-    with path.open("wb") as file:
-        made = McapFile(file, said)
-        for k, chunk in enumerate(chunks):
-            made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]))
-            text = json.dumps({"type": "decision", "label": "m\u00fcg", "step": k}).encode()
-            made.add("decisions", text, int(chunk.t_ns[-1]))
-        made.add("events", b'{"type":"contact","touching":true,"model":"m"}', 50_000_000)
-        made.add("health", b'{"state":"closed","t_ns":5}', 60_000_000)
-        made.finish()
-    return path, chunks
+    return write_as_daemon(path, said, chunks), chunks
 
 
 @pytest.mark.parametrize("make", [FakeSerial, FakeCan])
@@ -100,7 +95,7 @@ def test_each_channel_of_a_daemon_s_recording_is_read_by_both(path):
             for name, n in
             {"samples": 4, "decisions": 4, "events": 1, "health": 1, "array": 1}.items()
         }  # fmt: skip
-        assert found["/tactile/finger_1/decisions"][2].label == "m\u00fcg"
+        assert found["/tactile/finger_1/decisions"][2].label == "m\u00fcg \u2028 2\n"
         assert found["/tactile/finger_1/decisions"][2].step == 2
         for message, chunk in zip(found["/tactile/finger_1/samples"], chunks, strict=True):
             stamp = message.header.stamp
@@ -131,7 +126,7 @@ def test_a_bag_of_several_files_has_a_wrench_for_each_valid_sample(tmp_path):
             counted[connection.topic] += 1
         assert {t: n for t, (_, n) in topics.items()} == counted
         assert reader.message_count == sum(counted.values())
-        assert reader.duration == 60_000_000 - int(chunks[0].t_ns[-1]) + 1
+        assert reader.duration == 2**60 + 10**9 - int(chunks[0].t_ns[-1]) + 1
     assert topics["/tactile/finger_1/wrench"] == ("geometry_msgs/msg/WrenchStamped", 60)
     wrenches = by_mcap_ros2(tmp_path / "bag" / "bag_0.mcap")["/tactile/finger_1/wrench"]
     force, last = wrenches[-1].wrench.force, chunks[-1].values[-1, 0]
@@ -156,9 +151,7 @@ def test_what_is_recovered_is_a_bag_again(path):
 
 
 def test_names_are_of_the_array_where_no_daemon_named_a_source(path):
-    with path.open("wb") as file:
-        made = McapFile(file, Description(replace(SPEC, name="2nd finger/tip"), 0))
-        made.add("samples", encode_samples(cut(noise(5), 1000.0)[0]), 5)
-        made.finish()
+    about = Description(replace(SPEC, name="2nd finger/tip"), 0)
+    write_as_daemon(path, about, cut(noise(5), 1000.0))
     assert "/tactile/_2nd_finger_tip/samples" in by_rosbags(path)
     assert sum(map(len, Recording(path))) == 5

@@ -20,7 +20,6 @@ class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         file: The file that lines are appended to; empty: standard output.
-        samples: Whether samples are published, too.
         state_s: The time between two ``state`` messages, s; 0: none is sent.
     """
 

@@ -94,7 +94,6 @@ class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """The array that a mapping file is of.
 
     Attributes:
-        version: Version of the file's format.
         rate_hz: Rate at which the device sends samples, Hz.
         elements: The place of each element, by name. Elements without a grid get their row and
             column from their names if all are named like whiskers, A0 to Z99; else they stand in

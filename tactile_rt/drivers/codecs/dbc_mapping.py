@@ -41,7 +41,6 @@ class Signal:
         start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
             bit, counted from the highest of byte 0.
         length: Width of the signal, in bits.
-        big: Whether the signal's bytes are big-endian.
         signed: Whether the number is in two's complement.
         real: Whether the number is an IEEE 754 floating-point number.
     """

@@ -38,9 +38,6 @@ class Numbers:
     """Where numbers of one type are in a frame.
 
     Args:
-        at: offset of the first.
-        kind: their type.
-        order: their byte order.
         groups, n: how many groups there are, of how many that touch.
         stride: bytes from one group to the next; 0 if groups touch, too.
     """

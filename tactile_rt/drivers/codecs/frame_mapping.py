@@ -52,7 +52,6 @@ class Values(_Table, frozen=True, kw_only=True):
     those of the next.
 
     Attributes:
-        at: Offset of the first number.
         channels: Names of the channels; ``-`` for numbers that are not delivered, of which
             `possible` and `valid` are looked at.
         elements: Names of the elements; a whole number n for ``T0`` to ``Tn-1``, two for the rows
@@ -89,8 +88,6 @@ class FrameCounter(_Table, frozen=True, kw_only=True):
     """``[count]``: the number of the sample, which wraps at its width.
 
     Attributes:
-        at: Offset of the number.
-        type: Type of the number.
         order: Byte order of the number; empty for that of the file.
     """
 
@@ -153,9 +150,6 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
         ends: The bytes with which each frame ends; empty if they are not always the same.
         between: What else the device sends between frames, answers for example, in hexadecimal
             where ``..`` stands for any byte, or ``text:...``.
-        checksum: The frame's checksum, if it has one.
-        time: The device's clock, if it is there.
-        status: The device's status, if it is there.
         poll: What the host sends for each sample; empty if the device sends by itself.
     """
 

@@ -72,25 +72,17 @@ def crc16_modbus(data: bytes | bytearray | memoryview) -> int:
 
 
 class ByteBuffer:
-    """Bytes that have come and are not yet taken.
-
-    Attributes:
-        data: The bytes that have come and are not yet taken.
-    """
+    """Bytes that have come and are not yet taken."""
 
     def __init__(self) -> None:
         self.data = bytearray()
 
-    def skip_to(self, sync: bytes, keep: int = 0) -> int:
-        """Drop all before the first `sync` (or what may become one); return how many bytes.
-
-        Args:
-            keep: How many bytes at the beginning are not looked at.
-        """
-        at = self.data.find(sync, keep)
+    def skip_to(self, sync: bytes) -> int:
+        """Drop all before the first `sync` (or what may become one); return how many bytes."""
+        at = self.data.find(sync)
         if at < 0:
             at = len(self.data)
-            for n in range(min(len(sync) - 1, len(self.data) - keep), 0, -1):
+            for n in range(min(len(sync) - 1, len(self.data)), 0, -1):
                 if self.data.endswith(sync[:n]):
                     at -= n
                     break

@@ -80,14 +80,13 @@ def frame(
     payload: bytes = b"",
     *,
     format: int = 0,
-    status: int = 0,
     seq: int = 0,
     time_us: int = 0,
     shape: tuple[int, int] = (0, 0),
 ) -> bytes:
     """One frame of the serial form."""
     head = HEADER.pack(
-        SYNC, VERSION << 4 | kind, format, len(payload), status, seq & 0xFFFFFFFF,
+        SYNC, VERSION << 4 | kind, format, len(payload), 0, seq & 0xFFFFFFFF,
         time_us & 0xFFFFFFFF, *shape, 0,
     )[:-2]  # fmt: skip
     whole = head + crc16_xmodem(head[2:]).to_bytes(2, "little") + payload

@@ -159,7 +159,6 @@ class FaultSchedule:
         sample come one after the other. ``clock_drift`` is returned once, when it begins.
 
         Args:
-            t_s: Time since the first sample, s.
             quiet: Whether the stream is about to end, so that nothing happens any more.
         """
         if quiet or t_s < QUIET_S:

@@ -61,7 +61,6 @@ class BagTopic:
     """A topic of a bag.
 
     Attributes:
-        type: Type of the topic's messages.
         columns: What each is a sample of, in the words of ``--columns``; empty where only a user
             can tell.
     """

@@ -57,19 +57,3 @@ def test_commands() -> None:
     assert not device.streaming
     device.respond(sent)
     assert device.streaming and not aft200().respond(sent)
-
-
-def test_beyond_the_wire() -> None:
-    device = aft200()
-    values = np.array([[[np.nan, 1e6, -1e6, 0, 0, 0]]])
-    samples = device.feed(device.encode(chunk_of(device, values))[0], T0)
-    assert samples is not None
-    np.testing.assert_allclose(samples.values[0, 0, :3], [0.0, 355.35, -300.0], atol=1e-4)
-
-
-def test_other_frames() -> None:
-    host = aft200()
-    assert (
-        host.feed([CanFrame(3, bytes(8)), CanFrame(0, bytes(8)), CanFrame(1, bytes(5))], T0) is None
-    )
-    assert (host.stats.skipped, host.stats.corrupt) == (2, 1)

@@ -86,17 +86,6 @@ def test_a_saturated_converter_is_not_valid() -> None:
     assert samples.valid[:, 0].tolist() == [False, False, True, False, False, False]
 
 
-def test_an_emulated_board_saturates() -> None:
-    codec = hx711(whiskers=1)
-    chunk = chunk_of(codec, signal(3, 1))
-    chunk.values[0] = [[1.0, 0.0]]
-    chunk.valid[1] = False
-    wire = codec.encode(chunk)
-    assert struct.unpack("<f", wire[0][:4])[0] == 16.796875
-    samples = hx711(whiskers=1).feed(b"".join(wire), T0)
-    assert samples is not None and samples.valid[:, 0].tolist() == [False, False, True]
-
-
 @pytest.mark.parametrize(
     ("hurt", "lost", "left"),
     [

@@ -102,15 +102,3 @@ def test_commands() -> None:
         "4c01010100200000", "4e0222f00001800a",
     ]  # fmt: skip
     assert old.streaming and not old.commands(Command.STOP)
-
-
-def test_other_frames() -> None:
-    host = icub_skin(triangles="0-3")
-    foreign = [CanFrame(0x414, bytes(8)), CanFrame(0x310, bytes(8)), CanFrame(0x420, bytes(8))]
-    wrong = [
-        CanFrame(0x410, b""),
-        CanFrame(0x410, b"\x40" + bytes(6)),
-        CanFrame(0x411, b"\xc0" + bytes(4)),
-    ]
-    assert host.feed([*foreign, *wrong], T0) is None
-    assert (host.stats.skipped, host.stats.corrupt) == (3, 3)

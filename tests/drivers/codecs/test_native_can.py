@@ -262,16 +262,6 @@ def test_another_array_does_not_slip_in_between_samples() -> None:
     assert host.spec == small_spec(4)
 
 
-def test_values_beyond_the_wire() -> None:
-    device, host = native(), native()
-    values = signal(2)
-    values[0, 0], values[1, 1, 0] = (1.0, -1.0), np.nan
-    samples = host.feed(join(device, device.encode(chunk_of(device, values))), T0)
-    assert samples is not None
-    np.testing.assert_allclose(samples.values[0, 0], [0.1, -1e-3], rtol=1e-6)
-    assert not samples.valid[1, 1] and samples.valid.sum() == 9
-
-
 def test_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match=r"base must be from 0 to 0x7fb.*not 0x7fc"):
         NativeCanOptions(base=0x7FC)

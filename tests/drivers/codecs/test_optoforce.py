@@ -133,18 +133,6 @@ def test_frames_lost_on_can_cost_one_sample(parts: tuple[int, ...], load: int) -
     assert stacked(samples, "damaged").sum() == 0  # missing, and the counter shows it
 
 
-def test_frames_of_others_on_can_are_passed_over() -> None:
-    codec = can()
-    one, two = codec.encode(chunk_of(codec, counts(1, 3, 1)))[0]
-    others = [
-        CanFrame(0x101, b"\xaa\7\x08\x0a"),
-        one._replace(extended=True),
-        CanFrame(0x100, remote=True),
-    ]
-    assert len(codec.feed([one, *others, two], T0)) == 1
-    assert codec.stats.skipped == 3
-
-
 @pytest.mark.parametrize(
     ("status", "valid"),
     [
@@ -161,19 +149,6 @@ def test_status_bits(status: int, valid: list[int]) -> None:
     samples = serial("4x3d").feed(message + sum(message).to_bytes(2, "big"), T0)
     assert samples.valid[0].tolist() == [bool(v) for v in valid]
     assert samples.status.tolist() == [status]
-
-
-def test_an_invalid_or_too_large_value_on_the_wire() -> None:
-    codec = serial("4x3d")
-    values = counts(4, 3, 3)
-    values[0, 1, 0], values[0, 3, 2] = 1e9, -np.finfo(np.float32).max
-    values[1, 2, 0] = np.nan
-    chunk = chunk_of(codec, values)
-    chunk.valid[2, :2] = False
-    samples = codec.feed(b"".join(codec.encode(chunk)), T0)
-    assert samples.values[0, 1, 0] == 32767 and samples.values[0, 3, 2] == -32768
-    assert samples.values[1, 2, 0] == 0
-    assert samples.valid.tolist() == [[True] * 4, [True, True, False, True], [False] * 4]
 
 
 def test_a_device_is_configured() -> None:

@@ -120,14 +120,6 @@ def test_the_start_byte_may_occur_inside_a_packet() -> None:
     assert (stacked(joined, "values") == 0x9A9A).all() and len(stacked(joined, "values")) == 19
 
 
-def test_what_the_wire_cannot_carry_saturates() -> None:
-    codec = tsf85(fingers=1)
-    values = np.zeros((1, 28, 1))
-    values[0, :4, 0] = [-5, 1e9, np.nan, np.inf]
-    samples = codec.feed(codec.encode(chunk_of(codec, values))[0], T0)
-    assert samples.values[0, :4, 0].tolist() == [0, 65535, 0, 65535]
-
-
 def test_the_commands() -> None:
     host, device = tsf85(period_ms=20), tsf85()
     stop, start = host.commands(Command.START)
