@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.checks import check_config
-from tactile_rt.daemon.config import EXAMPLE, Config, config_text, is_loopback
+from tactile_rt.daemon.config import EXAMPLE, Config, config_text
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import find_lines
@@ -251,15 +251,6 @@ def test_what_looks_alike_and_disturbs_nobody_is_right(tmp_path, tables):
 def test_one_port_of_one_address_however_it_is_written(tmp_path, host):
     text = f'[page]\nport = 9464\n[metrics]\nhost = "{host}"\n'
     assert "is where page listens" in refusal_of(tmp_path, SMALL + text)
-
-
-@pytest.mark.parametrize(
-    ("host", "is_one"),
-    [("127.0.0.1", True), ("127.1.2.3", True), ("::1", True), ("[::1]", True),
-     ("localhost", True), ("0.0.0.0", False), ("::", False), ("robot", False), ("", False)],
-)  # fmt: skip
-def test_loopback(host, is_one):
-    assert is_loopback(host) == is_one
 
 
 def tables(of=Config):

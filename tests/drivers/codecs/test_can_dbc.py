@@ -240,7 +240,6 @@ def test_polling(folder: Path) -> None:
     ("old", "new", "message"),
     [
         ('"Taxel3.X"', '"Taxl3.X"', r"channel x: no message 'Taxl3' in .*\(did you mean Taxel3\?"),
-        ('"Taxel3.X"', '"Taxel3.XX"', r"channel x: no signal 'XX' in message Taxel3 .*mean X\?"),
         ('"Taxel3.X"', '"Taxel3.q"', r"no signal 'q' in message Taxel3 of .*; it has X, Y, Z"),
         ('"Taxel3.X"', '"X"', r"'X' must be written Message.Signal \(did you mean Taxel0.X\?\)"),
         ('x = "Taxel3.X", ', "", r"element T3: no signal for channel x; add one"),
@@ -251,13 +250,11 @@ def test_polling(folder: Path) -> None:
         ("100.0", "-1.0", r"array 'patch': rate_hz must be positive"),
         ("grid = [0, 1]", "grid = [0, 0]", r"array 'patch': grid repeat"),
         ("rate_hz", 'order = ["Taxel1"]\nrate_hz', r"order: Taxel0 is missing; name every"),
-        ("rate_hz", 'order = ["Tax"]\nrate_hz', r"order: no message 'Tax'"),
         ("rate_hz", 'counter = { signal = "Taxel0.K" }\nrate_hz', r"counter: no signal 'K'"),
         ("rate_hz", 'command = [{ when = "stop", id = 1, data = "0" }]\nrate_hz', r"data '0' m"),
         ("rate_hz", 'command = [{ when = "go", id = 1 }]\nrate_hz', r"when: 'go' is not one"),
         ("rate_hz", 'command = [{ when = "stop", id = 0x800 }]\nrate_hz', r"0x800 has over"),
         ('unit = "1"\n', 'unit = "1"\nscale = 0.0\n', r"channel x: scale must not be 0"),
-        ("rate_hz", "rate_hz = = ", r"Invalid"),
     ],
 )  # fmt: skip
 def test_mistakes_are_named(folder: Path, old: str, new: str, message: str) -> None:

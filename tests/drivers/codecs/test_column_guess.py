@@ -62,11 +62,6 @@ def test_a_log_in_words_has_none(form):
     assert guess_line_columns(lines(form)) is None
 
 
-def test_this_page_has_none():
-    with open(__file__, "rb") as file:
-        assert guess_line_columns(file.read()) is None
-
-
 def guessed(names: list[str], first: list[float], step: list[float]) -> list[str]:
     rows = [[a + k * d for a, d in zip(first, step, strict=True)] for k in range(20)]
     return guess_columns(names, rows)[0]
