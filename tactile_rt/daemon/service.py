@@ -128,15 +128,12 @@ systemctl --no-pager status {unit}
 """
 
 
-def unit_text(
-    command: Sequence[str], config: Config, user: str, watchdog_s: float = WATCHDOG_S
-) -> str:
+def unit_text(command: Sequence[str], config: Config, user: str) -> str:
     """Return the unit file of a service that runs a command.
 
     Args:
         command: The program with absolute paths, and its arguments.
         config: The configuration that it will run; see `check_folders`.
-        watchdog_s: The time of silence after which it is started anew, s.
 
     Raises:
         ConfigError: The command has a character that a unit file cannot hold.
@@ -152,7 +149,7 @@ def unit_text(
         if key == "StateDirectory" or any(f.is_relative_to(base) for f in folders)
     ]
     return UNIT.format(
-        command=" ".join(map(_quoted, command)), user=user, watchdog=f"{watchdog_s:g}",
+        command=" ".join(map(_quoted, command)), user=user, watchdog=f"{WATCHDOG_S:g}",
         home="read-only" if home else "yes", made="\n".join(made),
         devices="\n".join(f"DeviceAllow={d} rw" for d in DEVICES),
     )  # fmt: skip

@@ -28,7 +28,6 @@ class Transmitter:
 
     Args:
         faults: What goes wrong; None for nothing.
-        start_count: First value of the device's counter.
 
     Attributes:
         end_ns: Time at which the stream ends, on the source's clock, ns; nothing goes wrong just
