@@ -7,7 +7,6 @@ import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.models.alignment import save_benchmark
-from tactile_rt.models.alignment.neural import write_published
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.stimuli_input import SHIPPED
 from tactile_rt.models.alignment.strict import freeze_strict
@@ -172,7 +171,7 @@ def test_the_row_of_animals_as_published(call, refused, tmp_path):
     patterns = brains.geometry(rng)
     rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(3)}
     source, table = tmp_path / "rates.npz", tmp_path / "table.json"
-    write_published(rates, source)
+    np.savez_compressed(source, **rates)
     code, out, err = call(
         "align", "decode", MODEL, "--animals", source, "--paper", "--json", table
     )  # fmt: skip

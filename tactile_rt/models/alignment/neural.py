@@ -20,7 +20,6 @@ __all__ = [
     "published_layout",
     "rates_sha256",
     "read_published",
-    "write_published",
 ]
 
 Floats = NDArray[np.float64]
@@ -186,9 +185,3 @@ def read_published(path: Path) -> dict[str, Floats]:
         if np.isinf(array).any():
             raise ConfigError(f"{path}: {name} holds an infinite rate")
     return {name: array.astype(np.float64) for name, array in arrays.items()}
-
-
-def write_published(rates: dict[str, Floats], path: Path) -> None:
-    """Write rates in this layout."""
-    with path.open("wb") as file:
-        np.savez_compressed(file, **rates)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import pytest
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
 from tactile_rt.models.alignment import build
-from tactile_rt.models.alignment.neural import read_published, write_published
+from tactile_rt.models.alignment.neural import read_published
 from tests.helpers.brains import geometry, padded
 from tests.helpers.nwb_sessions import write_session
 
@@ -29,7 +29,7 @@ def test_a_published_file_builds_a_paper_code_benchmark(rates, tmp_path):
     np.savez(tmp_path / "rates.npz", allow_pickle_=np.array(True), **rates)
     with np.load(tmp_path / "rates.npz") as file:
         entries = {k.rstrip("_"): file[k] for k in file.files}
-    write_published(entries, tmp_path / "rates.npz")
+    np.savez_compressed(tmp_path / "rates.npz", **entries)
     made = build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
     assert [t.name for t in made.all_targets] == [*rates, "concatenated"]
     assert made.sources == ("rates.npz",)
@@ -38,7 +38,7 @@ def test_a_published_file_builds_a_paper_code_benchmark(rates, tmp_path):
 
 
 def test_its_stimuli_have_no_names_so_strict_refuses_it(rates, tmp_path):
-    write_published(rates, tmp_path / "rates.npz")
+    np.savez_compressed(tmp_path / "rates.npz", **rates)
     with pytest.raises(ConfigError, match="its stimuli have no names"):
         build([tmp_path / "rates.npz"])
     with pytest.raises(ConfigError, match="name nothing beside it"):
@@ -69,11 +69,11 @@ def test_the_published_option_is_passed_over_and_never_unpickled(rates, tmp_path
 
 def test_an_animal_without_an_rdm_is_left_out_alone(rates, tmp_path):
     silent = {**rates, "silent": np.zeros_like(rates["sub-0"])}
-    write_published(silent, tmp_path / "rates.npz")
+    np.savez_compressed(tmp_path / "rates.npz", **silent)
     made = build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
     assert [t.name for t in made.targets] == list(rates)
     assert made.notes[1].startswith("animal silent: no RDM") and made.notes[1].endswith("left out")
-    write_published({"silent": silent["silent"]}, tmp_path / "rates.npz")
+    np.savez_compressed(tmp_path / "rates.npz", silent=silent["silent"])
     with pytest.raises(ConfigError, match="animal silent: no RDM"):
         build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
 
@@ -102,7 +102,7 @@ def test_a_build_without_reliable_animals_says_why(tmp_path):
     ],
 )
 def test_arrays_of_another_shape_are_refused(tmp_path, array, message):
-    write_published({"m": array}, tmp_path / "rates.npz")
+    np.savez_compressed(tmp_path / "rates.npz", m=array)
     with pytest.raises(ConfigError, match=message):
         read_published(tmp_path / "rates.npz")
 

@@ -7,7 +7,7 @@ import pytest
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.clock import CLOCKS
-from tactile_rt.models.alignment.neural import read_published, write_published
+from tactile_rt.models.alignment.neural import read_published
 from tactile_rt.models.alignment.nwb import WINDOWS, read_session
 from tests.helpers.nwb_sessions import write_session
 
@@ -21,7 +21,7 @@ def nwb_bytes(folder):
 
 def npz_bytes(folder):
     rng = np.random.default_rng(0)
-    write_published({"m": rng.uniform(0, 9, (8, 6, 5)), "n": np.ones((9, 6, 3))}, folder / "a.npz")
+    np.savez_compressed(folder / "a.npz", m=rng.uniform(0, 9, (8, 6, 5)), n=np.ones((9, 6, 3)))
     return (folder / "a.npz").read_bytes()
 
 

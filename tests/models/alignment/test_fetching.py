@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.models.alignment.datasets import fetching, ranges
+from tactile_rt.models.alignment.datasets import fetching
 from tactile_rt.models.alignment.datasets.fetching import PublishedFile, fetch, published_files
 from tactile_rt.models.alignment.example import Brain
 from tactile_rt.models.alignment.example_files import write_example
@@ -39,7 +39,7 @@ def whole(tmp_path_factory):
 @pytest.fixture
 def archive(whole, tmp_path_factory, monkeypatch):
     """A list of the sessions on a server, and the server."""
-    monkeypatch.setattr(ranges, "AGAIN", 1)
+    monkeypatch.setattr(fetching, "AGAIN", 1)
     for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
         monkeypatch.delenv(name, raising=False)
     with Archive(tmp_path_factory.mktemp("archive")) as server:
@@ -122,7 +122,7 @@ def test_a_server_that_is_busy_is_asked_again(archive, tmp_path):
 
 
 def test_no_server(tmp_path, monkeypatch):
-    monkeypatch.setattr(ranges, "AGAIN", 0)
+    monkeypatch.setattr(fetching, "AGAIN", 0)
     file = PublishedFile("sub/a.nwb", 10, "", "http://127.0.0.1:9/a")
     with pytest.raises(ConfigError, match=r"sub/a.nwb cannot be fetched: .*refused"):
         fetch([file], tmp_path / "new")
@@ -141,10 +141,10 @@ def test_what_is_no_session_is_one_line(archive, tmp_path):
 def test_a_file_is_read_as_from_a_disk(whole, archive):
     listing, _ = archive
     data = whole[0].read_bytes()
-    remote = ranges.RangeFile(ranges.connections(), listing[0].url, len(data))
+    remote = fetching.RangeFile(fetching.connections(), listing[0].url, len(data))
     rng = np.random.default_rng(0)
     for _ in range(40):
-        begin, number = int(rng.integers(len(data))), int(rng.integers(3 * ranges.BLOCK))
+        begin, number = int(rng.integers(len(data))), int(rng.integers(3 * fetching.BLOCK))
         remote.seek(begin)
         assert remote.read(number) == data[begin : begin + number]
         assert remote.tell() == min(begin + number, len(data))
