@@ -421,17 +421,6 @@ def test_what_only_its_scores_were_kept_of_is_trained_again(plan: Path, tmp_path
     assert [p.update for p in told if not p.metrics] == [*range(1, again.chosen.updates + 1)]  # type: ignore[attr-defined]
 
 
-def test_of_what_no_processor_trained_no_processor_s_time_is_told(
-    plan: Path, tmp_path: Path
-) -> None:
-    grid, folder = read_grid(plan), tmp_path / "out"
-    pool.prepare(grid, folder)
-    Workbench(grid, folder, "auto").do(grid.tasks()[1])
-    (row,) = [row for row in gather(grid, folder).rows if row.top1 is not None]
-    assert row.seconds == 0
-    assert table(gather(grid, folder)).splitlines()[4].endswith("| 1 |  |")
-
-
 def test_the_longest_training_is_not_longer_than_it_helps(
     plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

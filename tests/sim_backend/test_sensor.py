@@ -312,12 +312,6 @@ def test_quantisation_rounds_to_the_nearest_step() -> None:
     np.testing.assert_array_equal(force_only[0, :, 3], values[0, :, 3].astype(np.float32))
 
 
-def test_no_reading_is_beyond_the_range_rounded_or_not() -> None:
-    model = SensorModel(noise_force=1.0, bias_force=2.0, range_force=0.5, resolution_force=0.6)
-    force = sensed(model, rest(500)).values[..., FORCE]
-    assert set(np.unique(force)) == {-0.5, 0.0, 0.5}
-
-
 def test_flicker_has_the_density_and_the_allan_deviation_it_should() -> None:
     """A^2 / f over three decades; an Allan deviation of A sqrt(2 ln 2) at every averaging time."""
     spec = grid_spec(2, 2)
@@ -396,22 +390,6 @@ def test_dead_elements_read_their_bias_for_ever_and_look_valid() -> None:
     stuck = out.values[:, sensor.dead]
     np.testing.assert_array_equal(stuck, np.broadcast_to(stuck[0], stuck.shape))
     np.testing.assert_allclose(stuck[0], sensor.bias[sensor.dead], rtol=1e-6)
-
-
-def test_a_dead_element_leaks_nothing() -> None:
-    values = np.ones((1, *SPEC.shape))
-    model = SensorModel(crosstalk_elements=0.1, dead_probability=0.3)
-    sensor = Sensor(model, SPEC, 1)
-    out = sensor.push(stream(values))
-    assert out is not None and 0 < sensor.dead.sum() < len(SPEC.elements)
-    for i, (row, column) in enumerate(SPEC.grid):
-        beside = [
-            j
-            for j, (r, c) in enumerate(SPEC.grid)
-            if abs(r - row) + abs(c - column) == 1 and not sensor.dead[j]
-        ]
-        expected = 0 if sensor.dead[i] else 1 + 0.1 * len(beside)
-        np.testing.assert_allclose(out.values[0, i], expected, rtol=1e-6)
 
 
 # Time

@@ -16,15 +16,13 @@ channels = 512
 reads = ["conv1"]
 """
 
-from pathlib import Path
-
 import msgspec
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
-from tactile_rt.settings import SettingNode, convert, parse_toml, read_toml
+from tactile_rt.settings import convert, parse_toml
 
-__all__ = ["parse_graph", "read_graph"]
+__all__ = ["parse_graph"]
 
 
 class _Input(msgspec.Struct):
@@ -47,24 +45,12 @@ class _File(msgspec.Struct):
 
 
 def parse_graph(text: str, where: str = "graph") -> Graph:
-    """A graph from TOML, as in the module's docstring.
+    """Read a graph from TOML, as in the module's docstring.
 
     Raises:
         ConfigError: naming `where`, the line, the key and what is wrong.
     """
-    return _graph(parse_toml(text, where))
-
-
-def read_graph(path: Path) -> Graph:
-    """A graph from a TOML file.
-
-    Raises:
-        ConfigError: as `parse_graph`; or the file cannot be read.
-    """
-    return _graph(read_toml(path))
-
-
-def _graph(tree: SettingNode) -> Graph:
+    tree = parse_toml(text, where)
     file: _File = convert(tree, _File)
     for table in ("inputs", "nodes"):
         if not getattr(file, table):
