@@ -42,13 +42,16 @@ def daemon_records(folder, text, n=1800):
         check_config(loaded)
         daemon = Daemon(loaded)
         daemon.start()
-        end = time.monotonic() + PATIENCE_S
-        while not fake.wait(0.01) or any(
-            m.queue.taken["samples"] < n for m in daemon.snapshot().models
-        ):
-            assert time.monotonic() < end
-            time.sleep(0.01)
-        assert daemon.stop() == []
+        try:
+            end = time.monotonic() + PATIENCE_S
+            while not fake.wait(0.01) or any(
+                m.queue.taken["samples"] < n for m in daemon.snapshot().models
+            ):
+                assert time.monotonic() < end
+                time.sleep(0.01)
+        finally:
+            left = daemon.stop()
+        assert left == []
     return sorted((folder / "rec").glob("*.mcap"), key=lambda p: p.stat().st_mtime_ns)
 
 
