@@ -63,6 +63,6 @@ def declare(source: Source, array: ArraySpec) -> Source:
 
 
 def declared(spec: ArraySpec, array: ArraySpec) -> Calibration:
-    """What makes the samples of one array those of another."""
+    """A change of elements and channels from one array to another."""
     device = re.sub(r"[^\w.:+-]+", "-", spec.name, flags=re.ASCII).strip(".-") or "device"
     return replace(Calibration.of(device, spec), array=array)

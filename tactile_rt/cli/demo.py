@@ -71,7 +71,7 @@ class SweepOutcome:
 
     @property
     def right(self) -> bool:
-        """Whether the decision is the object's category."""
+        """True if the decision is the object's category."""
         return self.said == self.category
 
     def line(self) -> str:
