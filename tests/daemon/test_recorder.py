@@ -81,8 +81,9 @@ def test_all_that_happens_is_in_the_file(daemon, tmp_path):
 
 def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path, monkeypatch):
     monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 10**15)
-    made = begun(daemon, tmp_path, min_free_mb=0)
+    made = begun(daemon, tmp_path, min_free_mb=0, rotate_s=1e-3)
     made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", 0)])
+    look(made)  # no next file would ever begin
     made.handle([decision()])
     (path,) = files(tmp_path)
     assert not is_finished(path)
