@@ -180,12 +180,14 @@ class CodecContract:
 
     def test_what_no_wire_can_carry_is_invalid_or_at_its_end(self) -> None:
         device, signal = self.case.make(), self.case.signal().astype(float)
-        most = signal[:, 0, 0].max()
-        signal[1:4, 0, 0] = np.nan, 1e9, -1e9
+        least, most = signal[:, 0, 0].min(), signal[:, 0, 0].max()
+        signal[1:6, 0, 0] = np.nan, 1e9, 1e12, -1e9, -1e12
         samples = decode(self.case.make(), join(device, device.encode(chunk_of(device, signal))))
         values, valid = stacked(samples, "values"), stacked(samples, "valid")
         assert np.isfinite(values[valid]).all()
-        assert not valid[2, 0] or values[2, 0, 0] > 0.99 * most
+        _, _, high, higher, low, lower = values[:6, 0, 0]  # a wire's end, or the number itself
+        assert not valid[2:4, 0].any() or higher >= high > most - 0.01 * abs(most)
+        assert not valid[4:6, 0].any() or lower <= low < least + 0.01 * abs(least) + 1e-6
 
     def test_frames_of_others_are_passed_over(self, sent: tuple[Any, np.ndarray]) -> None:
         codec = self.case.make()
@@ -193,6 +195,10 @@ class CodecContract:
             others = [f._replace(extended=not f.extended) for f in sent[0][:9]]
             assert codec.feed([*others, sent[0][0]._replace(remote=True)], T0) is None
             assert (codec.stats.skipped, codec.stats.corrupt) == (len(others) + 1, 0)
+            short = [f._replace(data=f.data[:-1]) for f in sent[0]]
+            codec.feed([*sent[0], *short, *sent[0]], T0)
+            lost = codec.stats.skipped + codec.stats.corrupt + codec.stats.incomplete
+            assert lost > len(others) + 1
 
     def test_respond_takes_anything(self, sent: tuple[Any, np.ndarray]) -> None:
         codec = self.case.make()
