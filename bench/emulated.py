@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.drivers.emulation.device import EmulatedDevice
 from tactile_rt.drivers.emulation.endpoints import SerialEndpoint, SlcanEndpoint
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = [
     "ArrayScript",

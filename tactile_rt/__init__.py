@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier, fuse
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.classifier.session import Session
-    from tactile_rt.drivers.codec import Codec
-    from tactile_rt.errors import (
+    from tactile_rt.core.errors import (
         ConfigError,
         ModelError,
         RecordingError,
@@ -33,9 +32,10 @@ if TYPE_CHECKING:
         SpecMismatch,
         TactileError,
     )
+    from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, SourceStats
+    from tactile_rt.drivers.codec import Codec
     from tactile_rt.recording.reader import Recording
     from tactile_rt.sources.opening import open_source
-    from tactile_rt.stream import ArraySpec, Chunk, EndOfStream, Source, SourceStats
 
 __all__ = [
     "ArraySpec",
@@ -61,7 +61,7 @@ __all__ = [
     "shipped_model",
 ]
 
-_STREAM, _ERRORS = "tactile_rt.stream", "tactile_rt.errors"
+_STREAM, _ERRORS = "tactile_rt.core.stream", "tactile_rt.core.errors"
 _WHERE = {
     "Classification": "tactile_rt.classifier.classifier",
     "Classifier": "tactile_rt.classifier.classifier",

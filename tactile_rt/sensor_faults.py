@@ -6,7 +6,7 @@ is wrong with the sensor this time, by these amounts, which the set's recipe may
 
 from dataclasses import dataclass, fields
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["SensorFaults"]
 

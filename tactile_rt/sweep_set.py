@@ -21,11 +21,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, RecordingError, name_some
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError, RecordingError, name_some
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.sensor_spec import ChannelLimits, SensorSpec, channel_limits
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.sensor_spec import ChannelLimits, SensorSpec, channel_limits
-from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "OUTLIERS",

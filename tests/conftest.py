@@ -82,8 +82,8 @@ def call(capsys, monkeypatch):
 
     A message that must be cut to its longest fails the test: it is to be written shorter.
     """
-    from tactile_rt import errors
     from tactile_rt.cli import main, progress
+    from tactile_rt.core import errors
 
     def check_length(message, shorten=errors.shorten):
         assert errors.length(message) <= errors.LONGEST, f"{errors.length(message)}: {message}"

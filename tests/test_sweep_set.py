@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.sweep_set import (
     SPLITS,
     SweepManifest,

@@ -33,13 +33,13 @@ from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
 from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.classifier.stepper import Stepper
+from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
 from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
 from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig
-from tactile_rt.stream import NS_PER_S, Chunk
 
 STREAM_BAR, DOUBLE_BAR = 2e-6, 1e-9  # some constants are single
 # What is measured, and the most that it may be; bit by bit is 0.

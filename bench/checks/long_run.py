@@ -20,7 +20,7 @@ import numpy as np
 
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.model_file import read_model, shipped_model
-from tactile_rt.stream import NS_PER_S, Chunk
+from tactile_rt.core.stream import NS_PER_S, Chunk
 
 STEPS, WARM_UP, REPORTS = 1_000_000, 20_000, 10
 GROWTH, DIFFERENCE = 2e6, 1e-4  # bytes; of a posterior, from the tare's sums in another order

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from bench.daemon.process import DaemonProcess, free_port
 from bench.emulated import ArrayScript, EmulatedArray
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.drivers.emulation.faults import Fate
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.redecoding import compare_decoding
-from tactile_rt.stream import Chunk, concatenate
 
 __all__ = ["Killed", "kill_nine", "killed_once", "records_of"]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from bench.daemon.accounts import RecordedSamples
 from bench.daemon.peers import Ping
 from bench.emulated import Played
-from tactile_rt.stream import NS_PER_S
+from tactile_rt.core.stream import NS_PER_S
 
 __all__ = ["Latencies", "latencies"]
 

@@ -9,7 +9,7 @@ import onnx
 from onnx import helper, numpy_helper
 
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec
 
 __all__ = ["finger_array", "whisker_array", "write_wide_model"]
 

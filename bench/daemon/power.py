@@ -26,7 +26,7 @@ import numpy as np
 
 from bench.daemon.kills import Killed, killed_once
 from bench.daemon.process import DaemonProcess
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import recover
 

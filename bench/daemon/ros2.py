@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.daemon import ros2_node
+from tactile_rt.core.stream import Chunk
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.publishers.ros2 import Ros2Options, Ros2Publisher
 from tactile_rt.evidence.records import Record, show
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import Chunk
 
 __all__ = ["Ages", "free_domain", "measure", "ros2_records"]
 

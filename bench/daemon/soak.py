@@ -19,8 +19,8 @@ from bench.daemon.latencies import latencies
 from bench.daemon.models import finger_array, whisker_array
 from bench.daemon.soak_rig import EVERY_S, WHOLE_S, WIRES, Soak, soak
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.evidence.records import Record, show, write
-from tactile_rt.stream import NS_PER_S
 
 __all__ = ["soak_records"]
 

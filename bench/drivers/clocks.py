@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.clocks import DeviceClock
 from tactile_rt.evidence.records import Record
-from tactile_rt.stream import NS_PER_S
 
 __all__ = ["clocks"]
 

@@ -9,9 +9,9 @@ import numpy as np
 from bench.drivers.metronome import Beat, play
 from bench.processes import Helper
 from tactile_rt.classifier.session import Session
+from tactile_rt.core.stream import Chunk, Source
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, Source
 
 __all__ = ["consumers"]
 

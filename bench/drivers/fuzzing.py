@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import CanFrame, Codec, Samples
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import Chunk
 
 __all__ = ["HEADERLESS", "Fuzzed", "all_codecs", "fuzz", "fuzzing", "mutate", "wire_of"]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from bench.emulated import ArrayScript, Played, noise, play
 from bench.processes import Helper
+from tactile_rt.core.stream import SourceStats, concatenate
 from tactile_rt.drivers.emulation.faults import Fate, Fault
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import SourceStats, concatenate
 
 __all__ = ["FAULTS", "UNPLUGS", "losses"]
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.drivers.emulation.endpoints import Endpoint, SerialEndpoint, SlcanEndpoint
 from tactile_rt.drivers.emulation.transmitter import EmulatedClock
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import NS_PER_S, Chunk
 
 __all__ = ["Beat", "Sent", "play"]
 

@@ -10,9 +10,9 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import Chunk, Source, SourceStats
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, Source, SourceStats
 
 __all__ = ["Came", "read_bare", "read_sources"]
 

@@ -13,12 +13,12 @@ import numpy as np
 from bench.emulated import LoopedSource
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import Recording, StreamWriter, recover
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk
 
 __all__ = ["recordings"]
 

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from bench.drivers.metronome import Beat, Sent, play
 from bench.drivers.readers import Came, read_bare, read_sources
 from bench.processes import Helper
+from tactile_rt.core.stream import Chunk, SourceStats
 from tactile_rt.drivers.clocks import Stamper
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import Chunk, SourceStats
 
 __all__ = ["can", "readers", "serial"]
 

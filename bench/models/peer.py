@@ -38,7 +38,7 @@ from bench.models.published import EPSILON, NETWORKS, NetworkPair, in_our_order,
 from bench.models.training_speed import STEPS, training_step
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.classifier.model_runs import file_outputs
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.evidence.records import Record, show
 from tactile_rt.export.onnx_step import step_graph, write_model
 from tactile_rt.models.ead import count_parameters

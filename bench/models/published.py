@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from bench.inference.full_size import random_model
 from bench.models.training_speed import CLASSES, STEPS
 from tactile_rt.classifier.model_file import read_model, shipped_model
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import Cell
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from bench.perception.area import FOLDER, measure, records_of
 from bench.perception.page import PAGE, write_page
-from tactile_rt.errors import TactileError
+from tactile_rt.core.errors import TactileError
 from tactile_rt.evidence.records import show
 
 

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.evidence.records import Record
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, WITHHELD, make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, draw_simulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, array_spec
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Difference", "catalogue", "difference", "drawn"]
 

@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES, read_triangles
 from tactile_rt.sim_backend.objects.meshes import load_mesh

@@ -13,10 +13,10 @@ from typing import Annotated
 import msgspec
 import paho.mqtt.client as mqtt
 
+from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
 from tactile_rt.daemon.publishers.sending import Sender, SenderOptions
-from tactile_rt.errors import SourceError
 
 RETAINED = ("array", "state")  # whoever subscribes later gets the newest of these at once
 QUEUE = 1000  # messages that wait for a broker that is away

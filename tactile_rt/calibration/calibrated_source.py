@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from tactile_rt.calibration.correction import Calibration
-from tactile_rt.stream import ArraySpec, Chunk, Source
+from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 __all__ = ["CalibratedSource", "declare", "declared"]
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, SpecMismatch
-from tactile_rt.settings import no_such
-from tactile_rt.stream import ArraySpec, Chunk
+from tactile_rt.core.errors import ConfigError, SpecMismatch
+from tactile_rt.core.settings import no_such
+from tactile_rt.core.stream import ArraySpec, Chunk
 
 __all__ = ["Calibration", "Mirror", "check_device"]
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import msgspec
 
 from tactile_rt.calibration.correction import Calibration, Mirror, check_device
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
-from tactile_rt.settings import SettingNode, convert, nearest, read_toml
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.settings import SettingNode, convert, nearest, read_toml
 
 __all__ = ["calibration_path", "load_calibration", "save_calibration"]
 

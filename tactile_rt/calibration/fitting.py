@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import convert, nearest, read_csv
-from tactile_rt.stream import ArraySpec, Chunk
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, nearest, read_csv
+from tactile_rt.core.stream import ArraySpec, Chunk
 
 __all__ = ["AXES", "Fit", "LoadTable", "calibrate", "raw_readings", "read_loads"]
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.calibration.calibrated_source import CalibratedSource
-from tactile_rt.errors import ConfigError, SourceError
-from tactile_rt.stream import ArraySpec, Chunk, EndOfStream, Source, concatenate
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, concatenate
 
 __all__ = ["Tare", "record", "tare"]
 

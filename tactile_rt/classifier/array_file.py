@@ -5,9 +5,9 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import convert, make_node, read_text
-from tactile_rt.stream import SPEC_VERSION, ArraySpec
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, make_node, read_text
+from tactile_rt.core.stream import SPEC_VERSION, ArraySpec
 
 __all__ = ["read_array"]
 

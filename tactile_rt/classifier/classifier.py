@@ -32,8 +32,8 @@ from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.skips import CatchUp, Skip, Skips
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse", "without_bad_samples"]
 

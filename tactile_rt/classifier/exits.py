@@ -33,7 +33,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["IN_A_ROW", "Deadline", "EarlyExit", "Lanes", "Policy"]
 

@@ -23,9 +23,9 @@ from tactile_rt.classifier.decision_rules import (
     named,
 )
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
-from tactile_rt.errors import ConfigError, ModelError, SpecMismatch, name_some
-from tactile_rt.sensor_spec import SensorSpec, channel_limits
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch, name_some
+from tactile_rt.core.sensor_spec import SensorSpec, channel_limits
+from tactile_rt.core.stream import ArraySpec
 
 __all__ = [
     "EmbeddingStatistics",

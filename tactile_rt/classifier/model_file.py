@@ -40,7 +40,7 @@ from tactile_rt.classifier.onnx_check import (
     read_onnx,
 )
 from tactile_rt.classifier.runtime import FlushDenormals
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.core.errors import ConfigError, ModelError
 
 __all__ = [
     "METADATA_KEY",

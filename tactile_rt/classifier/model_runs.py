@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 
 __all__ = ["file_outputs", "probe_logits", "verify_model"]
 

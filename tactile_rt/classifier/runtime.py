@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import onnxruntime as ort
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["PROVIDERS", "FlushDenormals", "available", "device_of", "onnxruntime_names"]
 

@@ -14,9 +14,9 @@ from collections.abc import Generator, Iterator
 from types import TracebackType
 from typing import Self
 
-from tactile_rt.bounded_queue import BoundedQueue
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.stream import Chunk, EndOfStream, Source
+from tactile_rt.core.bounded_queue import BoundedQueue
+from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
 __all__ = ["Session"]
 

@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.runtime import PROVIDERS, FlushDenormals, device_of
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["Stepper"]
 

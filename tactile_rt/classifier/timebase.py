@@ -8,7 +8,7 @@ import itertools
 
 import numpy as np
 
-from tactile_rt.stream import NS_PER_S, Chunk, concatenate
+from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 
 __all__ = ["Resampler"]
 

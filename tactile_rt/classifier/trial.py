@@ -21,7 +21,7 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 
 __all__ = ["Trial", "TrialLimits", "try_model"]
 

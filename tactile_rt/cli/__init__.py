@@ -86,7 +86,7 @@ def _run(told: list[int]) -> None:
     for module in pkgutil.iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
     from tactile_rt.cli.app import app
-    from tactile_rt.errors import TactileError
+    from tactile_rt.core.errors import TactileError
 
     # Typer brings a copy of click since 0.29: whose these are depends on its release.
     usage_error: Any = typer.BadParameter.__base__
@@ -163,7 +163,7 @@ def _give_up(why: str, code: int = 0) -> NoReturn:
     import typer
 
     from tactile_rt.cli.app import USER_ERROR
-    from tactile_rt.errors import shorten
+    from tactile_rt.core.errors import shorten
 
     line = shorten(" ".join(why.splitlines()))  # what a user wrote may have several
     typer.secho(f"tactile-rt: {line}", err=True, fg="red")

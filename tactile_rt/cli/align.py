@@ -13,8 +13,8 @@ from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import take_sets
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import take_sets
 
 if TYPE_CHECKING:
     from tactile_rt.models.alignment.results import Results

@@ -14,7 +14,7 @@ from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Page, Seed, Sessions, Stimuli
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.models.alignment.board import Alignments, BoardRow

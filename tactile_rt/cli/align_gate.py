@@ -15,7 +15,7 @@ from tactile_rt.cli.align import align
 from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Stimuli
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError, TactileError
+from tactile_rt.core.errors import ConfigError, TactileError
 
 if TYPE_CHECKING:
     from tactile_rt.models.alignment.layers import Layers

@@ -15,12 +15,12 @@ from urllib.parse import unquote
 
 import typer
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.extras import lacking
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extras import lacking
 from tactile_rt.version import VERSION
 
 if TYPE_CHECKING:
-    from tactile_rt.stream import Source
+    from tactile_rt.core.stream import Source
 
 __all__ = [
     "INTERRUPTED",

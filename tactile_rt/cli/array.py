@@ -11,7 +11,7 @@ from rich.table import Table
 from tactile_rt.cli.app import app, check_output, needing, open_url
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, show_table, told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.measuring.findings import ArrayFinding
@@ -32,7 +32,7 @@ def show(json: Json = None) -> None:
     An animal's name takes a side: mouse-left, mouse-both.
     """
     with needing("sim"):
-        from tactile_rt import extensions
+        from tactile_rt.core import extensions
         from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_animals
         from tactile_rt.sim_backend.transducer import device_spec
     found = []
@@ -84,8 +84,8 @@ def fit(
     with needing("sim"):
         from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
     from tactile_rt.calibration.taring import record
-    from tactile_rt.files import write_whole
-    from tactile_rt.stream import concatenate
+    from tactile_rt.core.files import write_whole
+    from tactile_rt.core.stream import concatenate
 
     source = open_url(url)
     with source:

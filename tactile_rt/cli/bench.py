@@ -15,7 +15,7 @@ from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_records
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 
 CHECKOUT = Path(__file__).parents[2]
 # Each area, and the extra that its `run(quick) -> list[Record]` needs.

@@ -14,14 +14,14 @@ from tactile_rt.cli.app import app, check_output, open_url
 from tactile_rt.cli.options import STDOUT, Json, Url
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from tactile_rt.calibration import Calibration, Fit, LoadTable, Tare
-    from tactile_rt.stream import ArraySpec, Chunk, Source
+    from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 LOUDER = 3.0  # noise over that of the last tare that is worth a word
 
@@ -185,7 +185,7 @@ def _existing(path: Path, device: str) -> "Calibration | None":
 def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
     """The raw samples that the times of a table are of."""
     from tactile_rt.calibration.taring import record
-    from tactile_rt.stream import concatenate
+    from tactile_rt.core.stream import concatenate
 
     if not url:
         raise ConfigError(f"{table} has times: name the recording they are in with --source")

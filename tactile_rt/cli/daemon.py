@@ -10,7 +10,7 @@ import typer
 
 from tactile_rt.cli.app import app, check_output
 from tactile_rt.cli.options import set_option
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["Settings", "serve"]
 
@@ -30,8 +30,8 @@ app.add_typer(config, name="config")
 
 def serve(file: Path, sets: list[str], seconds: float | None) -> None:
     """Run the daemon; leaves the process with its exit code."""
+    from tactile_rt.core.locks import AlreadyRunning
     from tactile_rt.daemon.process import ExitCode, leave, run_daemon
-    from tactile_rt.locks import AlreadyRunning
 
     try:
         leave(run_daemon(file, sets, seconds))
@@ -105,7 +105,7 @@ def ros2_messages(
     """Write tactile_rt_msgs, the ROS 2 package of what recordings and the publisher ros2 say."""
     import shutil
 
-    from tactile_rt.files import whole_folder
+    from tactile_rt.core.files import whole_folder
     from tactile_rt.ros2.definitions import PACKAGE
 
     made = folder / PACKAGE.name
@@ -131,7 +131,7 @@ def _give(text: str, output: Path | None, then: str) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    from tactile_rt.files import write_whole
+    from tactile_rt.core.files import write_whole
 
     write_whole(path, lambda file: file.write(text.encode()))
 

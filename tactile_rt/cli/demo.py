@@ -27,12 +27,12 @@ from tactile_rt.cli.app import app, leaving, needing
 from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError
-from tactile_rt.extras import install_extra
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extras import install_extra
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification
-    from tactile_rt.stream import Source
+    from tactile_rt.core.stream import Source
 
 __all__ = ["WIDTH", "Demonstration", "SweepOutcome", "draw", "watch"]
 
@@ -222,7 +222,7 @@ class Demonstration:
 
     def run(self) -> Iterator[list[SweepOutcome]]:
         """Run to the end; yields after every chunk the outcomes that it has settled."""
-        from tactile_rt.stream import NS_PER_S
+        from tactile_rt.core.stream import NS_PER_S
 
         for chunk, decisions in self._session:
             self._now_ns, self._now = int(chunk.t_ns[-1]), time.monotonic()

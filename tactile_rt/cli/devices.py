@@ -45,8 +45,8 @@ def doctor(
     from rich.console import Console
     from rich.markup import escape
 
+    from tactile_rt.core.files import write_whole
     from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
-    from tactile_rt.files import write_whole
 
     check_output(udev)
     ports = serial_ports()
@@ -76,9 +76,9 @@ def codecs(
     json: Json = None,
 ) -> None:
     """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
+    from tactile_rt.core.errors import ConfigError
+    from tactile_rt.core.settings import no_such
     from tactile_rt.drivers.catalogue import CODECS, FRAMES
-    from tactile_rt.errors import ConfigError
-    from tactile_rt.settings import no_such
 
     if frame:
         described = {path.stem: path for path in sorted(FRAMES.glob("*.toml"))}
@@ -115,7 +115,7 @@ def describe(
     """Write a source's array (elements, poses, channels, units, rate) as JSON."""
     import msgspec
 
-    from tactile_rt.files import write_whole
+    from tactile_rt.core.files import write_whole
 
     check_output(out)
     with open_url(source) as opened:
@@ -149,7 +149,7 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     """Print once a second: the rate, the jitter of arrival, what was lost, the device's state."""
     import numpy as np
 
-    from tactile_rt.stream import EndOfStream
+    from tactile_rt.core.stream import EndOfStream
 
     opened = open_url(source)
     looks: list[dict[str, Any]] = []

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from tactile_rt.cli.app import app, leaving, needing, open_url
 from tactile_rt.cli.options import Fast, Faults, ProjectFolder, set_option
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.device import EmulatedDevice

@@ -13,7 +13,7 @@ from tactile_rt.cli.emulate import codec_options, open_project
 from tactile_rt.cli.options import Faults, Json, Model, ProjectFolder, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.hil import LoopReport

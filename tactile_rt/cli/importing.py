@@ -11,7 +11,7 @@ from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, star
 from tactile_rt.cli.options import Force, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 
 @app.command("import")

@@ -11,7 +11,7 @@ from tactile_rt.cli.app import app, check_folder, check_output, check_text
 from tactile_rt.cli.options import Force, Json, Seed
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
 
 
 @app.command()

@@ -13,7 +13,7 @@ from tactile_rt.cli.app import app, check_output
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
 app.add_typer(model, name="model")
@@ -27,7 +27,7 @@ def show(file: File, json: Json = None) -> None:
     """What a model is: read, not run."""
     from tactile_rt.classifier.model_card import one_line
     from tactile_rt.classifier.model_file import read_model
-    from tactile_rt.stream import NS_PER_S
+    from tactile_rt.core.stream import NS_PER_S
 
     card, contents, data = read_model(file)
     if told_as_json(card, json):

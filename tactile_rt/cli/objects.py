@@ -11,7 +11,7 @@ from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_table, told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
 app.add_typer(objects, name="objects")

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from tactile_rt.cli.app import check_named_once, check_output
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "STDOUT",

@@ -11,12 +11,12 @@ from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leav
 from tactile_rt.cli.options import Force, Json, Seconds, Url
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import no_such
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import no_such
 
 if TYPE_CHECKING:
+    from tactile_rt.core.stream import Source
     from tactile_rt.recording import StreamWriter
-    from tactile_rt.stream import Source
 
 POLL_S = 0.1
 TELL_S = 1.0
@@ -66,7 +66,7 @@ def record(
 
 def _copy(source: "Source", writer: "StreamWriter") -> None:
     """Record until the stream ends, and tell how it goes."""
-    from tactile_rt.stream import EndOfStream
+    from tactile_rt.core.stream import EndOfStream
 
     tell_at = time.monotonic() + TELL_S
     while True:

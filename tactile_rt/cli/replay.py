@@ -9,12 +9,12 @@ import typer
 
 from tactile_rt.cli.app import app, check_new, leaving
 from tactile_rt.cli.options import Force
-from tactile_rt.errors import ConfigError, RecordingError, name_some
+from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier
+    from tactile_rt.core.stream import Chunk
     from tactile_rt.recording import Recording
-    from tactile_rt.stream import Chunk
 
 DIFFERENT = 1
 RECORDED = "recorded"  # the codec and options by which packets were decoded live
@@ -59,7 +59,7 @@ def replay(
     if "from" in fields:
         _compare(told.files, {k: v for k, v in fields.items() if k not in ("from", "speed")})
     if out is not None:
-        from tactile_rt.files import write_whole
+        from tactile_rt.core.files import write_whole
 
         write_whole(out, told.write)
     elif check:

@@ -8,7 +8,7 @@ import typer
 from tactile_rt.cli.app import app, leaving, open_url
 from tactile_rt.cli.daemon import Settings, serve
 from tactile_rt.cli.options import Model, Seconds
-from tactile_rt.errors import ConfigError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, SpecMismatch
 
 
 @app.command()

@@ -10,7 +10,7 @@ import typer
 from tactile_rt.cli.app import app, check_output, leaving, starting
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.logs import LineLog

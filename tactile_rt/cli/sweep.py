@@ -10,7 +10,7 @@ from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Json, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.datasets.recipes import SweepRecipe

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tactile_rt.cli.options import STDOUT
-from tactile_rt.files import write_whole
+from tactile_rt.core.files import write_whole
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.records import Record

@@ -13,10 +13,10 @@ import typer
 from tactile_rt.cli.app import app, check_folder, check_output, check_text, leaving, open_url
 from tactile_rt.cli.options import Json, Seconds, Url
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
-    from tactile_rt.stream import Chunk, Source
+    from tactile_rt.core.stream import Chunk, Source
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.page import TeachingPage
     from tactile_rt.teaching.teacher import Teacher
@@ -58,7 +58,7 @@ def teach(
     leaves).
     """
     from tactile_rt.classifier.model_file import shipped_model
-    from tactile_rt.locks import alone_in
+    from tactile_rt.core.locks import alone_in
     from tactile_rt.recording.labels import LABELS
     from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
@@ -165,8 +165,8 @@ class Orders:
 
 def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
     """Take touches until there are enough, the stream ends, or who teaches has had enough."""
+    from tactile_rt.core.stream import EndOfStream
     from tactile_rt.recording import StreamWriter
-    from tactile_rt.stream import EndOfStream
     from tactile_rt.teaching.lesson import BEFORE_NS
 
     lesson = teacher.lesson
@@ -250,7 +250,7 @@ def _address(given: str) -> tuple[str, int]:
 
 def _begun(folder: Path, source: "Source") -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
-    from tactile_rt.stream import EndOfStream
+    from tactile_rt.core.stream import EndOfStream
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.listener import measured_floor
 

@@ -16,7 +16,7 @@ from rich.text import Text
 from tactile_rt.cli.app import app
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.tables import fitting, print_table, told_as_json
-from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.core.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
     from tactile_rt.daemon.health import Latency, PartState, Snapshot

@@ -11,9 +11,9 @@ from tactile_rt.cli.app import app, check_folder, check_output, needing
 from tactile_rt.cli.options import Accelerator, Json, Seed, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_table, told_as_json
-from tactile_rt.errors import ConfigError
-from tactile_rt.locks import alone_in
-from tactile_rt.settings import take_sets
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.locks import alone_in
+from tactile_rt.core.settings import take_sets
 
 if TYPE_CHECKING:
     from tactile_rt.models.training.config import Progress

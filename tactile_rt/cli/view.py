@@ -12,8 +12,8 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, set_option
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import take_sets
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import take_sets
 
 if TYPE_CHECKING:
     import numpy as np

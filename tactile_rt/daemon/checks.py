@@ -12,15 +12,15 @@ from typing import Any
 
 from tactile_rt.classifier.model_file import fit_source, read_model, shipped_model
 from tactile_rt.classifier.runtime import onnxruntime_names
+from tactile_rt.core.errors import SpecMismatch, TactileError
+from tactile_rt.core.locks import device_keys
+from tactile_rt.core.settings import no_such
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.service import MADE
-from tactile_rt.errors import SpecMismatch, TactileError
-from tactile_rt.locks import device_keys
-from tactile_rt.settings import no_such
 from tactile_rt.sources.opening import check_source
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["check_config"]
 

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, make_node
 from tactile_rt.daemon.config import Config, PublisherConfig
 from tactile_rt.daemon.consumer import Consumer
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.publishers import load_class, publisher_class
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import convert, make_node
 
 __all__ = ["Wanted", "wanted_consumers"]
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
+from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.daemon.admission import file_stamp, model_path
 from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
@@ -21,7 +22,6 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
 from tactile_rt.daemon.troubles import troubles
-from tactile_rt.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]

@@ -11,9 +11,9 @@ import threading
 from collections import deque
 from dataclasses import dataclass, field
 
-from tactile_rt.bounded_queue import QueueState
+from tactile_rt.core.bounded_queue import QueueState
+from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.health import Health
-from tactile_rt.stream import SourceStats
 
 __all__ = [
     "ConsumerState",

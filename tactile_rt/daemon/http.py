@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Any
 
-from tactile_rt.errors import SourceError
+from tactile_rt.core.errors import SourceError
 
 __all__ = ["HttpLimits", "HttpServer", "Refused", "Request", "Response", "listen", "parse_head"]
 

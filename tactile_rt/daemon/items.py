@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.stream import ArraySpec, Chunk, Source
+from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 __all__ = [
     "Closed",

@@ -12,9 +12,9 @@ from typing import NoReturn
 
 import msgspec
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import SettingNode, convert, read_toml, refusal, set_key
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import SettingNode, convert, read_toml, refusal, set_key
 
 __all__ = ["Loaded", "load_config"]
 

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Iterable, Mapping
 
-from tactile_rt.bounded_queue import BoundedQueue
+from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.daemon.items import Closed, Decision, Item, Opened, Packet, SourceChunk
 
 __all__ = ["Hub", "Mailbox"]

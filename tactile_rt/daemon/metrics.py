@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
+from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
 from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
@@ -21,7 +22,6 @@ from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Res
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message
 from tactile_rt.drivers.health import State
-from tactile_rt.errors import SourceError
 
 __all__ = ["ALERTS", "Metrics", "exposition"]
 

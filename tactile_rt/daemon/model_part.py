@@ -12,6 +12,9 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.model_card import sensor_of
 from tactile_rt.classifier.model_file import hash_of
 from tactile_rt.classifier.trial import Trial
+from tactile_rt.core.errors import ConfigError, SpecMismatch, TactileError
+from tactile_rt.core.sensor_spec import SensorSpec
+from tactile_rt.core.stream import NS_PER_S, Chunk, Source, concatenate
 from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
@@ -21,9 +24,6 @@ from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.source_part import keeps_host_time
 from tactile_rt.daemon.troubles import LossWindow
-from tactile_rt.errors import ConfigError, SpecMismatch, TactileError
-from tactile_rt.sensor_spec import SensorSpec
-from tactile_rt.stream import NS_PER_S, Chunk, Source, concatenate
 
 __all__ = ["ModelPart"]
 

@@ -11,9 +11,9 @@ import traceback
 from pathlib import Path
 from typing import Protocol
 
+from tactile_rt.core.errors import SpecMismatch, TactileError
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import PartState
-from tactile_rt.errors import SpecMismatch, TactileError
 
 __all__ = ["Part", "Report", "reason_of"]
 

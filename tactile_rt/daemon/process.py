@@ -77,10 +77,10 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
         if _asked_to_end(_noted):
             return ExitCode.STOPPED
         # Late, as all this takes its time.
+        from tactile_rt.core.locks import Locks
         from tactile_rt.daemon.checks import check_config
         from tactile_rt.daemon.daemon import Daemon
         from tactile_rt.daemon.loading import load_config
-        from tactile_rt.locks import Locks
 
         loaded = load_config(path, sets)
         check_config(loaded)

@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
-from tactile_rt.files import sync_folder
+from tactile_rt.core.files import sync_folder
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.recording.writer import PART
 

@@ -11,9 +11,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.errors import ConfigError
 
 __all__ = ["MADE", "check_folders", "install_script", "unit_text"]
 

@@ -17,6 +17,8 @@ from functools import partial
 from typing import Any
 
 from tactile_rt.classifier.classifier import without_bad_samples
+from tactile_rt.core.sensor_spec import SensorSpec
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
@@ -28,9 +30,7 @@ from tactile_rt.daemon.troubles import LossWindow, oldest_s
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.reader import Reader
-from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 
 __all__ = ["Acquisition", "SourcePart", "keeps_host_time"]
 

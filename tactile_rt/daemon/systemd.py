@@ -7,10 +7,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Event, Item
-from tactile_rt.errors import ConfigError
 
 __all__ = ["Systemd", "hanging", "status_of"]
 

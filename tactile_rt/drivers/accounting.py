@@ -25,8 +25,8 @@ A device without a counter can show damage only.
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codec import Samples
-from tactile_rt.stream import SourceStats
 
 __all__ = ["Sequencer"]
 

@@ -34,9 +34,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, SourceStats
 from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Codec, Samples
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, SourceStats
 
 __all__ = ["DeviceClock", "DeviceTime", "Stamper", "host_stamps"]
 

@@ -17,11 +17,11 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt import extensions
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import no_such
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.catalogue import CODECS
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import no_such
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = [
     "CanCodec",

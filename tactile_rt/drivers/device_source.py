@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from tactile_rt.calibration import CalibratedSource
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.stream import NS_PER_S, Chunk, EndOfStream, Source
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.links import Link
-from tactile_rt.errors import ConfigError, SourceError
-from tactile_rt.stream import NS_PER_S, Chunk, EndOfStream, Source
 
 __all__ = ["DeviceOptions", "DeviceSource", "Tap", "device_of"]
 

@@ -8,9 +8,9 @@ import time
 from collections.abc import Sequence
 from typing import Any, Generic
 
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
-from tactile_rt.errors import ConfigError, SourceError
 
 __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
 

@@ -4,10 +4,10 @@ hexadecimal print."""
 import re
 from typing import Any, Final
 
+from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
-from tactile_rt.stream import NS_PER_S
 
 __all__ = [
     "Found",

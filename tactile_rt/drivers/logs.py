@@ -17,6 +17,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import open_regular
+from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import (
     Found,
@@ -26,9 +29,6 @@ from tactile_rt.drivers.log_lines import (
     of_hex,
     of_slcan,
 )
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import open_regular
-from tactile_rt.stream import NS_PER_S
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 

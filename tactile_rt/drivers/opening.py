@@ -16,12 +16,12 @@ from tactile_rt.calibration import (
     declared,
     load_calibration,
 )
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import no_such, split_url, take_options
+from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import no_such, split_url, take_options
-from tactile_rt.stream import ArraySpec, Source
 
 __all__ = [
     "CanOptions",

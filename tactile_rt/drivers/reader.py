@@ -13,7 +13,7 @@ import select
 import time
 from collections.abc import Iterable, Iterator
 
-from tactile_rt.stream import Chunk, EndOfStream, Source
+from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
 __all__ = ["Reader"]
 

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.errors import ConfigError
 
 __all__ = ["SlcanAdapter", "SlcanDecoder", "closing", "encode", "opening"]
 

@@ -21,13 +21,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.stream import EndOfStream
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import CanFrame, Codec, Command, Samples, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import Link, SerialLink
 from tactile_rt.drivers.opening import make_codec, open_line
-from tactile_rt.errors import ConfigError, SourceError
-from tactile_rt.stream import EndOfStream
 
 __all__ = [
     "LOOK_BYTES",

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.errors import ConfigError, SpecMismatch, name_some
+from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.promises import familiarity, named_faults, promises
 from tactile_rt.evidence.records import Record

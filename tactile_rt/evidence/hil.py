@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 
 from tactile_rt.calibration import declare
 from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.stream import NS_PER_S, Chunk, Source, SourceStats
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import NS_PER_S, Chunk, Source, SourceStats
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.faults import FaultSchedule

@@ -24,7 +24,7 @@ from tactile_rt.classifier.decision_rules import (
     UnknownRule,
     mass_above,
 )
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Step, at_temperature, predict
 

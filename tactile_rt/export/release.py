@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.model_card import EmbeddingStatistics, Kind
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, load_model
 from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.core.files import write_whole
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
-from tactile_rt.files import write_whole
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 
 __all__ = ["Symmetry", "compose", "symmetries"]
 

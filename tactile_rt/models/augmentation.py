@@ -23,10 +23,10 @@ import numpy as np
 import torch
 from torch import Generator, Tensor
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models import published_pictures
 from tactile_rt.models.array_symmetries import compose, symmetries
-from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "Augmentation",

@@ -10,10 +10,10 @@ from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.errors import ModelError
-from tactile_rt.files import open_regular
+from tactile_rt.core.errors import ModelError
+from tactile_rt.core.files import open_regular
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models.ead_config import EADConfig
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["NETWORK", "describe_checkpoint", "network_of", "no_checkpoint", "reason"]
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models.datasets import SweepSet, frame_of
 from tactile_rt.models.ead_config import EADConfig
-from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import (
     OUTLIERS,
     UNLABELLED,

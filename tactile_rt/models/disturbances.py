@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
 
 __all__ = ["CLEAN", "OFFSET", "RATED", "Disturbance"]

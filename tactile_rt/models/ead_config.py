@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from tactile_rt import extensions
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError, name_some
 
 __all__ = [
     "ATTENDERS",

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec
 
 __all__ = ["IMPLAUSIBLE", "implausible"]
 

@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream import ArraySpec
 
 PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
 PAPER_CLIP = 1000.0  # of these units

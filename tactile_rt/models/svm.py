@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.svm import SVC
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet

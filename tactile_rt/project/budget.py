@@ -13,8 +13,8 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
 from tactile_rt.project.folder import Project
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.dataset import simulate_sweep

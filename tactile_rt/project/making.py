@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.evidence.classification import evaluate_model
 from tactile_rt.evidence.records import Record, write
 from tactile_rt.export.release import release

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.core.files import write_whole
 from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.pictures import draw_confusion
 from tactile_rt.evidence.records import Record
-from tactile_rt.files import write_whole
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.project.folder import Project

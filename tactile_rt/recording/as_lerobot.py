@@ -22,8 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
-from tactile_rt.files import whole_folder
+from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
+from tactile_rt.core.files import whole_folder
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.recording.conversion import about_text
 from tactile_rt.recording.lerobot_film import CameraFilm, write_film
 from tactile_rt.recording.lerobot_meta import (
@@ -35,7 +36,6 @@ from tactile_rt.recording.lerobot_meta import (
     write_meta,
 )
 from tactile_rt.recording.reader import Recording
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["write_dataset"]
 

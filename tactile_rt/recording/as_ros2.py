@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tactile_rt.files import whole_folder
+from tactile_rt.core.files import whole_folder
 from tactile_rt.recording.description import RECOVERED
 from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
 from tactile_rt.recording.reader import Recording

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.classifier.model_file import hash_of, shipped_model
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import parse_toml
+from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.recording.description import Description
-from tactile_rt.settings import parse_toml
-from tactile_rt.stream import NS_PER_S, Chunk
 
 __all__ = [
     "FACTS",

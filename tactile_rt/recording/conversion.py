@@ -21,13 +21,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.extras import lacking
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.extras import lacking
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.recording.description import Description, seal
 from tactile_rt.recording.layout import DECISIONS, EVENTS, HEALTH
 from tactile_rt.recording.reader import Recording
-from tactile_rt.stream import ArraySpec, Chunk, concatenate
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 
 from tactile_rt.calibration import CalibratedSource, Calibration
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.device_source import device_of
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.stream import ArraySpec, Source
 
 __all__ = [
     "METADATA",

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import whole_folder
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import whole_folder
 from tactile_rt.recording.labelling import LabelledTouch, LabelledTouches
 from tactile_rt.recording.touches import REST
 from tactile_rt.sweep_set import (

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import open_regular, sync_folder, write_whole
-from tactile_rt.settings import check_columns, convert, nearest, read_csv, refusal
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import open_regular, sync_folder, write_whole
+from tactile_rt.core.settings import check_columns, convert, nearest, read_csv, refusal
 
 __all__ = [
     "LABELS",

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.stream import Chunk
 
 __all__ = [
     "DECISIONS",

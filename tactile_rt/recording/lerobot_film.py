@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.extras import lacking
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extras import lacking
 
 __all__ = ["VIDEO", "CameraFilm", "film_of", "write_film"]
 

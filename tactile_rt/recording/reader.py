@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import msgspec
 
-from tactile_rt.errors import ConfigError, RecordingError, TactileError
-from tactile_rt.files import open_regular
+from tactile_rt.core.errors import ConfigError, RecordingError, TactileError
+from tactile_rt.core.files import open_regular
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -23,7 +24,6 @@ from tactile_rt.recording.layout import (
 )
 from tactile_rt.recording.records import MAGIC, read_records
 from tactile_rt.recording.ros2_form import is_in_file_form, name_channel, plain
-from tactile_rt.stream import ArraySpec, Chunk
 
 if TYPE_CHECKING:
     from tactile_rt.recording.records import Record

@@ -6,8 +6,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.files import open_regular, sync_folder, write_whole
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.files import open_regular, sync_folder, write_whole
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC, read_whole_records

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.recording.layout import WIRE
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.replay import open_replay
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 
 __all__ = ["Redecoded", "compare_decoding"]
 

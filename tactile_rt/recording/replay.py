@@ -22,15 +22,15 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.classifier.array_file import read_array
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.settings import take_options
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples
 from tactile_rt.drivers.opening import Prepared, make_codec
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
-from tactile_rt.settings import take_options
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.sweep_set import SweepManifest, read_object
 
 __all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]

@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.core.stream import NS_PER_S, Source
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.writer import RecordingWriter
-from tactile_rt.stream import NS_PER_S, Source
 
 __all__ = ["Rotation"]
 

@@ -14,9 +14,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from tactile_rt.bounded_queue import BoundedQueue
+from tactile_rt.core.bounded_queue import BoundedQueue
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import Chunk, Source
 from tactile_rt.drivers.device_source import device_of
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     SAMPLES,
@@ -28,7 +29,6 @@ from tactile_rt.recording.layout import (
 from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Syncer
 from tactile_rt.recording.writer import RecordingWriter, WriterStats
-from tactile_rt.stream import Chunk, Source
 
 __all__ = ["StreamWriter"]
 

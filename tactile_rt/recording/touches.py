@@ -28,7 +28,7 @@ from tactile_rt.classifier.contact import (
     ContactDetector,
 )
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.stream import ArraySpec, Chunk
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.timing import Timing
 
 __all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]

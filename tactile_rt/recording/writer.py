@@ -27,10 +27,11 @@ from typing import Any, BinaryIO, Literal
 
 import msgspec
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import sync_folder
+from tactile_rt.core.stream import Source
 from tactile_rt.drivers.device_source import device_of
 from tactile_rt.drivers.health import Health
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import sync_folder
 from tactile_rt.recording.description import (
     METADATA,
     SESSION,
@@ -50,7 +51,6 @@ from tactile_rt.recording.layout import (
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.ros2.definitions import schema_text
-from tactile_rt.stream import Source
 
 __all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats", "check_not_recorded"]
 

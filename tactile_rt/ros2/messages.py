@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.ros2 import cdr
-from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "ARRAY",

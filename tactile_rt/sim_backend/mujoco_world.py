@@ -11,7 +11,7 @@ import trimesh
 from mujoco import rollout
 from numpy.typing import NDArray
 
-from tactile_rt.errors import SourceError
+from tactile_rt.core.errors import SourceError
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, link_nodes
 from tactile_rt.sim_backend.world import (

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["SensorModel"]
 

@@ -22,7 +22,8 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
@@ -40,7 +41,6 @@ from tactile_rt.sim_backend.sweep_simulation import (
 )
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = [
     "CHUNK_SAMPLES",

@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation

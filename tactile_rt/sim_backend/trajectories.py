@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import convert, read_csv
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, read_csv
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 
 __all__ = ["ANGLES", "Trajectory", "Whisk", "base_angles", "coupled", "mirror", "read_trajectory"]

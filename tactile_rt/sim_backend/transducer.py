@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.sensor_spec import FIELD, MagnetSpec, SensorSpec
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import FIELD, MagnetSpec, SensorSpec
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.world import SAMPLE_MS, world_spec
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["FASTEST_HZ", "Transducer", "device_spec", "dipole_field", "sensor_of"]
 

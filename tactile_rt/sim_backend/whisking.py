@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.whisker_array import Mount
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.sim_backend.mujoco_world import UNSTABLE

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
@@ -20,7 +21,6 @@ from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedOptions, PacedSour
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.stream import ArraySpec, Chunk, EndOfStream
 
 __all__ = ["Placing", "WhiskingOptions", "WhiskingSource", "parse_point"]
 

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import (
     DAMPING_RATIO,
@@ -24,7 +25,6 @@ from tactile_rt.sim_backend.arrays.whiskers import (
     link_nodes,
     rotation,
 )
-from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "CHANNELS",

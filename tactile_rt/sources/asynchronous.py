@@ -8,7 +8,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
 
-from tactile_rt.stream import Chunk, EndOfStream, Source
+from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
 __all__ = ["chunks"]
 

@@ -29,11 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.core.errors import ConfigError, SourceError, TactileError
+from tactile_rt.core.settings import convert, read_toml, refusal
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.drivers.opening import Prepared
-from tactile_rt.errors import ConfigError, SourceError, TactileError
-from tactile_rt.settings import convert, read_toml, refusal
 from tactile_rt.sources.opening import check_source, open_source
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["CombinedSource", "MemberArray", "combine_specs", "prepare_combined"]
 

@@ -14,14 +14,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from tactile_rt import extensions
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.array_file import read_array
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError, SpecMismatch
+from tactile_rt.core.extras import lacking
+from tactile_rt.core.settings import nearest, split_url, take_options
+from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.opening import Prepared
-from tactile_rt.errors import ConfigError, SpecMismatch
-from tactile_rt.extras import lacking
-from tactile_rt.settings import nearest, split_url, take_options
-from tactile_rt.stream import ArraySpec, Source
 
 __all__ = ["SCHEMES", "check_model", "check_source", "is_made_up", "open_source"]
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.array_file import read_array
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["SyntheticOptions", "SyntheticSource", "synthetic_spec"]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
 
 __all__ = ["FeatureNetwork"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.teaching.head import FEWEST, LeftOut, check_enough
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["FEWEST", "LeftOut", "TouchClasses", "check_enough", "fit_classes", "leave_out"]
 

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import hash_of, load_model
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.labels import (
     LABELS,
@@ -37,7 +38,6 @@ from tactile_rt.recording.labels import (
     read_labels,
     remove_label,
 )
-from tactile_rt.stream import ArraySpec
 from tactile_rt.teaching.further import check_further
 from tactile_rt.teaching.head import FEWEST, LeftOut
 from tactile_rt.teaching.listener import Listener

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.errors import RecordingError
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["Listener", "measured_floor"]
 

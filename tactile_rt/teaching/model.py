@@ -25,8 +25,8 @@ from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, read_model
 from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
-from tactile_rt.files import write_whole
-from tactile_rt.stream import NS_PER_S, ArraySpec
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import NS_PER_S, ArraySpec
 from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.further import (
     check_further,

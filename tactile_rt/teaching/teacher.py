@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.teaching.lesson import ORDERS, Lesson, LessonProgress
 
 __all__ = ["ORDERS", "Teacher"]

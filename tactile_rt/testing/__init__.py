@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["ArraySource", "FakeCan", "FakeSerial", "cut", "small_spec"]
 

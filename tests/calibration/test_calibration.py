@@ -23,8 +23,8 @@ from tactile_rt.calibration import (
     save_calibration,
     tare,
 )
-from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
-from tactile_rt.stream import ArraySpec, Chunk, EndOfStream, SourceStats, concatenate
+from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
+from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, SourceStats, concatenate
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.calibration import CalibratedSource, Calibration, declare, declared
-from tactile_rt.errors import SpecMismatch
-from tactile_rt.stream import ArraySpec, Source
+from tactile_rt.core.errors import SpecMismatch
+from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 CHANNELS = (("bx", "T"), ("by", "T"), ("bz", "T"), ("temperature", "K"), ("fx", "N"))

@@ -6,7 +6,7 @@ import pytest
 
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.errors import TactileError
+from tactile_rt.core.errors import TactileError
 from tactile_rt.testing import small_spec
 
 

@@ -19,8 +19,8 @@ from tactile_rt.classifier.decision_rules import (
     UnknownRule,
 )
 from tactile_rt.classifier.model_card import decided, rated_noise
-from tactile_rt.errors import ModelError, SpecMismatch
-from tactile_rt.stream import NS_PER_S, Chunk, concatenate
+from tactile_rt.core.errors import ModelError, SpecMismatch
+from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import (
     CARD,

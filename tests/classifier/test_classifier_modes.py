@@ -11,8 +11,8 @@ pytest.importorskip("onnx")
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.exits import Lanes
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import NS_PER_S, Chunk
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.testing import cut
 from tests.helpers.tiny_model import PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, expected_logits, push_all, signal, stream

@@ -20,7 +20,7 @@ from tactile_rt.classifier.classifier import Classification, Classifier, without
 from tactile_rt.classifier.exits import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
-from tactile_rt.stream import NS_PER_S, Chunk, concatenate
+from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, expected_logits, push_all, signal, stream

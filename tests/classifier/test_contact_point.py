@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.contact_point import ESTIMATES, WhiskerShapes, bent, resting, straight
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 ONE = np.zeros(1, dtype=np.int64)
 

@@ -20,7 +20,7 @@ from tactile_rt.classifier.model_file import (
     shipped_model,
 )
 from tactile_rt.classifier.model_runs import probe_logits
-from tactile_rt.errors import ConfigError, ModelError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model
 

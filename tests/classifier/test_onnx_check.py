@@ -18,7 +18,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.onnx_check import BadModel, graph_sha256, read_onnx
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 from tests.helpers.tiny_model import GRAPH, write_model
 
 

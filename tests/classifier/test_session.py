@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.session import Session
-from tactile_rt.errors import SourceError
-from tactile_rt.stream import Chunk, EndOfStream, Source
+from tactile_rt.core.errors import SourceError
+from tactile_rt.core.stream import Chunk, EndOfStream, Source
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 

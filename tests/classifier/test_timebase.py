@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.stream import NS_PER_S, Chunk, concatenate
+from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 
 PERIOD_NS = 9_000_000

@@ -16,7 +16,7 @@ pytest.importorskip("onnx")
 from tactile_rt.classifier import trial
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.classifier.trial import TrialLimits, try_model
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 from tests.helpers.hostile_models import BURNERS, GREEDY, UNSOUND, write_burdened
 from tests.helpers.tiny_model import write_model
 from tests.helpers.waiting import PATIENCE_S, until
@@ -30,7 +30,7 @@ JUDGE = """
 import json, resource, sys
 from pathlib import Path
 from tactile_rt.classifier.trial import try_model
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 try:
     try_model(Path(sys.argv[1]))
     said = ""
@@ -128,7 +128,7 @@ LIMITED = """
 import os, resource, sys
 import tactile_rt.classifier.model_file as model_file
 import tactile_rt.classifier.trial as trial
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
 
 def load_model(path, *others):
     kinds = resource.RLIMIT_CPU, resource.RLIMIT_CORE, resource.RLIMIT_DATA

@@ -11,7 +11,7 @@ from tactile_rt.calibration import (
     load_calibration,
     save_calibration,
 )
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sources import opening as sources
 from tactile_rt.testing import ArraySource, cut, small_spec
 

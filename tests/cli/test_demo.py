@@ -14,9 +14,9 @@ from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import demo as demo_module
 from tactile_rt.cli.demo import Demonstration, draw, watch
-from tactile_rt.extras import install_extra
+from tactile_rt.core.extras import install_extra
+from tactile_rt.core.stream import Chunk
 from tactile_rt.recording.replay import DEMO
-from tactile_rt.stream import Chunk
 
 simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
 

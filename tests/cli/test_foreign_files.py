@@ -14,8 +14,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from tactile_rt.core.stream import concatenate
 from tactile_rt.recording import Recording
-from tactile_rt.stream import concatenate
 
 N = 20
 TIMES = [k / 100 for k in range(N)]  # s

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.tiny_model import write_model
 

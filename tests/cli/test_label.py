@@ -14,7 +14,7 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import cut_windows, run_over

@@ -160,7 +160,7 @@ def test_what_ignores_hangups_goes_on_ignoring_them():
 
 
 def test_a_configuration_is_written_whole_or_not(refused, tmp_path, monkeypatch):
-    from tactile_rt import files
+    from tactile_rt.core import files
 
     def full(source, target):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -17,7 +17,7 @@ import pytest
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.locks import alone_in
+from tactile_rt.core.locks import alone_in
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.sources.opening import open_source
 from tactile_rt.teaching.lesson import Lesson

@@ -10,13 +10,13 @@ from importlib.util import find_spec
 
 import pytest
 
+from tactile_rt.core.errors import TactileError
+from tactile_rt.core.extras import install_extra
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
-from tactile_rt.errors import TactileError
-from tactile_rt.extras import install_extra
 from tactile_rt.recording.replay import ReplayOptions, SweepOptions
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import SyntheticOptions

@@ -6,8 +6,8 @@ import threading
 import numpy as np
 import pytest
 
+from tactile_rt.core.stream import Chunk, SourceStats
 from tactile_rt.daemon.source_part import Acquisition
-from tactile_rt.stream import Chunk, SourceStats
 from tactile_rt.testing import small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 

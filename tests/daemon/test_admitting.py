@@ -7,11 +7,11 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import EVERY
 from tactile_rt.classifier.trial import Trial, TrialLimits
+from tactile_rt.core.errors import ModelError
 from tactile_rt.daemon import admission as module
 from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
-from tactile_rt.errors import ModelError
 from tactile_rt.testing import ArraySource, cut
 from tests.helpers.tiny_model import CARD, STEPS, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream

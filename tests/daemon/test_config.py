@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import find_lines
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.config import EXAMPLE, Config, config_text
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import find_lines
 from tactile_rt.testing import small_spec
 from tests.helpers.refusals import refusal
 

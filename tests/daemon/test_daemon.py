@@ -14,6 +14,8 @@ from rich.console import Console
 from tactile_rt.calibration import Calibration, save_calibration
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.cli.top import picture
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.locks import AlreadyRunning, Locks
 from tactile_rt.daemon import publishers
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.clock import Clock
@@ -32,8 +34,6 @@ from tactile_rt.daemon.items import (
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.metrics import exposition
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.errors import ConfigError, SourceError
-from tactile_rt.locks import AlreadyRunning, Locks
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 from tests.helpers.tiny_model import write_model

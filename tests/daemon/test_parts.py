@@ -14,8 +14,11 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from tactile_rt import locks as lock
 from tactile_rt.classifier.classifier import Classification
+from tactile_rt.core import locks as lock
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
+from tactile_rt.core.stream import Chunk
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
 from tactile_rt.daemon.health import EDGES_S, LatencyMeter
@@ -34,9 +37,6 @@ from tactile_rt.daemon.mailbox import AROUND_BYTES, FRAME_BYTES, Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.errors import ConfigError
-from tactile_rt.locks import AlreadyRunning, Locks, device_keys, lock_keys
-from tactile_rt.stream import Chunk
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -267,7 +267,7 @@ def test_a_lock_ends_with_its_process_and_is_anothers_until_then(tmp_path):
     device = f"device {tmp_path}/tty"
     keys = [f"configuration {tmp_path}/robot.toml", device]
     code = (
-        "import sys; from tactile_rt.locks import Locks; held = Locks(); "
+        "import sys; from tactile_rt.core.locks import Locks; held = Locks(); "
         "held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
@@ -317,7 +317,7 @@ def test_many_start_at_once_and_one_of_them_is_alone(tmp_path):
 def test_a_lock_of_another_user_is_a_lock_and_names_the_user(tmp_path):
     key = f"device {tmp_path}/tty"
     code = (
-        "import os, sys; from tactile_rt.locks import Locks; os.setuid(65534); "
+        "import os, sys; from tactile_rt.core.locks import Locks; os.setuid(65534); "
         "held = Locks(); held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
@@ -367,7 +367,7 @@ def test_a_holder_that_very_many_have_asked_is_not_waited_for(tmp_path):
 def test_a_holder_outside_of_the_container_is_a_lock(tmp_path):
     key, held = f"device {tmp_path}/tty", Locks()
     held.hold([key])
-    code = "import sys; from tactile_rt.locks import Locks; Locks().hold([sys.argv[1]])"
+    code = "import sys; from tactile_rt.core.locks import Locks; Locks().hold([sys.argv[1]])"
     command = ["unshare", "--pid", "--fork", sys.executable, "-c", code, key]
     asked = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
     held.close()

@@ -11,10 +11,10 @@ import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import main
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.service import unit_text
-from tactile_rt.errors import ConfigError
 from tests.helpers.overlay import changes
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'

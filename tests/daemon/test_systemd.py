@@ -10,14 +10,14 @@ from typing import ClassVar
 
 import pytest
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Source
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.process import _serve
 from tactile_rt.daemon.systemd import Systemd, hanging, status_of
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Source
 from tactile_rt.testing import small_spec
 from tests.helpers.published import View, busy_snapshot, event, running
 from tests.helpers.waiting import PATIENCE_S, until

@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.core.stream import Chunk
 from tactile_rt.daemon import troubles as module
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
@@ -21,8 +23,6 @@ from tactile_rt.daemon.health import (
 )
 from tactile_rt.daemon.troubles import LossWindow, troubles
 from tactile_rt.drivers.health import Health, State
-from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
-from tactile_rt.stream import Chunk
 from tactile_rt.testing import cut, small_spec
 
 NOW = 1_000_000_000_000

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.accounting import REMEMBERED, Sequencer
 from tactile_rt.drivers.codec import Samples
-from tactile_rt.stream import SourceStats
 
 
 def samples(counts, damaged=None, ticks=None, content=None):

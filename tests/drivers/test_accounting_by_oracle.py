@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Samples
-from tactile_rt.stream import SourceStats
 
 PERIOD = 1000  # ticks between samples, nominally
 

@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.stream import EndOfStream
 from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.health import State
-from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import EndOfStream
 from tactile_rt.testing import FakeCan, FakeSerial
 from tests.helpers.waiting import PATIENCE_S, until
 

@@ -8,9 +8,9 @@ import sqlite3
 import can
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.logs import read_log
-from tactile_rt.errors import ConfigError
 
 T0 = 1_700_000_000.5
 N = 60

@@ -7,12 +7,12 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import SourceError
+from tactile_rt.core.stream import EndOfStream, Source
 from tactile_rt.drivers.health import State
 from tactile_rt.drivers.reader import Reader
-from tactile_rt.errors import SourceError
 from tactile_rt.sources.asynchronous import chunks
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import EndOfStream, Source
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 

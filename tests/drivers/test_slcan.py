@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.slcan import SlcanAdapter, SlcanDecoder, closing, encode, opening
-from tactile_rt.errors import ConfigError
 
 # CANUSB manual 1.0C, commands t, T, r, R and Z
 MANUAL = [

@@ -7,14 +7,14 @@ from contextlib import suppress
 import pytest
 
 from bench.drivers.fuzzing import COLUMNS, DBC, MAPPING
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import EndOfStream
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.column_guess import guess_line_columns
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.sniffing import sniff_bytes, sniff_frames
-from tactile_rt.errors import ConfigError
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import EndOfStream
 from tests.helpers.source_tree import ROOT
 from tests.helpers.waiting import PATIENCE_S
 

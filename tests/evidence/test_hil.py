@@ -9,12 +9,12 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classification
+from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
+from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.health import Health, State
-from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
 from tactile_rt.evidence.hil import Loop, LoopReport, named_right, pair
-from tactile_rt.stream import SourceStats
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.tiny_model import write_model
 

@@ -27,7 +27,9 @@ from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
-from tactile_rt.errors import ModelError
+from tactile_rt.core.errors import ModelError
+from tactile_rt.core.sensor_spec import CHANNEL_FLOOR
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.export import onnx_step, streaming, streaming_gpt
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
@@ -41,8 +43,6 @@ from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.onsets import find_onsets
-from tactile_rt.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest
 from tactile_rt.testing import cut
 from tactile_rt.timing import MOUSE

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from bench.drivers.fuzzing import mutate
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import Codec, Command, Samples
-from tactile_rt.stream import Chunk
 
 T0 = 5_000_000_000
 

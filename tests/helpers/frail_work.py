@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.stream import ArraySpec, Chunk
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.testing import cut
 from tests.helpers.recordings import write
 from tests.helpers.tiny_sweeps import plate

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["KINDS", "RATE_HZ", "felt", "touch", "wrench_spec"]
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.world import RodWorld
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.transducer import Transducer, device_spec
-from tactile_rt.stream import ArraySpec, Chunk
 
 LINKS, STEPS = 10, 4
 SWING_MS, APART_MS = 900, 1500

@@ -5,6 +5,7 @@ import contextlib
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification
+from tactile_rt.core.stream import ArraySpec, Chunk, SourceStats
 from tactile_rt.daemon.health import (
     ConsumerState,
     Latency,
@@ -18,7 +19,6 @@ from tactile_rt.daemon.health import (
 )
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
 from tactile_rt.drivers.health import Health, State
-from tactile_rt.stream import ArraySpec, Chunk, SourceStats
 from tactile_rt.testing import small_spec
 
 UTC = 1_700_000_000_000_000_000

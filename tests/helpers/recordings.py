@@ -6,11 +6,11 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from tactile_rt.core.stream import Chunk
 from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S
 

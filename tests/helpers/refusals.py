@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 
 def refusal(work: Callable[..., Any], *arguments: Any, **options: Any) -> str:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from tactile_rt.stream import Chunk, EndOfStream, Source, SourceStats, concatenate
+from tactile_rt.core.stream import Chunk, EndOfStream, Source, SourceStats, concatenate
 from tests.helpers.waiting import PATIENCE_S
 
 AT_ONCE_S = 0.5  # nobody sleeps that long by accident, and a busy machine is forgiven

@@ -44,7 +44,7 @@ class SourceModule:
     """A file of source.
 
     Attributes:
-        name: The module's full name, such as `tactile_rt.stream`.
+        name: The module's full name, such as `tactile_rt.core.stream`.
         path: The file that it was read from.
         tree: The syntax tree of the whole file.
     """

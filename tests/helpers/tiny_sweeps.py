@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, split_by_object, write_object
 
 COLUMNS = (5, 5, 7, 7, 6)  # of rows A to E

@@ -3,7 +3,7 @@
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.stream import NS_PER_S, Chunk
+from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import CARD, PERIOD_NS, SUBSTEPS
 

@@ -9,7 +9,7 @@ pytest.importorskip("torch")
 
 import torch
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
 from tactile_rt.timing import Timing

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tactile_rt.calibration.correction import Mirror
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.array_symmetries import symmetries
 from tactile_rt.models.augmentation import (
     Tactile,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, windows
 from tactile_rt.models.evaluation import cut_windows
 from tactile_rt.models.training.batches import TrainingBatches, partners

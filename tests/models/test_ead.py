@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, READOUTS, EADConfig
 from tests.helpers.small_networks import STEPS, TOLERANCE, build, frames, stream
 

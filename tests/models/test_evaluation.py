@@ -10,7 +10,9 @@ pytest.importorskip("torch")
 from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import ContactDetector
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import channel_limits
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models import evaluation, onsets
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import OFFSET, Disturbance
@@ -22,8 +24,6 @@ from tactile_rt.models.evaluation import (
     deciding_step,
 )
 from tactile_rt.models.onsets import find_onsets
-from tactile_rt.sensor_spec import channel_limits
-from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 from tactile_rt.timing import MOUSE
 from tests.helpers.tiny_sweeps import plate

@@ -15,7 +15,7 @@ pytest.importorskip("torch")
 pytest.importorskip("lightning")
 pytest.importorskip("matplotlib")
 
-from tactile_rt.errors import ConfigError, ModelError, RecordingError
+from tactile_rt.core.errors import ConfigError, ModelError, RecordingError
 from tactile_rt.models.grid import pool, results
 from tactile_rt.models.grid.outcomes import (
     Outcome,

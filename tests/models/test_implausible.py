@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models.implausible import IMPLAUSIBLE, implausible
-from tactile_rt.stream import ArraySpec
 from tactile_rt.testing import small_spec
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.inputs import InputStage, paper_units
 from tests.helpers.tiny_sweeps import plate, tiny_array
 

@@ -5,7 +5,7 @@ from itertools import product
 
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.recipes import load_recipe, read_recipe, shipped_recipes
 

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("sklearn")
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.svm import fit, fit_svm
 from tests.helpers.tiny_sweeps import write_tiny_set

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import nn
 
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import hits, predict

@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
-from tactile_rt.errors import ConfigError, ModelError  # noqa: E402
+from tactile_rt.core.errors import ConfigError, ModelError  # noqa: E402
 from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of  # noqa: E402
 from tactile_rt.models.checkpoints import load_checkpoint  # noqa: E402
 from tactile_rt.models.ead_config import CELLS  # noqa: E402

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import Chunk, EndOfStream, Source
 from tactile_rt.recording import Recording
-from tactile_rt.stream import Chunk, EndOfStream, Source
 from tactile_rt.testing import FakeSerial, small_spec
 from tests.helpers.waiting import until
 

@@ -15,8 +15,8 @@ pytest.importorskip("matplotlib")
 
 import trimesh
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.errors import ConfigError
 from tactile_rt.project import folder as folder_module
 from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import KINDS, Project, new_project

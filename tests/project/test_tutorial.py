@@ -18,11 +18,11 @@ pytest.importorskip("sklearn")
 pytest.importorskip("matplotlib")
 
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.project.budget import Budget, described, write_budget
 from tactile_rt.project.folder import KINDS, Project
 from tactile_rt.project.making import make
-from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sweep_set import SweepManifest, read_skipped
 from tests.helpers.source_tree import ROOT
 

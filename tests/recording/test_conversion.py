@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from tactile_rt.calibration import Calibration
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.extras import install_extra
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.extras import install_extra
+from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.conversion import convert
-from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.recordings import odd_chunks, write_as_daemon
 

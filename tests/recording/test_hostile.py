@@ -2,7 +2,7 @@
 
 import pytest
 
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
 from tactile_rt.recording import Recording
 from tests.helpers.hostile_files import MCAPS
 from tests.helpers.measured import measured

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.model_file import METADATA_KEY, shipped_model
-from tactile_rt.errors import ConfigError, ModelError, RecordingError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
+from tactile_rt.core.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.recording import Recording
 from tactile_rt.recording.labelled_set import write_set
 from tactile_rt.recording.labelling import (
@@ -20,7 +21,6 @@ from tactile_rt.recording.labelling import (
     like,
 )
 from tactile_rt.recording.labels import LabelledInterval
-from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.sweep_set import SweepManifest, read_object, read_sweeps
 from tests.helpers.labelled import ARRAY, KINDS, chunks_of_touches, record_touches, times
 from tests.helpers.recordings import write

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.recording.labels import LabelledInterval, append_label, label_of_file, read_labels
 
 HEADER = "recording,start_s,end_s,label,object\n"

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.recording.layout import (
     decode_packet,
@@ -13,7 +14,6 @@ from tactile_rt.recording.layout import (
     encode_packet,
     encode_samples,
 )
-from tactile_rt.stream import Chunk
 from tactile_rt.testing import cut
 from tests.helpers.recordings import noise, parts
 

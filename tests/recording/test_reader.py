@@ -6,7 +6,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import cut

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.recording import Description, Recording, recover
 from tactile_rt.recording.description import RECOVERED
 from tactile_rt.recording.layout import encode_samples

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tactile_rt.calibration import Calibration, save_calibration
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import EndOfStream, concatenate
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording
 from tactile_rt.recording.replay import DEMO
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import EndOfStream, concatenate
 from tactile_rt.sweep_set import SweepManifest, write_object
 from tactile_rt.testing import FakeCan, FakeSerial, cut
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, record_device, write

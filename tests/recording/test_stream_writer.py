@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut

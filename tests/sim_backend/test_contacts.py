@@ -13,7 +13,7 @@ import mujoco
 
 from bench.sim.beams import flat
 from bench.sim.pegs import SLIDE_MM_S, _steps, press, presses
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import welch
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.sim_backend.sensor import FULL_SCALE, Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
-from tactile_rt.stream import ArraySpec, Chunk, concatenate
 
 PERIOD_NS = 1_000_000
 

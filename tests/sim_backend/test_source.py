@@ -6,12 +6,12 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk, EndOfStream, SourceStats, concatenate
 from tactile_rt.sim_backend import source as source_module
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, EndOfStream, SourceStats, concatenate
 from tests.helpers.source_contract import take
 
 

@@ -10,7 +10,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.stimuli import (
     PERIOD_NS,

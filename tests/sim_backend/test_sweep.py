@@ -12,7 +12,7 @@ import mujoco
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.errors import SourceError
+from tactile_rt.core.errors import SourceError
 from tactile_rt.sim_backend.arrays.files import load_animals, load_array
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, place
 from tactile_rt.sim_backend.arrays.whiskers import Whisker

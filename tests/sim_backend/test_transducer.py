@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.errors import ConfigError
-from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits
+from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, dipole_field
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, concatenate
 from tests.helpers.source_tree import ROOT
 
 MAGNETS = ROOT / "docs" / "arrays" / "magnets.toml"

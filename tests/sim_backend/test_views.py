@@ -15,7 +15,8 @@ import mujoco
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.arrays.files import load_array, mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
@@ -31,7 +32,6 @@ from tactile_rt.sim_backend.views.footage import VIEWS, Camera, Footage, framing
 from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
-from tactile_rt.stream import ArraySpec
 
 SCALE = ForceScale(1.0, 10.0)
 SIDE = 200  # pixels of a test picture

@@ -9,7 +9,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
-from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirrored
 from tactile_rt.sim_backend.trajectories import Whisk, base_angles, mirror, read_trajectory

@@ -13,15 +13,15 @@ pytest.importorskip("trimesh")
 
 from scipy.integrate import solve_ivp
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk, EndOfStream, Source, concatenate
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, MessageType
-from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.whisking_drive import LAG_S, LARGEST_RAD, MOST, Drive, Whisking
 from tactile_rt.sim_backend.whisking_source import WhiskingOptions, WhiskingSource
 from tactile_rt.sim_backend.world import array_spec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, EndOfStream, Source, concatenate
 from tactile_rt.testing import FakeCan, FakeSerial
 from tests.helpers.source_contract import take
 from tests.helpers.waiting import until

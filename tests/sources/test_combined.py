@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sources.combined import CombinedSource, MemberArray, combine_specs
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, cut, small_spec

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from tactile_rt.calibration import Calibration, save_calibration
+from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
+from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.codecs.native_common import MessageType
 from tactile_rt.drivers.device_source import device_of
-from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
 from tactile_rt.recording import Recording
 from tactile_rt.recording.redecoding import compare_decoding
 from tactile_rt.sources.opening import check_model, check_source, open_source
-from tactile_rt.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import record_device
 from tests.helpers.waiting import PATIENCE_S, until

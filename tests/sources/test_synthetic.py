@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from tactile_rt.core.stream import concatenate
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
-from tactile_rt.stream import concatenate
 
 
 def test_one_at_rest_only_has_noise() -> None:

@@ -7,7 +7,7 @@ import onnxruntime
 import pytest
 
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.model import Taught, write_features
 from tactile_rt.testing import small_spec

@@ -10,7 +10,7 @@ from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_card import EmbeddingStatistics
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.model_runs import file_outputs, verify_model
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.teaching.further import (
     EARLY,
     fit_further,

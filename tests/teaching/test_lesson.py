@@ -12,7 +12,7 @@ import pytest
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.classifier.model_runs import verify_model
-from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.teaching.head import fit_classes, leave_out

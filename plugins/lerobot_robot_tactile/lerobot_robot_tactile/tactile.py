@@ -13,10 +13,10 @@ from lerobot.robots import Robot, make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_robot_tactile.config_tactile import TactileConfig
-from tactile_rt.errors import ConfigError, SourceError, TactileError
+from tactile_rt.core.errors import ConfigError, SourceError, TactileError
+from tactile_rt.core.stream import Chunk, EndOfStream
 from tactile_rt.recording import StreamWriter
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, EndOfStream
 
 __all__ = ["Sensor", "Tactile"]
 

@@ -8,6 +8,7 @@ import time
 
 import msgspec
 
+from tactile_rt.core.errors import ConfigError, TactileError
 from tactile_rt.daemon.config import PageConfig, is_loopback
 from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.http import HttpServer, listen
@@ -16,7 +17,6 @@ from tactile_rt.daemon.messages import encode, state_message
 from tactile_rt.daemon.page import routes
 from tactile_rt.daemon.page.feed import FEED_VERSION, Feed, array_line
 from tactile_rt.daemon.page.routes import HEADERS, Guard
-from tactile_rt.errors import ConfigError, TactileError
 
 __all__ = ["Page"]
 

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, message_of
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["FEED_VERSION", "Feed", "Line", "array_line", "map_axes"]
 

@@ -21,7 +21,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 
-from tactile_rt.bounded_queue import BoundedQueue
+from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.daemon.http import HttpLimits, Refused, Request, Response
 from tactile_rt.daemon.page.feed import Line
 

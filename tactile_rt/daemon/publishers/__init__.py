@@ -3,10 +3,10 @@
 from importlib import import_module
 from typing import Any
 
-from tactile_rt import extensions
-from tactile_rt.errors import ConfigError
-from tactile_rt.extras import lacking
-from tactile_rt.settings import no_such
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extras import lacking
+from tactile_rt.core.settings import no_such
 
 __all__ = ["PUBLISHERS", "load_class", "publisher_class"]
 

@@ -16,6 +16,8 @@ from foxglove.channels import LogChannel, SceneUpdateChannel
 from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import WebSocketServer
 
+from tactile_rt.core.errors import SourceError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.items import (
     Closed,
@@ -39,8 +41,6 @@ from tactile_rt.daemon.messages import (
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.scene import Scene
 from tactile_rt.daemon.publishers.sending import Connections, Prefix, Repeated, tell_exposed
-from tactile_rt.errors import SourceError
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["FoxgloveOptions", "FoxglovePublisher", "schema_of"]
 

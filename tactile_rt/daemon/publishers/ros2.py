@@ -21,6 +21,7 @@ from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.config import is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import (
@@ -41,7 +42,6 @@ from tactile_rt.daemon.messages import (
     topic_of,
 )
 from tactile_rt.daemon.publishers.sending import Due, SenderOptions, tell_exposed
-from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.ros2 import messages
 from tactile_rt.ros2.definitions import SIMPLE, dds_type, fields_of, token

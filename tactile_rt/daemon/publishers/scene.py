@@ -22,7 +22,7 @@ from foxglove.messages import (
 )
 from numpy.typing import NDArray
 
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec
 
 __all__ = ["Scene", "force_columns", "rotate", "turn_x_to"]
 

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import zenoh
 
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
@@ -18,7 +19,6 @@ from tactile_rt.daemon.publishers.sending import (
     is_port,
     tell_exposed,
 )
-from tactile_rt.errors import ConfigError, SourceError
 
 __all__ = ["ZenohOptions", "ZenohPublisher"]
 

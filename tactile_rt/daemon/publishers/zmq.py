@@ -7,6 +7,7 @@ from urllib.parse import urlsplit
 
 import zmq
 
+from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
@@ -16,7 +17,6 @@ from tactile_rt.daemon.publishers.sending import (
     is_port,
     tell_exposed,
 )
-from tactile_rt.errors import SourceError
 
 __all__ = ["ZmqOptions", "ZmqPublisher"]
 

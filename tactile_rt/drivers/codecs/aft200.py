@@ -7,6 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import (
     CanCodec,
     CanFrame,
@@ -17,8 +19,6 @@ from tactile_rt.drivers.codec import (
     six_axis,
 )
 from tactile_rt.drivers.codecs.framing import Rounds
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = ["Aft200", "Aft200Options"]
 

@@ -15,6 +15,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.ascii_mapping import (
     Column,
@@ -24,8 +26,6 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     read_mapping,
 )
 from tactile_rt.drivers.codecs.ascii_text import Names, fields, number, quoted
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = ["AsciiLine", "AsciiLineOptions"]
 

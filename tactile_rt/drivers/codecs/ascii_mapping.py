@@ -27,10 +27,10 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, read_toml
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.column_words import expand_columns
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import convert, read_toml
-from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "UNITS",

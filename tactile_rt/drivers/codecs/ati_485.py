@@ -22,10 +22,10 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_modbus
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Ati485", "Ati485Options"]
 

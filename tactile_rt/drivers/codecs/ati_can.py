@@ -9,6 +9,8 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import (
     CanCodec,
     CanFrame,
@@ -18,8 +20,6 @@ from tactile_rt.drivers.codec import (
     Step,
     six_axis,
 )
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = ["AtiCan", "AtiCanOptions"]
 

@@ -9,14 +9,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.catalogue import FRAMES
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.endings import EndFinder, Found, StrideFinder
 from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
 from tactile_rt.drivers.codecs.frame_mapping import FrameMapping, read_frame_mapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = [
     "BinaryFrame",

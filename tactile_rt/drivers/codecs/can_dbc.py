@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.dbc_mapping import FramePart, Signal, read_mapping
 from tactile_rt.drivers.codecs.framing import Rounds
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = ["CanDbc", "CanDbcOptions"]
 

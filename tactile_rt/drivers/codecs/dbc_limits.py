@@ -8,7 +8,7 @@ the text. It is not parsed: what looks like a size in a comment counts as one.
 import re
 from typing import Final
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["DEEPEST", "MOST_BYTES", "check_dbc"]
 

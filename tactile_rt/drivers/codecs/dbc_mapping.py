@@ -17,12 +17,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.extras import lacking
+from tactile_rt.core.settings import convert, read_toml
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
-from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.extras import lacking
-from tactile_rt.settings import convert, read_toml
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["DbcMapping", "FramePart", "Signal", "read_mapping"]
 

@@ -10,11 +10,11 @@ from typing import Any, Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS, Column, array_of
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD, FrameCounter, FrameMapping, Values
 from tactile_rt.drivers.codecs.framing import crc16_modbus, crc16_x25, crc16_xmodem
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["CHECKSUMS", "Block", "FrameLayout", "Numbers", "as_bytes"]
 

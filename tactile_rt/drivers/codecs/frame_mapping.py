@@ -8,8 +8,8 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
+from tactile_rt.core.settings import convert, read_toml, refusal
 from tactile_rt.drivers.codecs.ascii_mapping import ArrayTable
-from tactile_rt.settings import convert, read_toml, refusal
 
 __all__ = ["UNHEARD", "FrameCounter", "FrameMapping", "Message", "Values", "read_frame_mapping"]
 

@@ -14,9 +14,9 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.framing import crc16_modbus
-from tactile_rt.errors import ConfigError
 
 __all__ = ["Ft300", "Ft300Options"]
 

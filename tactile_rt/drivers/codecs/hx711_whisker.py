@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.ascii_mapping import Element
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import Message
-from tactile_rt.errors import ConfigError
 
 __all__ = ["Hx711Whisker", "Hx711WhiskerOptions"]
 

@@ -6,10 +6,10 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.framing import Rounds
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["IcubSkin", "IcubSkinOptions"]
 

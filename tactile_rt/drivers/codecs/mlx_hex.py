@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import SampleBatch, Samples, SerialCodec
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["MlxHex", "MlxHexOptions"]
 

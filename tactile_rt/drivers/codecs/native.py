@@ -19,6 +19,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_common import (
@@ -35,8 +37,6 @@ from tactile_rt.drivers.codecs.native_common import (
     pack_valid,
     quantise,
 )
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = ["NativeOptions", "NativeSerial", "frame"]
 

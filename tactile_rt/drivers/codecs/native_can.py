@@ -22,6 +22,8 @@ from typing import Final
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.native_can_parts import (
     FLOAT32,
@@ -46,8 +48,6 @@ from tactile_rt.drivers.codecs.native_common import (
     pack_valid,
     quantise,
 )
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Chunk
 
 __all__ = ["NativeCan", "NativeCanOptions"]
 

@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 
 __all__ = [
     "FORMATS",

@@ -18,6 +18,8 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import (
     CanCodec,
     CanFrame,
@@ -28,8 +30,6 @@ from tactile_rt.drivers.codec import (
     WireStats,
 )
 from tactile_rt.drivers.codecs.framing import FrameFinder
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["OptoForceCan", "OptoForceCanOptions", "OptoForceOptions", "OptoForceSerial"]
 

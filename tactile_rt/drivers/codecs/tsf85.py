@@ -17,10 +17,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import Command, SampleBatch, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import ByteBuffer
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Tsf85", "Tsf85Options"]
 

@@ -10,6 +10,8 @@ from types import TracebackType
 from typing import Any, ClassVar, Self
 from urllib.parse import quote, urlencode
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import Source
 from tactile_rt.drivers.codec import Codec, SerialCodec, codec_class
 from tactile_rt.drivers.emulation.emulator import Emulator
 from tactile_rt.drivers.emulation.endpoints import (
@@ -20,8 +22,6 @@ from tactile_rt.drivers.emulation.endpoints import (
 )
 from tactile_rt.drivers.emulation.faults import FaultSchedule
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import Source
 
 SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
 

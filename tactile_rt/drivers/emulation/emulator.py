@@ -12,6 +12,8 @@ from typing import Any, Final, Self
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import NS_PER_S, Chunk, EndOfStream, Source
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedule
@@ -21,8 +23,6 @@ from tactile_rt.drivers.emulation.transmitter import (
     Transmitter,
     fit,
 )
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import NS_PER_S, Chunk, EndOfStream, Source
 
 __all__ = ["PACES", "Emulator"]
 

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.emulation.pseudo_terminal import Pty
 from tactile_rt.drivers.emulation.wire import Wire, bytes_s, frames_s
 from tactile_rt.drivers.slcan import SlcanAdapter
-from tactile_rt.errors import ConfigError
 
 __all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
 

@@ -32,9 +32,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, no_such, read_toml
 from tactile_rt.drivers.codec import Packet
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import convert, no_such, read_toml
 
 __all__ = [
     "KINDS",

@@ -15,8 +15,8 @@ from collections import deque
 from pathlib import Path
 from typing import Final
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.emulation.wire import Wire, misheard
-from tactile_rt.errors import ConfigError
 
 __all__ = ["Pty"]
 

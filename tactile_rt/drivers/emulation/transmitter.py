@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import (
@@ -16,7 +17,6 @@ from tactile_rt.drivers.emulation.faults import (
     FaultSchedule,
     damaged,
 )
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["EmulatedClock", "RateConverter", "Transmitter", "fit"]
 

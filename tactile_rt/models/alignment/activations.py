@@ -21,7 +21,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.classifier.model_card import ModelCard
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import ChannelLimits
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models.alignment.layers import Layers, table
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
@@ -31,8 +33,6 @@ from tactile_rt.models.ead import EADConfig, count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.encoders.gru import GRUEncoder
-from tactile_rt.sensor_spec import ChannelLimits
-from tactile_rt.stream import ArraySpec
 from tactile_rt.timing import Timing
 
 __all__ = [

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.json_file import Floats, Number, encode, read_json, write_json
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI
 from tactile_rt.models.alignment.statistics import standard_error

@@ -8,7 +8,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.models.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
 from tactile_rt.models.alignment.neural import (

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.rdm import DISTANCES, SHAPES, STIMULI
 

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import whole_folder
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import whole_folder
 from tactile_rt.models.alignment.example import MODELS, Brain, example_models, gains
 from tactile_rt.models.alignment.rdm import STIMULI
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.files import write_whole
+from tactile_rt.core.files import write_whole
 
 __all__ = ["format_number", "join_notes", "make_page", "make_table", "write_page"]
 

@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
 
 __all__ = ["Floats", "Number", "encode", "read_json", "write_json"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.classifier.model_file import read_model
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.models.alignment.layers import PARTS, Layers
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.stimuli_input import StimuliInput

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.models.alignment.rdm import STIMULI
 
 __all__ = [

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.extras import lacking
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.extras import lacking
 from tactile_rt.models.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb_parts import (

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.runtime import FlushDenormals
-from tactile_rt.errors import ModelError, TactileError
+from tactile_rt.core.errors import ModelError, TactileError
 from tactile_rt.models.alignment.layers import Layers, first_difference, table
 from tactile_rt.models.alignment.onnx_taps import (
     GRU_LAYERS,

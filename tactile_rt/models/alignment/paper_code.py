@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.neural import pad, rates_sha256
 from tactile_rt.models.alignment.rdm import STIMULI, pearson, rdm

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.rdm import pearson, rdm
 
 __all__ = [

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Benchmark, benchmark_sha256, check_benchmark
 from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.json_file import Floats, Number, read_json

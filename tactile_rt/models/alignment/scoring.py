@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.json_file import Floats, Number
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, pearson, rdm

@@ -7,9 +7,9 @@ from fnmatch import fnmatchcase
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.settings import no_such
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
-from tactile_rt.settings import no_such
 
 __all__ = ["CELLS", "LAYERS_UM", "TARGET_PARTS", "TASKS", "Selection", "part_of"]
 

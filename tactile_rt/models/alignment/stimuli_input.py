@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.sensor_spec import CHANNEL_FLOOR
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["SHIPPED", "STEPS", "SUBSTEPS", "StimuliInput", "read_stimuli"]
 

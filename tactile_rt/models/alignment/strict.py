@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, rates_sha256

@@ -20,8 +20,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt import extensions
-from tactile_rt.errors import ConfigError
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.convolution import Convolution, convolve
 
 __all__ = [

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.models.ead_config import CELLS, added_cells
 
 __all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node"]

@@ -18,9 +18,9 @@ reads = ["conv1"]
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import convert, parse_toml
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
-from tactile_rt.settings import convert, parse_toml
 
 __all__ = ["parse_graph"]
 

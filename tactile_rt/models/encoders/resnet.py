@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.ead_config import MOUSE_FRAME
 
 __all__ = ["FoldedResNet18", "ResNet18Encoder"]

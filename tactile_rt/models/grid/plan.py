@@ -16,9 +16,9 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
-from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 
 __all__ = [
     "Candidate",

@@ -14,8 +14,8 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 
-from tactile_rt.errors import TactileError
-from tactile_rt.locks import alone_in
+from tactile_rt.core.errors import TactileError
+from tactile_rt.core.locks import alone_in
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.grid.outcomes import SUBSET, TESTED, Outcome, waiting_tasks, write_tested
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.files import write_whole
+from tactile_rt.core.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.data_checks import check_sets, check_split

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import NOISE_LEVELS, SweepSet, windows
 from tactile_rt.models.implausible import IMPLAUSIBLE
 

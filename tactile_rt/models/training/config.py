@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError, ModelError, name_some
+from tactile_rt.core.errors import ConfigError, ModelError, name_some
 from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.data_checks import check_labelled, check_split
 from tactile_rt.models.datasets import frame_of

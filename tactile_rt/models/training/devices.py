@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.training.config import TrainingConfig
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 import torch
 
-from tactile_rt.errors import RecordingError
-from tactile_rt.locks import alone_in
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.locks import alone_in
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole

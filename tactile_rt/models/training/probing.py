@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.locks import alone_in
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.locks import alone_in
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
 from tactile_rt.models.data_checks import (
     check_sets,

@@ -20,9 +20,8 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.settings import (
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import (
     SettingNode,
     convert,
     hint,
@@ -32,6 +31,7 @@ from tactile_rt.settings import (
     read_toml,
     set_keys,
 )
+from tactile_rt.models.training.config import TrainingConfig
 
 __all__ = [
     "Recipe",

@@ -17,8 +17,8 @@ import msgspec
 import torch
 from torch.optim.lr_scheduler import LRScheduler
 
-from tactile_rt.errors import ConfigError, ModelError, name_some
-from tactile_rt.files import replaced, write_whole
+from tactile_rt.core.errors import ConfigError, ModelError, name_some
+from tactile_rt.core.files import replaced, write_whole
 from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig

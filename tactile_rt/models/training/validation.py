@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import run_on
 from tactile_rt.models.datasets import SweepSet, windows

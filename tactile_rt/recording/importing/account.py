@@ -4,12 +4,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
-from tactile_rt.errors import RecordingError
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.recording.description import SUMMARY, Description
 from tactile_rt.recording.layout import SAMPLES, encode_samples
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import NS_PER_S, Chunk
 
 __all__ = ["Import", "clock_of", "write_chunks"]
 

@@ -16,10 +16,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.extras import lacking
+from tactile_rt.core.files import open_regular
+from tactile_rt.core.settings import nearest
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.codecs.column_words import compress_columns
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.extras import lacking
-from tactile_rt.files import open_regular
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
 from tactile_rt.recording.importing.mending import mend_bag
@@ -29,8 +31,6 @@ from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
 from tactile_rt.recording.ros2_form import ARRAY
 from tactile_rt.ros2 import messages
-from tactile_rt.settings import nearest
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 
 __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
 

@@ -17,9 +17,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
+from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 from tactile_rt.drivers.logs import open_log_file
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.importing.table import Table
 
 __all__ = ["CsvForm", "csv_form", "read_table"]

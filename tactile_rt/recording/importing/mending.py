@@ -10,7 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from tactile_rt.files import open_regular
+from tactile_rt.core.files import open_regular
 from tactile_rt.recording.records import MAGIC
 
 __all__ = ["mend_bag"]

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
+from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
 from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, guess_line_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 
 __all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_columns"]

@@ -20,6 +20,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.settings import nearest
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.drivers.codecs.ascii_mapping import (
     Column,
     LineMapping,
@@ -29,11 +32,8 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
 )
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
 from tactile_rt.drivers.codecs.column_words import compress_columns
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
-from tactile_rt.settings import nearest
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["BESIDE", "Table", "import_table", "place_columns", "shown_names"]
 

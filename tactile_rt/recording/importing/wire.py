@@ -14,17 +14,17 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from tactile_rt.classifier.array_file import read_array
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import NS_PER_S, Chunk, SourceStats
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
 from tactile_rt.drivers.logs import LineLog
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.files import write_whole
 from tactile_rt.recording.description import SUMMARY, Description
 from tactile_rt.recording.importing.account import Import, clock_of
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import NS_PER_S, Chunk, SourceStats
 
 __all__ = ["import_wire"]
 

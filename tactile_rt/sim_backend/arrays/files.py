@@ -36,10 +36,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tactile_rt import extensions
-from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
-from tactile_rt.settings import (
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
+from tactile_rt.core.settings import (
     SettingNode,
     check_columns,
     convert,

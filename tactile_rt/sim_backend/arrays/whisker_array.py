@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.sensor_spec import SensorSpec
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
 __all__ = [

@@ -14,9 +14,9 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tactile_rt.files import write_whole
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.datasets.card_survey import Card, Fit, Separability, survey
-from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["write_card"]

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import RecordingError
-from tactile_rt.sensor_spec import ChannelLimits
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.sensor_spec import ChannelLimits
 from tactile_rt.sweep_set import SweepManifest, has_object, read_object, read_skipped
 from tactile_rt.timing import STEP_MS, STEPS
 

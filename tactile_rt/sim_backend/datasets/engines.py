@@ -17,8 +17,8 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from tactile_rt.errors import ConfigError, TactileError
-from tactile_rt.extras import lacking
+from tactile_rt.core.errors import ConfigError, TactileError
+from tactile_rt.core.extras import lacking
 
 __all__ = ["ENGINES", "Outcome", "Work", "run_processes", "run_ray"]
 

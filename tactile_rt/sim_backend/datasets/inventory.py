@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.errors import RecordingError, name_some
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import RecordingError, name_some
+from tactile_rt.core.files import write_whole
 from tactile_rt.sweep_set import (
     MANIFEST,
     SKIPPED,

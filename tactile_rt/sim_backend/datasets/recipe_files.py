@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import (
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import (
     SettingNode,
     convert,
     make_node,

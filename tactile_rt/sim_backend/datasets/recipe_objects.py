@@ -8,8 +8,8 @@ from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import no_such
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import no_such
 from tactile_rt.sim_backend.datasets.recipes import VARIED_SHAPES, ObjectChoice
 from tactile_rt.sim_backend.objects import catalogue as shapes
 from tactile_rt.sim_backend.objects.catalogue import VARIED, TactileObject, load_object

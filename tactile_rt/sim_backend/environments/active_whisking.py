@@ -10,7 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from tactile_rt.errors import ConfigError, SourceError, name_some
+from tactile_rt.core.errors import ConfigError, SourceError, name_some
+from tactile_rt.core.stream import Chunk
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.environments.whisking_head import Stretch, WhiskingHead, place_beside
@@ -21,7 +22,6 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance, usual_size
 from tactile_rt.sim_backend.whisking_drive import Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.stream import Chunk
 
 __all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking", "picture", "whisker_nodes"]
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from tactile_rt.errors import ConfigError, SpecMismatch
-from tactile_rt.sensor_spec import SensorSpec
-from tactile_rt.settings import find_lines, parse_toml, read_text, read_toml
+from tactile_rt.core.errors import ConfigError, SpecMismatch
+from tactile_rt.core.sensor_spec import SensorSpec
+from tactile_rt.core.settings import find_lines, parse_toml, read_text, read_toml
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.measuring.findings import (
@@ -26,7 +27,6 @@ from tactile_rt.sim_backend.measuring.mechanics import compare_whiskers
 from tactile_rt.sim_backend.measuring.resting import Rest, find_rest
 from tactile_rt.sim_backend.measuring.ringing import Ring, find_swings, fit_ring
 from tactile_rt.sim_backend.transducer import Transducer, device_spec
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["Fitted", "edit_text", "fit_array", "read_described"]
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tactile_rt import extensions
-from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.core import extensions
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh

@@ -21,7 +21,7 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "MESH_SUFFIXES",

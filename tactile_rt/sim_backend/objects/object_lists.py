@@ -34,9 +34,9 @@ from urllib.parse import quote
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
-from tactile_rt.settings import check_columns, convert, no_such, read_csv
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.settings import check_columns, convert, no_such, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 
 __all__ = ["get_objects", "read_list"]

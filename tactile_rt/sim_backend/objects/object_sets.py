@@ -22,8 +22,8 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import check_columns, convert, read_csv
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import check_columns, convert, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh

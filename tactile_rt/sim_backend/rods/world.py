@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tactile_rt.errors import SourceError
+from tactile_rt.core.errors import SourceError
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.rod import make_rod

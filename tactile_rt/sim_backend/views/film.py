@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
 from tactile_rt.sim_backend.views.footage import Camera, Footage, framing
 from tactile_rt.sim_backend.views.sheet import ForceScale, Sheet, scene_size
 from tactile_rt.sim_backend.views.stage import Dressed, Stage

@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["VIEWS", "Camera", "Footage", "framing", "record"]
 

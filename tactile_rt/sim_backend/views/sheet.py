@@ -15,8 +15,8 @@ from matplotlib.patches import FancyArrowPatch, Rectangle
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.views.footage import Camera, Footage
-from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "INK",

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.views.footage import Camera, Footage
 from tactile_rt.sim_backend.views.sheet import ForceScale
 from tactile_rt.sim_backend.world import OBJECT_BIT
-from tactile_rt.stream import ArraySpec
 
 __all__ = ["Dressed", "Stage"]
 

@@ -15,10 +15,10 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
 from tactile_rt.daemon.publishers.scene import rotate, turn_x_to
 from tactile_rt.daemon.publishers.sending import Repeated
-from tactile_rt.errors import SourceError
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
     FORCES,

@@ -12,10 +12,10 @@ pytest.importorskip("cyclonedds", reason="needs cyclonedds: pip install '.[ros2]
 
 from bench.daemon import ros2_node
 from bench.daemon.ros2 import free_domain, measure
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.items import SourceChunk
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.ros2 import Ros2Options, Ros2Publisher
-from tactile_rt.errors import ConfigError, SourceError
 from tests.helpers.published import (
     FORCES,
     UTC,

@@ -7,9 +7,9 @@ import pytest
 import zenoh
 
 from bench.daemon.process import free_port
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
-from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
     View,

@@ -5,9 +5,9 @@ import json
 import pytest
 import zmq
 
+from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
-from tactile_rt.errors import SourceError
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
     View,

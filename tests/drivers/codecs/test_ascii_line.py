@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,

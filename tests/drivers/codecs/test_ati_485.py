@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ati_485 import Ati485, Ati485Options
 from tactile_rt.drivers.links import SerialLink
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # Request and answer as constants of a public firmware for this sensor.

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.binary_frame import BinaryFrame, BinaryFrameOptions
 from tactile_rt.drivers.codecs.framing import crc16_modbus
 from tactile_rt.drivers.codecs.optoforce import OptoForceOptions, OptoForceSerial
 from tactile_rt.drivers.emulation.device import EmulatedSerial
-from tactile_rt.errors import ConfigError
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, cut
 from tests.helpers.codec_contract import (

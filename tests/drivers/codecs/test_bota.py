@@ -5,10 +5,10 @@ import struct
 import numpy as np
 import pytest
 
+from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.bota import Bota, BotaOptions
 from tactile_rt.drivers.codecs.framing import crc16_x25
-from tactile_rt.stream import Chunk
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand from the format: AA, status 0, the loads 1, -2, 0.5, -0.25, 0.125 and 4, 305419896 us,

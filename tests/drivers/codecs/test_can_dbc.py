@@ -7,9 +7,9 @@ import cantools
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.can_dbc import CanDbc, CanDbcOptions
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 DOCS = Path(__file__).parents[3] / "docs" / "codecs"

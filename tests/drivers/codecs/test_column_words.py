@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.column_words import compress_columns, expand_columns
-from tactile_rt.errors import ConfigError
 
 
 @pytest.mark.parametrize(

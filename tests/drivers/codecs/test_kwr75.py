@@ -5,9 +5,9 @@ import struct
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, FrameOptions, frame_codec
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand: 1, -2, 0.5 kgf, 0.25, -0.125, 0 kgf m as float32 (1 is 3F800000, and so on).

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import MessageType
-from tactile_rt.errors import ConfigError
 from tactile_rt.testing import small_spec
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of
 

@@ -7,12 +7,12 @@ import zlib
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
 from tactile_rt.drivers.codecs.native_common import DeviceDescription
-from tactile_rt.errors import ConfigError
-from tactile_rt.stream import ArraySpec
 from tactile_rt.testing import small_spec
 from tests.helpers.codec_contract import (
     T0,

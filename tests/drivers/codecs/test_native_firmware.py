@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import CanFrame, Command, Samples
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
 from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType
-from tactile_rt.stream import ArraySpec, Chunk
 from tactile_rt.testing import small_spec
 from tests.helpers.codec_contract import T0, mutations
 

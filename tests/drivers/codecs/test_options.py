@@ -2,8 +2,8 @@
 
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError
 
 WRONG = [
     ("serial anyskin", "magnetometers", "0", "magnetometers must be 1 to 64, not 0"),

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract
 
 nan = np.nan

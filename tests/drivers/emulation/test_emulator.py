@@ -13,6 +13,8 @@ import can
 import numpy as np
 import pytest
 
+from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.stream import Chunk, EndOfStream, Source
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
@@ -21,8 +23,6 @@ from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, 
 from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.emulation.transmitter import fit
 from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
-from tactile_rt.errors import ConfigError, SourceError
-from tactile_rt.stream import Chunk, EndOfStream, Source
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
 from tests.helpers.waiting import PATIENCE_S, until

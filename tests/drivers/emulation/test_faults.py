@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.emulation.faults import (
     Fate,
@@ -13,7 +14,6 @@ from tactile_rt.drivers.emulation.faults import (
     damaged,
     read_faults,
 )
-from tactile_rt.errors import ConfigError
 
 RATE = 1000
 

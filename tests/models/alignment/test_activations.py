@@ -8,7 +8,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model  # noqa: E402
-from tactile_rt.errors import ConfigError  # noqa: E402
+from tactile_rt.core.errors import ConfigError  # noqa: E402
 from tactile_rt.models.alignment.activations import (  # noqa: E402
     network_layers,
     reach,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment import benchmark_sha256, load_benchmark, save_benchmark, score
 from tactile_rt.models.alignment.benchmark import Consistency, Frozen
 from tactile_rt.models.alignment.strict import freeze_strict

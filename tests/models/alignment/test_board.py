@@ -6,7 +6,7 @@ from importlib.metadata import EntryPoint, EntryPoints
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment import board as boards
 from tactile_rt.models.alignment.board import (
     ANOTHER,

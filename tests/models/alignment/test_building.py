@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.extras import install_extra
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extras import install_extra
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.neural import read_published
 from tests.helpers.brains import geometry, padded

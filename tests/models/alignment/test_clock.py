@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.clock import contact_response
 from tactile_rt.models.alignment.neural import by_animal

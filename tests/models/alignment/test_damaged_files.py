@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.clock import CLOCKS
 from tactile_rt.models.alignment.neural import read_published
 from tactile_rt.models.alignment.nwb import WINDOWS, read_session

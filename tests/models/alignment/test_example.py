@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.example import MODELS, Brain, example_models
 from tactile_rt.models.alignment.example_files import BEGIN_S, write_example
 from tactile_rt.models.alignment.rdm import rsa

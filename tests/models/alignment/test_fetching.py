@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.datasets import fetching
 from tactile_rt.models.alignment.datasets.fetching import PublishedFile, fetch, published_files
 from tactile_rt.models.alignment.example import Brain

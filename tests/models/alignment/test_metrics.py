@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.align import oracles
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.metrics import (
     METRICS,
     MINIMUM_CEILING,

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment import build, nwb
 from tactile_rt.models.alignment.clock import CLOCKS
 from tactile_rt.models.alignment.rdm import STIMULI

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment import load_benchmark
 from tactile_rt.models.alignment.json_file import write_json
 from tactile_rt.models.alignment.layers import Layers

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import load_benchmark, save_benchmark
 from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.example import Brain

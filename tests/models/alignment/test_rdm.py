@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.rdm import (
     STIMULI,
     pearson,

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Consistency
 from tactile_rt.models.alignment.rdm import pearson, rdm
 from tactile_rt.models.alignment.reliability import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as change
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.json_file import encode, write_json
 from tactile_rt.models.alignment.layers import Layers

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.building import refuse_copies
 from tactile_rt.models.alignment.neural import NeuralSession

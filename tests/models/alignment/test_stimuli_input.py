@@ -9,7 +9,7 @@ pytest.importorskip("onnx")
 import onnx
 
 from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.alignment.activations import (
     checkpoint_layers,
     untrained_card_layers,

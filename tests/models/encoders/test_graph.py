@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.graph_files import parse_graph

@@ -5,13 +5,13 @@ import random
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError, RecordingError, TactileError
+from tactile_rt.core.errors import ConfigError, RecordingError, TactileError
+from tactile_rt.core.stream import concatenate
 from tactile_rt.recording import Recording
 from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.ros2 import messages
 from tactile_rt.ros2.definitions import schema_text
-from tactile_rt.stream import concatenate
 from tactile_rt.testing import cut, small_spec
 
 rosbags = pytest.importorskip("rosbags")

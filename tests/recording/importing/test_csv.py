@@ -5,11 +5,11 @@ import gzip
 import numpy as np
 import pytest
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import concatenate
 from tactile_rt.recording import Recording
 from tactile_rt.recording.importing.csv import csv_form, read_table
 from tactile_rt.recording.importing.table import import_table
-from tactile_rt.stream import concatenate
 
 N = 50
 

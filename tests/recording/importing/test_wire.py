@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from bench.drivers.fuzzing import all_codecs, wire_of
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.stream import concatenate
 from tactile_rt.drivers.logs import read_log
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording
 from tactile_rt.recording.importing.wire import import_wire
 from tactile_rt.recording.redecoding import compare_decoding
-from tactile_rt.stream import concatenate
 
 
 def imported(path, output, force=True, rate_hz=0.0, **fields):

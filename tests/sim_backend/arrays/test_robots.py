@@ -12,9 +12,10 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.calibration import declared
+from tactile_rt.core.sensor_spec import SensorSpec
+from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.files import (
     ROBOTS,
     load_animals,
@@ -25,7 +26,6 @@ from tactile_rt.sim_backend.arrays.files import (
 from tactile_rt.sim_backend.sweep import Sweep, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.testing import FakeSerial
 from tests.helpers.codec_contract import chunk_of, decode, join, stacked
 from tests.helpers.source_tree import ROOT

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import (
     OPTIONAL,

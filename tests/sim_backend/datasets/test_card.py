@@ -9,9 +9,9 @@ pytest.importorskip("sklearn")
 
 from matplotlib.image import imread
 
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.models.svm import fit
-from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.sim_backend.datasets.card import write_card
 from tactile_rt.sim_backend.datasets.card_survey import (
     Features,

@@ -16,7 +16,7 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.errors import ConfigError, RecordingError, SourceError, TactileError
+from tactile_rt.core.errors import ConfigError, RecordingError, SourceError, TactileError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.dataset import (

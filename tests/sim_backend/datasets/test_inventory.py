@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from tactile_rt.errors import RecordingError
+from tactile_rt.core.errors import RecordingError
 from tactile_rt.sim_backend.datasets.inventory import Tally, remove_leftovers, tally
 from tactile_rt.sweep_set import object_path, write_object, write_skipped
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import (

@@ -12,7 +12,7 @@ pytest.importorskip("gymnasium")
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 
-from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.environments import ENVIRONMENT, WHISKERS
 from tactile_rt.sim_backend.environments.active_whisking import KINDS, LOGITS, ActiveWhisking
 from tactile_rt.sim_backend.environments.whisking_head import WhiskingHead, place_beside

@@ -11,13 +11,13 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("numba")
 
-from tactile_rt.errors import SpecMismatch
+from tactile_rt.core.errors import SpecMismatch
+from tactile_rt.core.stream import Chunk
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.measuring.fitting import Fitted, fit_array, read_described
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.transducer import device_spec
-from tactile_rt.stream import Chunk
 from tests.helpers.plucked import plucked
 from tests.helpers.refusals import refusal
 from tests.helpers.source_tree import ROOT

@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("manifold3d")
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
     OUTLIERS,

@@ -9,7 +9,7 @@ pytest.importorskip("trimesh")
 
 import trimesh
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.objects import mesh_files
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object, make_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail

@@ -15,7 +15,7 @@ pytest.importorskip("manifold3d")
 
 import trimesh
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.objects import object_lists

@@ -13,7 +13,7 @@ pytest.importorskip("manifold3d")
 import trimesh
 from manifold3d import Manifold, OpType
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects import meshes

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.extensions import added, added_names
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extensions import added, added_names
+from tactile_rt.core.settings import no_such
 from tactile_rt.models.alignment.neural import Animal
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
-from tactile_rt.settings import no_such
 
 __all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
 

@@ -17,8 +17,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 from urllib.request import getproxies
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
 from tactile_rt.models.alignment.nwb import read_nwb
 from tactile_rt.models.alignment.nwb_parts import (
     COLUMNS,

@@ -18,10 +18,10 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.extensions import added, added_names
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.extensions import added, added_names
+from tactile_rt.core.settings import no_such
 from tactile_rt.models.alignment.neural import Animal
-from tactile_rt.settings import no_such
 
 __all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "metric_names"]
 

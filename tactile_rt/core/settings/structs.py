@@ -23,8 +23,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.settings.tree import SettingNode, named
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.settings.tree import SettingNode, named
 
 __all__ = ["convert", "hint", "is_list", "is_text", "nearest", "no_such", "refusal", "types_of"]
 

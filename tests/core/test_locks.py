@@ -2,8 +2,8 @@
 
 import pytest
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.locks import alone_in
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.locks import alone_in
 from tests.helpers.holding import held_elsewhere
 
 

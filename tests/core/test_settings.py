@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import msgspec
 import pytest
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings import (
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import (
     check_columns,
     convert,
     make_node,

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from tactile_rt import extras
+from tactile_rt.core import extras
 
 
 @pytest.fixture

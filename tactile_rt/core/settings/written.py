@@ -8,9 +8,17 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.settings.structs import convert, hint, is_list, is_text, nearest, shown, types_of
-from tactile_rt.settings.tree import SettingNode, make_node, named, plain_value, read_text
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings.structs import (
+    convert,
+    hint,
+    is_list,
+    is_text,
+    nearest,
+    shown,
+    types_of,
+)
+from tactile_rt.core.settings.tree import SettingNode, make_node, named, plain_value, read_text
 
 __all__ = [
     "CsvTable",

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.bounded_queue import BoundedQueue, QueueState
+from tactile_rt.core.bounded_queue import BoundedQueue, QueueState
 from tests.helpers.waiting import PATIENCE_S, until
 
 KINDS = ("a", "b")
@@ -142,7 +142,7 @@ def test_closed_it_may_drop_what_waits():
 
 
 def test_its_counts_are_told_also_while_a_thread_hangs_in_it(monkeypatch):
-    monkeypatch.setattr("tactile_rt.bounded_queue.LOOK_S", 0.01)
+    monkeypatch.setattr("tactile_rt.core.bounded_queue.LOOK_S", 0.01)
     made = queue()
     made.put(("a", 3, 1))
     seen = made.state

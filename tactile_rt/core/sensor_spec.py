@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.stream import NS_PER_S, ArraySpec
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream import NS_PER_S, ArraySpec
 
 __all__ = [
     "CHANNEL_FLOOR",

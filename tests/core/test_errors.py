@@ -2,7 +2,7 @@
 
 import pytest
 
-from tactile_rt.errors import LONGEST, length, name_some, shorten
+from tactile_rt.core.errors import LONGEST, length, name_some, shorten
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from tactile_rt.files import replaced, whole_folder, write_whole
+from tactile_rt.core.files import replaced, whole_folder, write_whole
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ adds names and replaces none; what it names is imported when it is asked for.
 from importlib import metadata
 from typing import Any
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "ARRAYS",

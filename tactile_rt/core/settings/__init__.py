@@ -14,8 +14,8 @@ structs   a tree as a struct, and what is wrong with it in words
 written   what is text alone: ``--set``, URLs, CSV
 """
 
-from tactile_rt.settings.structs import convert, hint, nearest, no_such, refusal
-from tactile_rt.settings.tree import (
+from tactile_rt.core.settings.structs import convert, hint, nearest, no_such, refusal
+from tactile_rt.core.settings.tree import (
     SettingNode,
     find_lines,
     make_node,
@@ -24,7 +24,7 @@ from tactile_rt.settings.tree import (
     read_text,
     read_toml,
 )
-from tactile_rt.settings.written import (
+from tactile_rt.core.settings.written import (
     CsvTable,
     check_columns,
     read_csv,

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "NS_PER_S",

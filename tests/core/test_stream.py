@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.errors import ConfigError, TactileError
-from tactile_rt.stream import (
+from tactile_rt.core.errors import ConfigError, TactileError
+from tactile_rt.core.stream import (
     NS_PER_S,
     ArraySpec,
     Chunk,
@@ -209,7 +209,7 @@ def test_concatenated_chunks_are_the_stream_and_a_copy_of_it() -> None:
 
 
 def test_every_error_a_caller_may_handle_is_a_tactile_error() -> None:
-    from tactile_rt import stream
+    from tactile_rt.core import stream
 
     errors = [c for c in vars(stream).values() if isinstance(c, type) and issubclass(c, Exception)]
     # The end of a stream is no error: a caller who handles errors must not swallow it.

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from tactile_rt.errors import ConfigError, TactileError
+from tactile_rt.core.errors import ConfigError, TactileError
 
 __all__ = ["AlreadyRunning", "Locks", "alone_in", "device_keys", "lock_keys"]
 

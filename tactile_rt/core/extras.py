@@ -10,11 +10,11 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.core.errors import ConfigError
 
 __all__ = ["install_extra", "install_line", "lacking"]
 
-ROOT = Path(__file__).parents[1]  # of a checkout or an unpacked source archive
+ROOT = Path(__file__).parents[2]  # of a checkout or an unpacked source archive
 
 
 def install_extra(extra: str) -> str:
