@@ -414,7 +414,7 @@ class Recorder(Consumer):
             if over or self._folder.full:
                 self._finish_file(track)
             elif track.rotation.is_due(file) and not track.closed_ns:
-                self._rotate(track)  # what is decided after the source's end goes into its last file
+                self._rotate(track)  # decisions after a source's end go into its last file
 
     def _sync(self, track: _Track, sync: bool = True) -> bool:
         """Flush, at least; whether that could be done, and the sync before."""
