@@ -416,7 +416,7 @@ class Recorder(Consumer):
             elif track.rotation.is_due(file) and not track.closed_ns:
                 self._rotate(
                     track
-                )  # what is decided after the source's end goes into its last file
+                )  # decisions after a source's end go into its last file
 
     def _sync(self, track: _Track, sync: bool = True) -> bool:
         """Flush, at least; whether that could be done, and the sync before."""
