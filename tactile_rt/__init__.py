@@ -15,7 +15,7 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tactile_rt.version import VERSION as __version__
+from tactile_rt.core.packages import VERSION as __version__
 
 # From 1.29 on ONNX Runtime reports what runs to its maker unless told not to before it loads.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -35,8 +35,8 @@ TABLES = {
     "tactile_rt.daemon.publishers",
     "tactile_rt.drivers.codec",
     "tactile_rt.models",
-    "tactile_rt.models.alignment.datasets",
-    "tactile_rt.models.alignment.metrics",
+    "tactile_rt.alignment.datasets",
+    "tactile_rt.alignment.metrics",
     "tactile_rt.models.ead",
     "tactile_rt.sources.opening",
 }

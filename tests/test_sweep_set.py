@@ -9,14 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.sweep_set import (
-    SPLITS,
-    SweepManifest,
-    has_object,
+from tactile_rt.sets.manifest import SPLITS, SweepManifest, has_object, split_by_object
+from tactile_rt.sets.objects import (
     read_object,
     read_skipped,
     read_sweeps,
-    split_by_object,
     write_object,
     write_skipped,
 )

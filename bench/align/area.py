@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.align import oracles, truth
-from tactile_rt.evidence.records import Record
-from tactile_rt.models.alignment import load_benchmark, save_benchmark, score
-from tactile_rt.models.alignment.neural import pad
-from tactile_rt.models.alignment.paper_code import freeze_paper_code
-from tactile_rt.models.alignment.rdm import pearson, rdm
-from tactile_rt.models.alignment.reliability import (
+from tactile_rt.alignment import load_benchmark, save_benchmark, score
+from tactile_rt.alignment.neural import pad
+from tactile_rt.alignment.paper_code import freeze_paper_code
+from tactile_rt.alignment.rdm import pearson, rdm
+from tactile_rt.alignment.reliability import (
     BOOTSTRAPS,
     SEED,
     first_halves,
@@ -27,7 +26,8 @@ from tactile_rt.models.alignment.reliability import (
     split_half,
     trial_mean,
 )
-from tactile_rt.models.alignment.statistics import highest, max_statistic
+from tactile_rt.alignment.statistics import highest, max_statistic
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["plain_loop", "run"]
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.evidence.records import Record
-from tactile_rt.models.alignment.metrics import find_metric
-from tactile_rt.models.alignment.metrics.linear import PENALTIES
-from tactile_rt.models.alignment.neural import Animal, NeuralSession
-from tactile_rt.models.alignment.reliability import filtered_mean, noise_corrected
+from tactile_rt.alignment.metrics import find_metric
+from tactile_rt.alignment.metrics.linear import PENALTIES
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.reliability import filtered_mean, noise_corrected
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = [
     "PUBLISHED",
@@ -34,7 +34,7 @@ __all__ = [
 Floats = NDArray[np.float64]
 
 # Per-bootstrap results for raw sensor input, from the paper's published analysis.
-PUBLISHED = Path(__file__).parents[2] / "tests/models/alignment/data/published_model_input.npz"
+PUBLISHED = Path(__file__).parents[2] / "tests/alignment/data/published_model_input.npz"
 # The mean of r_xy; the paper's 0.46; what it is as models are scored.
 AGGREGATES = (0.283455, 0.457738, 0.329451)
 BINS, TRIALS, UNITS, LAYER_UNITS = 8, 9, 20, 40
@@ -79,7 +79,7 @@ def by_rsa(session: NeuralSession, layer: Floats) -> float:
 
 def by_rsa_time(session: NeuralSession, layer: Floats) -> float:
     """The metric ``rsa-time``, in bins in which the animal is reliable, by rsatoolbox."""
-    from tactile_rt.models.alignment.metrics.geometry import time_course
+    from tactile_rt.alignment.metrics.geometry import time_course
 
     assert session.course is not None
     found = time_course(Animal("mouse", (session,)))

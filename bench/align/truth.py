@@ -12,13 +12,13 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.evidence.records import Record
-from tactile_rt.models.alignment.benchmark import Benchmark
-from tactile_rt.models.alignment.example import Brain, gains
-from tactile_rt.models.alignment.gate import FAIL, INCONCLUSIVE, PASS, mice_of, regression, turing
-from tactile_rt.models.alignment.neural import Animal, NeuralSession
-from tactile_rt.models.alignment.scoring import Score, layer_rdms, score_rdms
-from tactile_rt.models.alignment.strict import freeze_strict
+from tactile_rt.alignment.benchmark import Benchmark
+from tactile_rt.alignment.example import Brain, gains
+from tactile_rt.alignment.gate import FAIL, INCONCLUSIVE, PASS, mice_of, regression, turing
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.scoring import Score, layer_rdms, score_rdms
+from tactile_rt.alignment.strict import freeze_strict
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["run"]
 

@@ -29,7 +29,7 @@ from typing import Any
 
 from rich.console import Console
 
-from tactile_rt.evidence.records import Record, show, write
+from tactile_rt.models.evaluation.records import Record, show, write
 
 __all__ = ["Mutant", "mutants_of"]
 

@@ -54,7 +54,7 @@ def main() -> None:
         python = str(environment / "bin" / "python")
         subprocess.run([python, "-c", code], check=True, cwd=out, stdout=subprocess.DEVNULL)
         # The extra that is asked for comes without an index that has this package.
-        line = "from tactile_rt.core.extras import install_extra; print(install_extra('dbc'))"
+        line = "from tactile_rt.core.packages import install_extra; print(install_extra('dbc'))"
         told = subprocess.run([python, "-c", line], cwd=out, capture_output=True, text=True)
         subprocess.run(shlex.split(told.stdout), check=True, cwd=out, stdout=subprocess.DEVNULL)
         subprocess.run([python, "-c", "import cantools"], check=True, cwd=out)

@@ -6,7 +6,7 @@ from bench.daemon.power import power_cuts
 from bench.daemon.ros2 import ros2_records
 from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import QUICK_S, WHOLE_S, soak
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["run"]
 

@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 
 from bench.daemon.fault_kinds import KINDS, FaultKind, FaultScene, Named, may_mount
-from tactile_rt.evidence.records import Record, show, write
+from tactile_rt.models.evaluation.records import Record, show, write
 
 __all__ = ["TIMES", "faults"]
 

@@ -17,7 +17,7 @@ from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.drivers.emulation.faults import Fate
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.redecoding import compare_decoding
 

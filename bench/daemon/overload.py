@@ -27,7 +27,7 @@ from bench.daemon.accounts import account, recorded
 from bench.daemon.disturbed import DisturbedDaemon
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.evidence.records import Record, show
+from tactile_rt.models.evaluation.records import Record, show
 
 __all__ = ["overload", "slow_down"]
 

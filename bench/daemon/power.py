@@ -27,7 +27,7 @@ import numpy as np
 from bench.daemon.kills import Killed, killed_once
 from bench.daemon.process import DaemonProcess
 from tactile_rt.core.errors import RecordingError
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import recover
 
 __all__ = ["can_mount", "power_cuts", "power_noted", "preloaded"]

@@ -24,7 +24,7 @@ from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.publishers.ros2 import Ros2Options, Ros2Publisher
-from tactile_rt.evidence.records import Record, show
+from tactile_rt.models.evaluation.records import Record, show
 from tactile_rt.sources.synthetic import synthetic_spec
 
 __all__ = ["Ages", "free_domain", "measure", "ros2_records"]

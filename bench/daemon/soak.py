@@ -20,7 +20,7 @@ from bench.daemon.models import finger_array, whisker_array
 from bench.daemon.soak_rig import EVERY_S, WHOLE_S, WIRES, Soak, soak
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.stream import NS_PER_S
-from tactile_rt.evidence.records import Record, show, write
+from tactile_rt.models.evaluation.records import Record, show, write
 
 __all__ = ["soak_records"]
 

@@ -21,7 +21,7 @@ from bench.daemon.overload import HOG, HOGS_PER_CORE, STEP_MS, slow_down
 from bench.daemon.process import DaemonProcess, free_port
 from bench.emulated import ArrayScript, play
 from bench.processes import Helper
-from tactile_rt.evidence.records import Record, show
+from tactile_rt.models.evaluation.records import Record, show
 
 __all__ = ["stopping"]
 

@@ -7,7 +7,7 @@ from bench.drivers.losses import losses
 from bench.drivers.recordings import recordings
 from bench.drivers.unplugging import unplugging
 from bench.drivers.wires import can, readers, serial
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["run"]
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.clocks import DeviceClock
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["clocks"]
 

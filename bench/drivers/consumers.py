@@ -10,7 +10,7 @@ from bench.drivers.metronome import Beat, play
 from bench.processes import Helper
 from tactile_rt.classifier.session import Session
 from tactile_rt.core.stream import Chunk, Source
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.opening import open_source
 
 __all__ = ["consumers"]

@@ -22,7 +22,7 @@ from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import CanFrame, Codec, Samples
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
 
 __all__ = ["HEADERLESS", "Fuzzed", "all_codecs", "fuzz", "fuzzing", "mutate", "wire_of"]

@@ -12,7 +12,7 @@ from bench.emulated import ArrayScript, Played, noise, play
 from bench.processes import Helper
 from tactile_rt.core.stream import SourceStats, concatenate
 from tactile_rt.drivers.emulation.faults import Fate, Fault
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import synthetic_spec
 

@@ -16,7 +16,7 @@ from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import Recording, StreamWriter, recover
 from tactile_rt.sources.opening import open_source
 

@@ -12,7 +12,7 @@ from bench.emulated import ArrayScript, play
 from bench.processes import Helper
 from tactile_rt.drivers.device_source import DeviceSource
 from tactile_rt.drivers.health import State
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import synthetic_spec
 

@@ -12,7 +12,7 @@ from bench.processes import Helper
 from tactile_rt.core.stream import Chunk, SourceStats
 from tactile_rt.drivers.clocks import Stamper
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
 
 __all__ = ["can", "readers", "serial"]

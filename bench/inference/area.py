@@ -13,10 +13,10 @@ from bench.inference.window_speed import window_speed
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.session import Session
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
-from tactile_rt.evidence.model_steps import Subject, measure_model
-from tactile_rt.evidence.records import Record
+from tactile_rt.export.model_steps import Subject, measure_model
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["Pulses", "run"]
 

@@ -12,18 +12,16 @@ from pathlib import Path
 
 import torch
 
-from tactile_rt import export
+from tactile_rt import VERSION, export
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.core.sensor_spec import channel_limits
-from tactile_rt.core.stream import ArraySpec
-from tactile_rt.evidence.model_steps import Subject
+from tactile_rt.core.stream import MOUSE, ArraySpec
+from tactile_rt.export.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.export.precision import Precision
 from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import EADConfig
-from tactile_rt.timing import MOUSE
-from tactile_rt.version import VERSION
 
 __all__ = ["full_size", "full_size_models", "random_model"]
 

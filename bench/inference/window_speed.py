@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import ModelCard, load_model, read_model, shipped_model
 from tactile_rt.classifier.model_runs import file_outputs
-from tactile_rt.core.extras import install_extra
-from tactile_rt.evidence.records import Record
+from tactile_rt.core.packages import install_extra
+from tactile_rt.models.evaluation.records import Record
 
 if TYPE_CHECKING:  # a robot has no torch
     from tactile_rt.models.checkpoints import TactileClassifier

@@ -8,12 +8,12 @@ import msgspec
 
 from bench.models.training_speed import training_speed
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.evidence.classification import evaluate_model
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.model_file import evaluate_model
+from tactile_rt.models.evaluation.records import Record
+from tactile_rt.sets.manifest import WITHHELD
 from tactile_rt.sim_backend.datasets.dataset import describe_set, make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
-from tactile_rt.sweep_set import WITHHELD
 
 __all__ = ["run"]
 

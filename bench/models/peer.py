@@ -39,9 +39,9 @@ from bench.models.training_speed import STEPS, training_step
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.evidence.records import Record, show
 from tactile_rt.export.onnx_step import step_graph, write_model
 from tactile_rt.models.ead import count_parameters
+from tactile_rt.models.evaluation.records import Record, show
 
 PARTS = ("parity", "training", "window")
 SEEDS = 40

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from bench.models.plain_network import PlainEncoder
-from tactile_rt.evidence.records import Record
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import CELLS
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["CLASSES", "STEPS", "training_speed", "training_step"]
 

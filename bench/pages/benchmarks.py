@@ -20,8 +20,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from tactile_rt.cli.bench import AREAS
-from tactile_rt.evidence.records import Record
-from tactile_rt.version import VERSION
+from tactile_rt.core.packages import VERSION
+from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["FOLDER", "PAGE", "Measurement", "measure", "read", "written"]
 

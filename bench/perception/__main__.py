@@ -16,7 +16,7 @@ from rich.console import Console
 from bench.perception.area import FOLDER, measure, records_of
 from bench.perception.page import PAGE, write_page
 from tactile_rt.core.errors import TactileError
-from tactile_rt.evidence.records import show
+from tactile_rt.models.evaluation.records import show
 
 
 def main() -> int:

@@ -21,15 +21,15 @@ from bench.perception.methods import (
 )
 from bench.perception.scores import Figures, accuracy_by_source, robustness, score
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.evidence.promises import Promises, named_faults, promises
-from tactile_rt.evidence.records import Record
-from tactile_rt.evidence.robustness import conditions
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.evaluation.measures import Interval
+from tactile_rt.models.evaluation.promises import Promises, named_faults, promises
+from tactile_rt.models.evaluation.records import Record
+from tactile_rt.models.evaluation.robustness import conditions
+from tactile_rt.sets.manifest import SPLITS, WITHHELD
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
-from tactile_rt.sweep_set import SPLITS, WITHHELD
 
 __all__ = [
     "ALL",

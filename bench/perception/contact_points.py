@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.classifier.contact_point import ESTIMATES, WhiskerShapes
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import read_sweeps
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sweep_set import SweepManifest, read_sweeps
 
 FELT_N = 30e-6  # of transverse force: three times the rated noise
 

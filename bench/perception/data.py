@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.sweep_set import OUTLIERS, WITHHELD, SweepManifest, Sweeps
+from tactile_rt.sets.manifest import OUTLIERS, WITHHELD, SweepManifest
+from tactile_rt.sets.objects import Sweeps
 
 __all__ = ["FILE", "NAME", "SOURCE", "SPLITS", "VERSION", "Data", "Portion", "load", "pack"]
 

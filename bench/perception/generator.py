@@ -12,15 +12,15 @@ import numpy as np
 from msgspec.structs import replace as change
 
 from bench.perception.methods import Method, of_kinds
-from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.models.onsets import find_onsets
+from tactile_rt.sets.objects import Sweeps
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import Choice, Range
-from tactile_rt.sweep_set import Sweeps
 
 __all__ = ["UPRIGHT", "Condition", "false_touches", "measured", "rows"]
 
@@ -122,8 +122,8 @@ def measured(method: Method, wanted: dict[str, list[Condition]]) -> dict[str, In
 
     def right(data: SweepSet, disturbance: Disturbance) -> Interval:
         own = of_kinds(data, method.kinds)
-        hits = evaluation.hits(method.posteriors(own, disturbance), own.sweeps.labels)
-        return evaluation.accuracy(hits, own.sweeps.objects)
+        hits = measures.hits(method.posteriors(own, disturbance), own.sweeps.labels)
+        return measures.accuracy(hits, own.sweeps.objects)
 
     return {
         name: min((right(*one) for one in several), key=lambda found: found.value)

@@ -16,12 +16,12 @@ from pathlib import Path
 from msgspec.structs import replace as change
 
 from bench.perception.data import FILE, SOURCE, Portion, pack
+from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
 from tactile_rt.sim_backend.objects.object_sets import open_objects
-from tactile_rt.sweep_set import OUTLIERS, WITHHELD
 
 RECIPES = Path(__file__).parent / "recipes"
 INSTANCES, ANOTHER, WIDE = "real27", "real27-source", "-wide"

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from bench.perception.data import Data
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.evidence.model_windows import stepped
-from tactile_rt.evidence.promises import familiarity
 from tactile_rt.export.release import fit_temperature
-from tactile_rt.models import evaluation
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.promises import familiarity
+from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.svm import PENALTIES, fit, window_features
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import train
+from tactile_rt.sets.objects import Sweeps
 from tactile_rt.sim_backend.datasets import recipes
-from tactile_rt.sweep_set import Sweeps
 
 __all__ = [
     "GENERATED",
@@ -108,7 +108,7 @@ def onnx_model(path: Path) -> Method:
     run = stepped(session, card)
 
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
-        return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
+        return measures.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
     taught, familiar = _learnt_from(card), partial(familiarity, path)
     return Method(path.stem, taught, card.classes, posteriors, familiar)
@@ -169,7 +169,7 @@ def _calibrated(
     temperature = fit_temperature(uncalibrated(validation, CLEAN), validation.sweeps.labels)
 
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
-        return evaluation.at_temperature(uncalibrated(sweeps, disturbance), temperature)
+        return measures.at_temperature(uncalibrated(sweeps, disturbance), temperature)
 
     return Method(name, taught, validation.manifest.categories, posteriors)
 
@@ -177,7 +177,7 @@ def _calibrated(
 def _best(candidates: list[Callable[..., Floats]], validation: SweepSet) -> Callable[..., Floats]:
     """The one that decides most of the validation sweeps rightly."""
     labels = validation.sweeps.labels
-    return max(candidates, key=lambda one: evaluation.hits(one(validation, CLEAN), labels).mean())
+    return max(candidates, key=lambda one: measures.hits(one(validation, CLEAN), labels).mean())
 
 
 def _softmax(margins: NDArray[Any], usable: NDArray[np.bool_]) -> Floats:
@@ -219,7 +219,7 @@ def _gru(taught: str, training: SweepSet, validation: SweepSet, runs: Path) -> M
         run = run_on(load_checkpoint(best)[0])
 
         def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
-            return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
+            return measures.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
         return posteriors
 

@@ -18,9 +18,9 @@ from bench.perception.area import (
 from bench.perception.data import NAME, SOURCE, VERSION, Data
 from bench.perception.methods import Method
 from bench.perception.scores import COVERAGES, Figures
-from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.evaluation.measures import Interval
+from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE
-from tactile_rt.sweep_set import OUTLIERS, WITHHELD
 
 __all__ = ["PAGE", "write_page"]
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from bench.perception.data import Data
 from bench.perception.methods import Method, of_kinds
-from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.measures import Interval
 
 __all__ = ["COVERAGES", "Figures", "accuracy_by_source", "robustness", "score"]
 
@@ -61,22 +61,22 @@ def score(
     posteriors = method.posteriors(known, CLEAN)
 
     def over(statistic: Callable[[NDArray[np.int64]], float]) -> Interval:
-        return evaluation.bootstrap(statistic, objects)
+        return measures.bootstrap(statistic, objects)
 
-    right = evaluation.hits(posteriors, labels)
+    right = measures.hits(posteriors, labels)
     sure = np.nan_to_num(posteriors.max(axis=1), nan=0.0)
     area = NOTHING
     if strange is not None:
         area = _told_apart(method.familiarity(known), objects, *strange)
 
     return Figures(
-        top1=evaluation.accuracy(right, objects),
-        top5=evaluation.accuracy(evaluation.hits(posteriors, labels, 5), objects),
+        top1=measures.accuracy(right, objects),
+        top5=measures.accuracy(measures.hits(posteriors, labels, 5), objects),
         macro=over(lambda at: _macro(right[at], labels[at])),
-        two=evaluation.fused_accuracy(posteriors, labels, objects, 2),
-        four=evaluation.fused_accuracy(posteriors, labels, objects, 4),
+        two=measures.fused_accuracy(posteriors, labels, objects, 2),
+        four=measures.fused_accuracy(posteriors, labels, objects, 4),
         calibration=over(
-            lambda at: evaluation.expected_calibration_error(posteriors[at], labels[at])
+            lambda at: measures.expected_calibration_error(posteriors[at], labels[at])
         ),
         at={c: over(lambda at, c=c: _surest(right[at], sure[at], c)) for c in COVERAGES},  # type: ignore[misc]
         auroc=area,
@@ -86,10 +86,10 @@ def score(
 def accuracy_by_source(method: Method, test: SweepSet, data: Data) -> dict[str, Interval]:
     """Top-1 on the objects of every source."""
     known = of_kinds(test, method.kinds)
-    right = evaluation.hits(method.posteriors(known, CLEAN), known.sweeps.labels)
+    right = measures.hits(method.posteriors(known, CLEAN), known.sweeps.labels)
     source = np.array([data.origins[name].source for name in known.sweeps.objects.tolist()])
     return {
-        name: evaluation.accuracy(right[source == name], known.sweeps.objects[source == name])
+        name: measures.accuracy(right[source == name], known.sweeps.objects[source == name])
         for name in sorted(set(source.tolist()))
     }
 
@@ -100,8 +100,8 @@ def robustness(
     """Top-1 under every condition."""
     known = of_kinds(test, method.kinds)
     return {
-        name: evaluation.accuracy(
-            evaluation.hits(method.posteriors(known, disturbance), known.sweeps.labels),
+        name: measures.accuracy(
+            measures.hits(method.posteriors(known, disturbance), known.sweeps.labels),
             known.sweeps.objects,
         )
         for name, disturbance in conditions.items()
@@ -116,9 +116,9 @@ def _told_apart(
 
     def area(at: NDArray[np.int64]) -> float:
         mine = at < len(familiar)
-        return evaluation.auroc(both[at[mine]], both[at[~mine]])
+        return measures.auroc(both[at[mine]], both[at[~mine]])
 
-    return evaluation.bootstrap(area, np.concatenate([objects, others]))
+    return measures.bootstrap(area, np.concatenate([objects, others]))
 
 
 def _macro(right: NDArray[np.bool_], labels: NDArray[np.int64]) -> float:

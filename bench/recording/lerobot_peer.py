@@ -19,7 +19,7 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from tactile_rt.core.stream import concatenate
-from tactile_rt.evidence.records import Record, show
+from tactile_rt.models.evaluation.records import Record, show
 from tactile_rt.recording import Recording, StreamWriter
 from tactile_rt.recording.as_lerobot import write_dataset
 from tactile_rt.recording.lerobot_film import film_of

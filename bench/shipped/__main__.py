@@ -24,11 +24,11 @@ from msgspec.structs import replace as change
 from bench.perception.make import RECIPES as OF_THE_BENCHMARK
 from tactile_rt.export.release import release
 from tactile_rt.models.checkpoints import save_whole
+from tactile_rt.sets.manifest import OUTLIERS
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
-from tactile_rt.sweep_set import OUTLIERS
 
 RECIPES = Path(__file__).parent / "recipes"
 LISTS = ("real", "everyday")

@@ -5,7 +5,7 @@ from time import process_time
 import gymnasium
 import numpy as np
 
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sim_backend import environments
 
 __all__ = ["active"]

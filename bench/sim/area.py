@@ -11,7 +11,7 @@ from bench.sim.active import active
 from bench.sim.catalogue import catalogue
 from bench.sim.mechanics import mechanics
 from bench.sim.reference_model import PROTOTYPE_CPU_S, reference_cost
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.source import REST_SAMPLES

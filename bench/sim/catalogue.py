@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, WITHHELD, make_object
 from tactile_rt.sim_backend.sweep import Sweep

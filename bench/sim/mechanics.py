@@ -7,7 +7,7 @@ import numpy as np
 from bench.sim.beams import BeamErrors, beams, flat, measure
 from bench.sim.pegs import SLIDE_MM_S, Press, press, presses
 from bench.sim.ringing import release_error, rod_ring
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sim_backend.arrays.files import load_array, mouse_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import FRICTION

@@ -17,7 +17,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
 
 if TYPE_CHECKING:
-    from tactile_rt.models.alignment.results import Results
+    from tactile_rt.alignment.results import Results
 
 align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
 app.add_typer(align, name="align")
@@ -34,8 +34,8 @@ def write_brain(
     ] = None,
 ) -> None:
     """Make up a brain: recordings in NWB, and models of known truth, to try the commands on."""
-    from tactile_rt.models.alignment.example import Brain
-    from tactile_rt.models.alignment.example_files import write_example
+    from tactile_rt.alignment.example import Brain
+    from tactile_rt.alignment.example_files import write_example
 
     (brain,) = take_sets("align example", sets or (), Brain)
     console = Console(stderr=True)
@@ -78,8 +78,8 @@ def build_benchmark(
     json: Json = None,
 ) -> None:
     """Freeze recordings into a small benchmark, so that nobody else needs them."""
-    from tactile_rt.models.alignment import build, save_benchmark
-    from tactile_rt.models.alignment.selection import Selection
+    from tactile_rt.alignment import build, save_benchmark
+    from tactile_rt.alignment.selection import Selection
 
     for file in (out, json):
         check_output(file)
@@ -128,14 +128,14 @@ def score_models(
     with needing("train"):
         if page:
             import matplotlib  # noqa: F401
-        from tactile_rt.models.alignment.benchmark import load_benchmark
-        from tactile_rt.models.alignment.loading import check_models, load_layers, load_untrained
-        from tactile_rt.models.alignment.results import (
+        from tactile_rt.alignment.benchmark import load_benchmark
+        from tactile_rt.alignment.loading import check_models, load_layers, load_untrained
+        from tactile_rt.alignment.results import (
             ModelResult,
             model_result,
             results_of,
         )
-        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+        from tactile_rt.alignment.stimuli_input import read_stimuli
 
         felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
         names = check_models(models)
@@ -166,9 +166,9 @@ def write_report(
     """Write one self-contained page of some scores on the same benchmark."""
     import msgspec
 
-    from tactile_rt.models.alignment.benchmark import benchmark_sha256
-    from tactile_rt.models.alignment.loading import told_apart
-    from tactile_rt.models.alignment.results import read_results
+    from tactile_rt.alignment.benchmark import benchmark_sha256
+    from tactile_rt.alignment.loading import told_apart
+    from tactile_rt.alignment.results import read_results
 
     check_output(out)
     read = [read_results(path) for path in scores]
@@ -208,16 +208,16 @@ def decode_stimuli(
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
     with needing("train"):
-        from tactile_rt.models.alignment.benchmark import load_strict
-        from tactile_rt.models.alignment.building import animal_means
-        from tactile_rt.models.alignment.decoding import (
+        from tactile_rt.alignment.benchmark import load_strict
+        from tactile_rt.alignment.building import animal_means
+        from tactile_rt.alignment.decoding import (
             decode,
             decode_paper,
             decode_rdm,
             mean_decoded,
         )
-        from tactile_rt.models.alignment.loading import check_models, load_layers
-        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+        from tactile_rt.alignment.loading import check_models, load_layers
+        from tactile_rt.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
         targets = load_strict(benchmark).targets if benchmark else ()
@@ -252,8 +252,8 @@ def decode_stimuli(
 
 def _write_report(results: "Results", path: Path) -> None:
     with needing("train"):
-        from tactile_rt.models.alignment.html_page import write_page
-        from tactile_rt.models.alignment.report import report_page
+        from tactile_rt.alignment.html_page import write_page
+        from tactile_rt.alignment.report import report_page
 
         write_page(report_page(results), path)
 

@@ -17,15 +17,15 @@ from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.models.alignment.board import Alignments, BoardRow
-    from tactile_rt.models.alignment.layers import Layers
-    from tactile_rt.models.alignment.stimuli_input import StimuliInput
+    from tactile_rt.alignment.board import Alignments, BoardRow
+    from tactile_rt.alignment.layers import Layers
+    from tactile_rt.alignment.stimuli_input import StimuliInput
 
 
 @align.command("datasets")
 def list_datasets(json: Json = None) -> None:
     """List the recordings that models can be compared with: license, citation, size."""
-    from tactile_rt.models.alignment.datasets import dataset_names, find_dataset
+    from tactile_rt.alignment.datasets import dataset_names, find_dataset
 
     found = [find_dataset(name) for name in dataset_names()]
     keys = ("name", "title", "about", "citation", "url", "license", "size")
@@ -52,9 +52,9 @@ def fetch_recordings(
     json: Json = None,
 ) -> None:
     """Get what is needed of published recordings, some MB of hundreds of GB, from their archive."""
-    from tactile_rt.models.alignment.datasets import find_dataset
-    from tactile_rt.models.alignment.datasets.fetching import counted, fetch, published_files
-    from tactile_rt.models.alignment.selection import Selection
+    from tactile_rt.alignment.datasets import find_dataset
+    from tactile_rt.alignment.datasets.fetching import counted, fetch, published_files
+    from tactile_rt.alignment.selection import Selection
 
     dataset = find_dataset(name)
     if not dataset.listing:
@@ -124,12 +124,12 @@ def write_board(
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
     parts, models = list(dict.fromkeys(part or ["all"])), models or []
     with needing("train"):
-        from tactile_rt.models.alignment.board import joined, with_cells
-        from tactile_rt.models.alignment.datasets import find_dataset
-        from tactile_rt.models.alignment.loading import check_models, told_apart
-        from tactile_rt.models.alignment.metrics import find_metric, metric_names
-        from tactile_rt.models.alignment.selection import part_of
-        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+        from tactile_rt.alignment.board import joined, with_cells
+        from tactile_rt.alignment.datasets import find_dataset
+        from tactile_rt.alignment.loading import check_models, told_apart
+        from tactile_rt.alignment.metrics import find_metric, metric_names
+        from tactile_rt.alignment.selection import part_of
+        from tactile_rt.alignment.stimuli_input import read_stimuli
 
         metrics = list(dict.fromkeys(metric or metric_names()))
         for name in metrics:
@@ -160,8 +160,8 @@ def write_board(
                 )  # fmt: skip
         made = joined(boards)
     if page:
-        from tactile_rt.models.alignment.board_page import board_page
-        from tactile_rt.models.alignment.html_page import write_page
+        from tactile_rt.alignment.board_page import board_page
+        from tactile_rt.alignment.html_page import write_page
 
         write_page(board_page(made), page)
     if not told_as_json(made, json):
@@ -175,8 +175,8 @@ def _shown(update: Any) -> Callable[[float], None]:
 def _rows(
     files: list[tuple[Path, str]], felt: "StimuliInput", seed: int, update: Any
 ) -> list[tuple["BoardRow", Any]]:
-    from tactile_rt.models.alignment.board import BoardRow, traces_of, traces_of_stimuli
-    from tactile_rt.models.alignment.loading import load_layers, load_untrained
+    from tactile_rt.alignment.board import BoardRow, traces_of, traces_of_stimuli
+    from tactile_rt.alignment.loading import load_layers, load_untrained
 
     rows: list[tuple[BoardRow, Any]] = []
     for path, name in files:
@@ -202,7 +202,7 @@ def _named(text: str) -> tuple[str, Path]:
 
 
 def _show(board: "Alignments") -> None:
-    from tactile_rt.models.alignment.html_page import format_number
+    from tactile_rt.alignment.html_page import format_number
 
     places = dict.fromkeys((c.dataset, c.part) for c in board.columns)
     for dataset, part in places:

@@ -18,8 +18,8 @@ from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, TactileError
 
 if TYPE_CHECKING:
-    from tactile_rt.models.alignment.layers import Layers
-    from tactile_rt.models.alignment.stimuli_input import StimuliInput
+    from tactile_rt.alignment.layers import Layers
+    from tactile_rt.alignment.stimuli_input import StimuliInput
 
 USAGE = 2  # click's exit code
 INPUT_ERROR = 3  # of the gate, whose 1 and 2 mean something else
@@ -80,13 +80,13 @@ def _gate(
     if baseline is not None and benchmark is None:
         raise ConfigError("--baseline needs the --benchmark that it was scored on")
     with needing("train"):
-        from tactile_rt.models.alignment.benchmark import load_strict
-        from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
-        from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks
-        from tactile_rt.models.alignment.loading import check_models, load_layers
-        from tactile_rt.models.alignment.results import baseline_of
-        from tactile_rt.models.alignment.scoring import score
-        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+        from tactile_rt.alignment.benchmark import load_strict
+        from tactile_rt.alignment.fidelity import export_layers, fidelity_check
+        from tactile_rt.alignment.gate import Check, exit_code, neural_checks
+        from tactile_rt.alignment.loading import check_models, load_layers
+        from tactile_rt.alignment.results import baseline_of
+        from tactile_rt.alignment.scoring import score
+        from tactile_rt.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
         frozen = load_strict(benchmark) if benchmark else None
@@ -119,6 +119,6 @@ def _exported(model: Path, felt: "StimuliInput", original: "Layers", export: Any
     if model.suffix == ".onnx":
         layers: Layers = export(model, felt, original)
         return layers
-    from tactile_rt.models.alignment.loading import load_layers
+    from tactile_rt.alignment.loading import load_layers
 
     return load_layers(model, felt)[0]

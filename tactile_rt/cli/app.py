@@ -16,8 +16,7 @@ from urllib.parse import unquote
 import typer
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.extras import lacking
-from tactile_rt.version import VERSION
+from tactile_rt.core.packages import VERSION, lacking
 
 if TYPE_CHECKING:
     from tactile_rt.core.stream import Source

@@ -32,11 +32,11 @@ def show(json: Json = None) -> None:
     An animal's name takes a side: mouse-left, mouse-both.
     """
     with needing("sim"):
-        from tactile_rt.core import extensions
+        from tactile_rt.core import packages
         from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_animals
         from tactile_rt.sim_backend.transducer import device_spec
     found = []
-    for name in (*SPECIES, *ROBOTS, *extensions.added_names(extensions.ARRAYS)):
+    for name in (*SPECIES, *ROBOTS, *packages.added_names(packages.ARRAYS)):
         spec = device_spec(load_animals(name))
         found.append(
             {

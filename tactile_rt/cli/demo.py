@@ -28,7 +28,7 @@ from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification

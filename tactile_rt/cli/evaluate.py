@@ -27,11 +27,11 @@ def evaluate(
 ) -> None:
     """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
     and what else goes wrong with a sensor."""
-    from tactile_rt.sweep_set import SweepManifest
+    from tactile_rt.sets.manifest import SweepManifest
 
     SweepManifest.read(data)
     with needing("train"):
-        from tactile_rt.evidence.classification import evaluate_model
+        from tactile_rt.models.evaluation.model_file import evaluate_model
     with progress_bar(Console(stderr=True), "evaluating"):
         records = evaluate_model(model, data, svm, pictures, quick)
     show_records(records, json)

@@ -29,7 +29,7 @@ def grid(
     """
     from tactile_rt.models.grid.outcomes import Outcome, waiting_tasks
     from tactile_rt.models.grid.plan import read_grid
-    from tactile_rt.sweep_set import SweepManifest
+    from tactile_rt.sets.manifest import SweepManifest
 
     check_output(json)
     check_folder(folder)

@@ -57,8 +57,8 @@ def label(
         intervals_of_all,
     )
     from tactile_rt.recording.labels import LABELS
+    from tactile_rt.sets.manifest import SPLITS
     from tactile_rt.sim_backend.datasets.inventory import write_sums
-    from tactile_rt.sweep_set import SPLITS
 
     *recordings, folder = files
     if not recordings:
@@ -128,8 +128,8 @@ def _shares(text: str) -> tuple[float, ...]:
 
 def _check_out(folder: Path, force: bool) -> None:
     """Refuse a folder that is there, unless it is a recorded set that is to be replaced."""
+    from tactile_rt.sets.manifest import MANIFEST, SweepManifest, object_path
     from tactile_rt.sim_backend.datasets.inventory import SUMS
-    from tactile_rt.sweep_set import MANIFEST, SweepManifest, object_path
 
     if not folder.absolute().parent.is_dir():
         raise ConfigError(f"no folder {folder.parent} to make {folder.name} in")

@@ -126,7 +126,7 @@ def bench(
 ) -> None:
     """Measure it here: size, loading, memory, CPU time of a step."""
     from tactile_rt.classifier.model_file import read_model
-    from tactile_rt.evidence.model_steps import Subject, measure_model
+    from tactile_rt.export.model_steps import Subject, measure_model
 
     card, _, _ = read_model(file)
     if card.kind != "step":

@@ -51,7 +51,7 @@ def make(
     """
     console = Console(stderr=True, soft_wrap=True)
     with needing("sim,train"):
-        from tactile_rt.evidence.records import as_dicts
+        from tactile_rt.models.evaluation.records import as_dicts
         from tactile_rt.project.folder import Project
         from tactile_rt.project.making import make as make_project
     project = Project(folder)

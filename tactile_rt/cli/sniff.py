@@ -310,7 +310,7 @@ def _sniff_bag(path: Path, told: _Told) -> None:
 
     from tactile_rt.recording import Recording
     from tactile_rt.recording.importing.bag import bag_topics
-    from tactile_rt.ros2 import messages
+    from tactile_rt.recording.ros2 import messages
 
     try:
         about = Recording(path).description if path.suffix == ".mcap" else None

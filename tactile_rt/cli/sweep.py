@@ -117,12 +117,12 @@ def _write_card(folder: Path) -> None:
 
 def _recipe(folder: Path, name: str | None, sets: list[str]) -> "SweepRecipe":
     """The recipe of a set that is there or to be made, with what is set otherwise."""
+    from tactile_rt.sets.manifest import SweepManifest
     from tactile_rt.sim_backend.datasets.recipe_files import (
         DEFAULT_RECIPE,
         read_recipe,
         recipe_of_set,
     )
-    from tactile_rt.sweep_set import SweepManifest
 
     if name is None and (folder / "manifest.json").exists():
         manifest = SweepManifest.read(folder)

@@ -16,7 +16,7 @@ from tactile_rt.cli.options import STDOUT
 from tactile_rt.core.files import write_whole
 
 if TYPE_CHECKING:
-    from tactile_rt.evidence.records import Record
+    from tactile_rt.models.evaluation.records import Record
 
 __all__ = ["fitting", "print_table", "show_records", "show_table", "told_as_json"]
 
@@ -47,7 +47,7 @@ def show_records(records: "list[Record]", json: Path | None) -> bool:
     Returns:
         Whether stdout took the JSON, and nothing else may go there.
     """
-    from tactile_rt.evidence.records import as_dicts, as_table
+    from tactile_rt.models.evaluation.records import as_dicts, as_table
 
     if told_as_json(as_dicts(records), json):
         return True

@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
+from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.admission import file_stamp, model_path
 from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
@@ -22,7 +23,6 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
 from tactile_rt.daemon.troubles import troubles
-from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]
 

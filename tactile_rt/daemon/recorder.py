@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
+from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import OnDisk
@@ -46,7 +47,6 @@ from tactile_rt.recording.layout import (
 from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.recording.writer import RecordingWriter
-from tactile_rt.version import VERSION
 
 __all__ = ["Recorder"]
 
@@ -414,9 +414,7 @@ class Recorder(Consumer):
             if over or self._folder.full:
                 self._finish_file(track)
             elif track.rotation.is_due(file) and not track.closed_ns:
-                self._rotate(
-                    track
-                )  # decisions after a source's end go into its last file
+                self._rotate(track)  # decisions after a source's end go into its last file
 
     def _sync(self, track: _Track, sync: bool = True) -> bool:
         """Flush, at least; whether that could be done, and the sync before."""

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import no_such
 from tactile_rt.core.stream import ArraySpec, Chunk
@@ -317,11 +317,11 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
             return described
         found: type[Codec[Any]] = getattr(there, attribute)
         return found
-    theirs: type[Codec[Any]] | None = extensions.added(extensions.CODECS, f"{wire}.{name}")
+    theirs: type[Codec[Any]] | None = packages.added(packages.CODECS, f"{wire}.{name}")
     if theirs is not None:
         return theirs
     known = {n for w, n in CODECS if w == wire}
-    added = extensions.added_names(extensions.CODECS)
+    added = packages.added_names(packages.CODECS)
     known |= {n.partition(".")[2] for n in added if n.startswith(f"{wire}.")}
     other = {n for w, n in CODECS if w != wire} - known
     if name in other:

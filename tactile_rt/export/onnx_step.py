@@ -27,13 +27,13 @@ from tactile_rt.classifier.model_runs import file_outputs, probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.files import write_whole
+from tactile_rt.core.packages import VERSION
 from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint
-from tactile_rt.models.data_checks import trained_objects, trained_on
-from tactile_rt.sweep_set import SweepManifest, join_manifests
-from tactile_rt.version import VERSION
+from tactile_rt.models.data_checks import trained_on
+from tactile_rt.sets.manifest import SweepManifest, join_manifests, trained_objects
 
 __all__ = [
     "OPSET",

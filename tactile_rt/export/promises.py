@@ -26,7 +26,7 @@ from tactile_rt.classifier.decision_rules import (
 )
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import Step, at_temperature, predict
+from tactile_rt.models.evaluation.measures import Step, at_temperature, predict
 
 __all__ = ["COVERAGE", "fit_candidates", "fit_unknown", "fitted_rules"]
 

@@ -19,8 +19,8 @@ from tactile_rt.export.promises import fitted_rules
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
-from tactile_rt.models.evaluation import Step, among, cut_windows, hits, predict, run_over
-from tactile_rt.sweep_set import SweepManifest, join_manifests
+from tactile_rt.models.evaluation.measures import Step, among, cut_windows, hits, predict, run_over
+from tactile_rt.sets.manifest import SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
 

@@ -11,22 +11,12 @@ from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models.datasets import SweepSet, frame_of
 from tactile_rt.models.ead_config import EADConfig
-from tactile_rt.sweep_set import (
-    OUTLIERS,
-    UNLABELLED,
-    WITHHELD,
-    SweepManifest,
-    join_manifests,
-    object_path,
-)
+from tactile_rt.sets.manifest import SweepManifest, check_labelled, join_manifests, object_path
 
 __all__ = [
     "check_array",
-    "check_labelled",
     "check_sets",
-    "check_split",
     "probed_on",
-    "trained_objects",
     "trained_on",
 ]
 
@@ -84,18 +74,6 @@ def trained_on(
     return folders
 
 
-def trained_objects(
-    manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
-) -> dict[str, list[str]]:
-    """The names of the objects that a network has learnt from, by where the objects come from."""
-    before = saved.get("trained_objects", {}) if saved else {}
-    found = {source: dict.fromkeys(names) for source, names in before.items()}
-    for one in manifests:
-        names = (*one.split["train"], *one.split.get(OUTLIERS, ()))
-        found.setdefault(one.source, {}).update(dict.fromkeys(names))
-    return {source: list(names) for source, names in found.items()}
-
-
 def probed_on(
     checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
 ) -> tuple[Path, SweepManifest]:
@@ -121,38 +99,6 @@ def probed_on(
     check_array(checkpoint, saved, manifest)
     check_labelled(path, manifest)
     return path, manifest
-
-
-def check_labelled(folder: Path, manifest: SweepManifest) -> None:
-    """What is to be learnt from a set's labels must have some.
-
-    Raises:
-        ConfigError: its touches have none.
-    """
-    if UNLABELLED in manifest.categories:
-        raise ConfigError(
-            f"{folder} holds touches without labels: learn from them by --recipe simclr, or say "
-            "what was touched with `tactile-rt label`"
-        )
-
-
-def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """No object on two sides of the split, every trained object of a category that is trained."""
-    side: dict[str, str] = {}
-    for split, names in manifest.split.items():
-        for name in names:
-            if name in side:
-                where = "twice in" if side[name] == split else f"in {side[name]!r} and in"
-                raise RecordingError(
-                    f"{folder}: the object {name} is {where} {split!r} of the split: an accuracy "
-                    "on it would mean nothing; make the set anew"
-                )
-            side[name] = split
-            if split not in (WITHHELD, OUTLIERS) and manifest.label(name) < 0:
-                raise RecordingError(
-                    f"{folder}: {name} of {split!r} is of the withheld category "
-                    f"{manifest.category(name)!r}, which has no label to train on"
-                )
 
 
 def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:

@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import UNKNOWN
+from tactile_rt.core.stream import MOUSE, Timing
 from tactile_rt.models.implausible import implausible
 from tactile_rt.models.onsets import Onsets, find_onsets
-from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.sweep_set import FAULTS, SweepManifest, Sweeps, join_manifests, read_sweeps
-from tactile_rt.timing import MOUSE, Timing
+from tactile_rt.sets.manifest import FAULTS, SweepManifest, join_manifests
+from tactile_rt.sets.objects import Sweeps, read_sweeps
+from tactile_rt.sets.sensor_faults import SensorFaults
 
 __all__ = [
     "NOISE_LEVELS",

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, name_some
 
 __all__ = [
@@ -49,7 +49,7 @@ WIDEST = 4  # sixteen times the paper's parameters, a billion
 
 def added_cells() -> tuple[str, ...]:
     """Names of the cells that other packages add, each plain and, with "-ln", normalised."""
-    return tuple(f"{cell}{ln}" for cell in extensions.added_names(extensions.CELLS) for ln in LN)
+    return tuple(f"{cell}{ln}" for cell in packages.added_names(packages.CELLS) for ln in LN)
 
 
 def encoder_class(name: str) -> tuple[str, str]:

@@ -115,7 +115,7 @@ def window_features(
     """
     # Imported here: it brings torch, which whoever only writes a set's card does without.
     from tactile_rt.models.disturbances import CLEAN
-    from tactile_rt.models.evaluation import cut_windows, run_over
+    from tactile_rt.models.evaluation.measures import cut_windows, run_over
 
     limits = data.manifest.limits
 

@@ -24,7 +24,7 @@ from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.core.settings import no_such, read_text, split_url
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import codec_class
-from tactile_rt.sensor_faults import LARGEST
+from tactile_rt.sets.sensor_faults import LARGEST
 from tactile_rt.sim_backend.arrays.files import (
     ARRAY_FILES,
     ROBOTS,

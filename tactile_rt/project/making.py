@@ -17,19 +17,19 @@ import numpy as np
 import torch
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.evidence.classification import evaluate_model
-from tactile_rt.evidence.records import Record, write
 from tactile_rt.export.release import release
 from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation.model_file import evaluate_model
+from tactile_rt.models.evaluation.records import Record, write
 from tactile_rt.models.training.config import Progress, TrainingConfig
 from tactile_rt.models.training.loop import read_splits, train
 from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import Project
 from tactile_rt.project.report import write_report
+from tactile_rt.sets.objects import read_skipped, write_skipped
 from tactile_rt.sim_backend.datasets.dataset import describe_set, finished_objects, make_sweeps
 from tactile_rt.sim_backend.datasets.inventory import write_sums
-from tactile_rt.sweep_set import read_skipped, write_skipped
 
 __all__ = ["MakeProgress", "make"]
 

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.files import write_whole
-from tactile_rt.evidence.model_windows import stepped
-from tactile_rt.evidence.pictures import draw_confusion
-from tactile_rt.evidence.records import Record
-from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.pictures import draw_confusion
+from tactile_rt.models.evaluation.records import Record
+from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.project.folder import Project
 
 __all__ = ["confused", "draw_over_time", "write_report"]
@@ -41,12 +41,12 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
     run = stepped(session, card)
     labels, objects = test.sweeps.labels, test.sweeps.objects
     curves = {
-        "no sensor noise": evaluation.predict(test, run),
-        "rated noise": evaluation.predict(test, run, 1.0),
+        "no sensor noise": measures.predict(test, run),
+        "rated noise": measures.predict(test, run, 1.0),
     }
     step_ms = card.period_ns * card.substeps * 1e-6
     draw_over_time(curves, labels, objects, step_ms, project.report / "over_time.png")
-    table = evaluation.confusion(curves["rated noise"][:, -1], labels, len(card.classes))
+    table = measures.confusion(curves["rated noise"][:, -1], labels, len(card.classes))
     draw_confusion(table, card.classes, project.report / "confusion.png")
     found = {r.name.removeprefix("models."): r for r in records}
     robust = [r for name, r in found.items() if name.startswith("top-1, ")]
@@ -109,7 +109,7 @@ def draw_over_time(
     for name, posteriors in curves.items():
         steps = posteriors.shape[1]
         found = [
-            evaluation.accuracy(evaluation.hits(posteriors[:, k], labels), objects)
+            measures.accuracy(measures.hits(posteriors[:, k], labels), objects)
             for k in range(steps)
         ]
         at = step_ms * np.arange(1, steps + 1)

@@ -17,9 +17,9 @@ from tactile_rt.core.files import whole_folder
 from tactile_rt.recording.description import RECOVERED
 from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
 from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2_form import CHANNELS, TEXTS, WRENCH, FileForm
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.ros2 import messages
 
 __all__ = ["write_bag"]
 

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.extras import lacking
 from tactile_rt.core.files import write_whole
+from tactile_rt.core.packages import lacking
 from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.recording.description import Description, seal
 from tactile_rt.recording.layout import DECISIONS, EVENTS, HEALTH

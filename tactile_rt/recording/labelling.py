@@ -23,7 +23,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.recording.labels import LABELS, LabelledInterval, label_of_file, read_labels
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.touches import RecordedTouch, find_touches
-from tactile_rt.sweep_set import UNLABELLED, SweepManifest
+from tactile_rt.sets.manifest import UNLABELLED, SweepManifest
 
 __all__ = [
     "LabelledTouch",

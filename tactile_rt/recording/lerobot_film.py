@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.extras import lacking
+from tactile_rt.core.packages import lacking
 
 __all__ = ["VIDEO", "CameraFilm", "film_of", "write_film"]
 

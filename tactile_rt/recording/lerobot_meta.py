@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.extras import lacking
+from tactile_rt.core.packages import lacking
 from tactile_rt.recording.lerobot_film import VIDEO, CameraFilm
 
 __all__ = ["DATA", "FRAME", "Episode", "Statistics", "need_pyarrow", "write_meta"]

@@ -31,7 +31,8 @@ from tactile_rt.drivers.opening import Prepared, make_codec
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
-from tactile_rt.sweep_set import SweepManifest, read_object
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import read_object
 
 __all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
 

@@ -14,9 +14,9 @@ from tactile_rt.recording.layout import (
     is_samples,
     last_ns,
 )
-from tactile_rt.ros2 import messages
-from tactile_rt.ros2.cdr import CDR
-from tactile_rt.ros2.definitions import token
+from tactile_rt.recording.ros2 import messages
+from tactile_rt.recording.ros2.cdr import CDR
+from tactile_rt.recording.ros2.definitions import token
 
 __all__ = [
     "ARRAY",

@@ -28,8 +28,7 @@ from tactile_rt.classifier.contact import (
     ContactDetector,
 )
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.timing import Timing
+from tactile_rt.core.stream import ArraySpec, Chunk, Timing
 
 __all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]
 

@@ -48,9 +48,9 @@ from tactile_rt.recording.layout import (
     encode_packet,
     samples_in,
 )
+from tactile_rt.recording.ros2.definitions import schema_text
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer
-from tactile_rt.ros2.definitions import schema_text
 
 __all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats", "check_not_recorded"]
 

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
+from tactile_rt.core.packages import VERSION
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS
-from tactile_rt.version import VERSION
 
 __all__ = ["DISTANCES", "SHAPES", "STIMULI", "Surface", "whisk_against", "write_input"]
 

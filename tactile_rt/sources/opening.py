@@ -1,7 +1,7 @@
 """Open a source by its URL: ``scheme:target?option=value&option=value``.
 
 Schemes are looked up in one table, imported when used, so that a robot without MuJoCo never
-imports it; then among what other packages add (`extensions`). What can be told of a URL without
+imports it; then among what other packages add (`core.packages`). What can be told of a URL without
 opening anything is told by `check_source`, in the words of `open_source`: both go through
 `_prepared`.
 
@@ -16,9 +16,9 @@ from typing import Any
 
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.array_file import read_array
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, SpecMismatch
-from tactile_rt.core.extras import lacking
+from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest, split_url, take_options
 from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.opening import Prepared
@@ -120,9 +120,9 @@ def _of_scheme(
 
 
 def _of_another_package(url: str, scheme: str) -> Any:
-    found = extensions.added(extensions.SOURCES, scheme)
+    found = packages.added(packages.SOURCES, scheme)
     if found is not None:
         return found
-    known = sorted(f"{s}:" for s in {*SCHEMES, *extensions.added_names(extensions.SOURCES)})
+    known = sorted(f"{s}:" for s in {*SCHEMES, *packages.added_names(packages.SOURCES)})
     near = nearest(f"{scheme}:" if scheme else url, known)
     raise ConfigError(f"{url!r:.80} is no source; {near}")

@@ -26,7 +26,7 @@ from tactile_rt.classifier.model_file import METADATA_KEY, load_model, read_mode
 from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.files import write_whole
-from tactile_rt.core.stream import NS_PER_S, ArraySpec
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing
 from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.further import (
     check_further,
@@ -38,7 +38,6 @@ from tactile_rt.teaching.further import (
 )
 from tactile_rt.teaching.head import LIMIT, LeftOut, TouchClasses, fit_classes, leave_out
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
-from tactile_rt.timing import Timing
 
 __all__ = ["FASTEST_NS", "TOUCH", "Taught", "TaughtFurther", "write_features", "write_taught"]
 

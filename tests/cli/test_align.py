@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from tactile_rt.alignment import save_benchmark
+from tactile_rt.alignment.paper_code import freeze_paper_code
+from tactile_rt.alignment.stimuli_input import SHIPPED
+from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.models.alignment import save_benchmark
-from tactile_rt.models.alignment.paper_code import freeze_paper_code
-from tactile_rt.models.alignment.stimuli_input import SHIPPED
-from tactile_rt.models.alignment.strict import freeze_strict
 from tests.helpers import brains
 
 pytest.importorskip("onnx")
@@ -125,7 +125,7 @@ def test_a_mistake_of_ours_is_no_verdict(call, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("tactile_rt.models.alignment.fidelity.fidelity_check", broken)
+    monkeypatch.setattr("tactile_rt.alignment.fidelity.fidelity_check", broken)
     code, out, err = call("align", "gate", MODEL, "--reference", MODEL)
     assert (code, out) == (3, "") and "ZeroDivisionError" in err
 

@@ -17,8 +17,8 @@ MODEL = shipped_model()
 
 @pytest.fixture(scope="module")
 def brain(tmp_path_factory):
-    from tactile_rt.models.alignment.example import Brain
-    from tactile_rt.models.alignment.example_files import write_example
+    from tactile_rt.alignment.example import Brain
+    from tactile_rt.alignment.example_files import write_example
 
     folder = tmp_path_factory.mktemp("board") / "brain"
     write_example(folder, Brain(mice=3, sessions=1, units=30, trials=12))

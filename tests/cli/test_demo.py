@@ -14,7 +14,7 @@ from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import demo as demo_module
 from tactile_rt.cli.demo import Demonstration, draw, watch
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tactile_rt.core.stream import Chunk
 from tactile_rt.recording.replay import DEMO
 

@@ -17,9 +17,9 @@ pytest.importorskip("trimesh")
 
 import trimesh
 
+from tactile_rt.sets.objects import write_object
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
-from tactile_rt.sweep_set import write_object
 
 TINY_SET = (
     "--recipe", "mouse12", "--set", "objects.per_category=3", "--set", "objects.validation=1",
@@ -217,7 +217,7 @@ def tiny_model(torch, tmp_path, sweep_set):
     from tactile_rt.models.checkpoints import TactileClassifier
     from tactile_rt.models.ead import EADConfig
     from tactile_rt.models.training.config import TrainingConfig
-    from tactile_rt.sweep_set import SweepManifest
+    from tactile_rt.sets.manifest import SweepManifest
 
     manifest = SweepManifest.read(sweep_set)
     spec = manifest.spec
@@ -277,7 +277,7 @@ def test_a_model_is_evaluated_on_fewer_kinds_and_on_objects_from_elsewhere(
     import shutil
 
     from tactile_rt.classifier.model_file import read_model
-    from tactile_rt.sweep_set import SweepManifest
+    from tactile_rt.sets.manifest import SweepManifest
 
     path = tiny_model()
     kinds = read_model(path)[0].labels

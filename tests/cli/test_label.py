@@ -17,11 +17,11 @@ from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation import cut_windows, run_over
+from tactile_rt.models.evaluation.measures import cut_windows, run_over
 from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.recording import Recording
-from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.sensor_faults import SensorFaults
 from tests.helpers.labelled import ARRAY, record_touches, touched
 from tests.helpers.source_tree import ROOT
 from tests.helpers.tiny_sweeps import LEAD, SAMPLES, write_tiny_set

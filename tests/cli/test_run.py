@@ -7,7 +7,7 @@ import time
 import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tests.helpers.processes import PROGRAM, start_program
 
 pytest.importorskip("mujoco")

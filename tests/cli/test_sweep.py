@@ -5,9 +5,9 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
+from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
-from tactile_rt.sweep_set import SweepManifest
 
 RECIPE = """
 name = "tiny"

@@ -11,7 +11,7 @@ from importlib.util import find_spec
 import pytest
 
 from tactile_rt.core.errors import TactileError
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.catalogue import CODECS

@@ -10,11 +10,12 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.decision_rules import MASS_ABOVE, POSTERIOR, UNKNOWN, CandidateRule
 from tactile_rt.classifier.decision_rules import UnknownRule as Rule
-from tactile_rt.evidence.promises import named_faults, promises
+from tactile_rt.core.stream import Timing
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.sweep_set import SweepManifest, Sweeps
+from tactile_rt.models.evaluation.promises import named_faults, promises
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import Sweeps
 from tactile_rt.testing import small_spec
-from tactile_rt.timing import Timing
 from tests.helpers.tiny_model import CARD, PERIOD_NS, STEPS, SUBSTEPS, write_model
 
 LEAD = 40

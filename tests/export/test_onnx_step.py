@@ -29,7 +29,7 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.export import onnx_step, streaming, streaming_gpt
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
@@ -43,9 +43,8 @@ from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.onsets import find_onsets
-from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.testing import cut
-from tactile_rt.timing import MOUSE
 from tests.helpers.tiny_sweeps import tiny_array
 
 STEPS, SUBSTEPS = MOUSE.steps, MOUSE.substeps

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tactile_rt.models.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.neural import Animal, NeuralSession
 
 
 def geometry(rng, features=8):

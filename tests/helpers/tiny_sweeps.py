@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.core.stream import ArraySpec
-from tactile_rt.sweep_set import SweepManifest, split_by_object, write_object
+from tactile_rt.sets.manifest import SweepManifest, split_by_object
+from tactile_rt.sets.objects import write_object
 
 COLUMNS = (5, 5, 7, 7, 6)  # of rows A to E
 LEAD, SAMPLES = 24, 136

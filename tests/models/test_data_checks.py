@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.sweep_set import SweepManifest, object_path, read_object, write_object
+from tactile_rt.sets.manifest import SweepManifest, object_path
+from tactile_rt.sets.objects import read_object, write_object
 from tests.helpers.tiny_sweeps import write_tiny_set
 
 pytest.importorskip("torch")

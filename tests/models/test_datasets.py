@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import MOUSE
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, windows
-from tactile_rt.models.evaluation import cut_windows
+from tactile_rt.models.evaluation.measures import cut_windows
 from tactile_rt.models.training.batches import TrainingBatches, partners
-from tactile_rt.sweep_set import SweepManifest, Sweeps
-from tactile_rt.timing import MOUSE
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import Sweeps
 from tests.helpers.tiny_sweeps import plate
 
 ELEMENTS, CHANNELS, SAMPLES, LEAD = 4, 6, 170, 30

@@ -12,11 +12,12 @@ from sklearn.metrics import roc_auc_score
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.sensor_spec import channel_limits
-from tactile_rt.core.stream import ArraySpec
-from tactile_rt.models import evaluation, onsets
+from tactile_rt.core.stream import MOUSE, ArraySpec
+from tactile_rt.models import onsets
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import OFFSET, Disturbance
-from tactile_rt.models.evaluation import (
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.measures import (
     accuracy,
     at_temperature,
     auroc,
@@ -24,8 +25,8 @@ from tactile_rt.models.evaluation import (
     deciding_step,
 )
 from tactile_rt.models.onsets import find_onsets
-from tactile_rt.sweep_set import SweepManifest, Sweeps
-from tactile_rt.timing import MOUSE
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import Sweeps
 from tests.helpers.tiny_sweeps import plate
 
 ELEMENTS = 8
@@ -169,7 +170,7 @@ def seen_by(
 
     data = a_set(values)
     data = replace(data, manifest=replace(data.manifest, spec=spec))
-    evaluation.predict(data, run, disturbance=disturbance, seed=seed)
+    measures.predict(data, run, disturbance=disturbance, seed=seed)
     return tuple(np.concatenate(part) for part in zip(*seen, strict=True))
 
 
@@ -188,10 +189,10 @@ def test_an_offset_after_the_tare_is_in_the_windows_and_not_in_the_baseline() ->
 def test_rest_before_a_sweep_tares_it_and_is_not_its_window() -> None:
     data = replace(a_set(sweeps(30)), window="sweep")
     plain, rested = (
-        next(evaluation.cut_windows(data, disturbance=Disturbance(rest=rest))) for rest in (0, 80)
+        next(measures.cut_windows(data, disturbance=Disturbance(rest=rest))) for rest in (0, 80)
     )
     assert np.array_equal(plain.samples, rested.samples)
-    noisy = next(evaluation.cut_windows(data, disturbance=Disturbance(rest=80, noise=1.0)))
+    noisy = next(measures.cut_windows(data, disturbance=Disturbance(rest=80, noise=1.0)))
     assert noisy.sigma.mean(axis=(0, 1)) == pytest.approx(NOISE, rel=0.02)
     assert np.abs(noisy.offset).mean(axis=(0, 1)) == pytest.approx(NOISE * 0.08, rel=0.15)
 

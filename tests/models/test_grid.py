@@ -31,7 +31,8 @@ from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, table, write_results
 from tactile_rt.models.grid.work import Workbench
 from tactile_rt.models.training.config import DivergedError, Progress
-from tactile_rt.sweep_set import SweepManifest, write_object
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import write_object
 from tests.helpers.source_tree import ROOT
 from tests.helpers.tiny_sweeps import plate
 

@@ -17,7 +17,7 @@ from torch import nn
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.evaluation.measures import hits, predict
 from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 from tactile_rt.models.training.feeding import prefetched
@@ -31,7 +31,8 @@ from tactile_rt.models.training.optimizers import (
 from tactile_rt.models.training.probing import linear_probe, probe
 from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.models.training.replay import replayed
-from tactile_rt.sweep_set import SweepManifest, write_object
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import write_object
 from tests.helpers.tiny_sweeps import SAMPLES, write_tiny_set
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}

@@ -23,7 +23,8 @@ from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.project.budget import Budget, described, write_budget
 from tactile_rt.project.folder import KINDS, Project
 from tactile_rt.project.making import make
-from tactile_rt.sweep_set import SweepManifest, read_skipped
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import read_skipped
 from tests.helpers.source_tree import ROOT
 
 PAGE = ROOT / "docs" / "how-to" / "your-array.md"

@@ -12,7 +12,7 @@ import pytest
 
 from tactile_rt.calibration import Calibration
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.conversion import convert

@@ -21,7 +21,8 @@ from tactile_rt.recording.labelling import (
     like,
 )
 from tactile_rt.recording.labels import LabelledInterval
-from tactile_rt.sweep_set import SweepManifest, read_object, read_sweeps
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import read_object, read_sweeps
 from tests.helpers.labelled import ARRAY, KINDS, chunks_of_touches, record_touches, times
 from tests.helpers.recordings import write
 from tests.helpers.tiny_sweeps import plate, write_tiny_set

@@ -13,8 +13,9 @@ from tactile_rt.core.stream import EndOfStream, concatenate
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.recording import Recording
 from tactile_rt.recording.replay import DEMO
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import write_object
 from tactile_rt.sources.opening import open_source
-from tactile_rt.sweep_set import SweepManifest, write_object
 from tactile_rt.testing import FakeCan, FakeSerial, cut
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, record_device, write
 

@@ -14,6 +14,8 @@ import mujoco
 from bench.sim.beams import flat
 from bench.sim.pegs import SLIDE_MM_S, _steps, press, presses
 from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import read_object, read_sweeps
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
@@ -28,7 +30,6 @@ from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
-from tactile_rt.sweep_set import SweepManifest, read_object, read_sweeps
 
 PLAIN = SweepRecipe(
     lead_ms=45,

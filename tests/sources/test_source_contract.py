@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from tactile_rt.recording import StreamWriter
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import write_object
 from tactile_rt.sources.opening import open_source
-from tactile_rt.sweep_set import SweepManifest, write_object
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.source_contract import Case, SourceContract
 from tests.helpers.waiting import PATIENCE_S

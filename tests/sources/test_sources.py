@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import pytest
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, small_spec
 from tests.helpers.refusals import refusal

@@ -3,9 +3,9 @@
 from importlib import import_module
 from typing import Any
 
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.extras import lacking
+from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import no_such
 
 __all__ = ["PUBLISHERS", "load_class", "publisher_class"]
@@ -29,10 +29,10 @@ def publisher_class(kind: str) -> Any:
     if kind in PUBLISHERS:
         where, extra = PUBLISHERS[kind]
         return load_class(where, f"publisher {kind}", extra)
-    found = extensions.added(extensions.PUBLISHERS, kind)
+    found = packages.added(packages.PUBLISHERS, kind)
     if found is not None:
         return found
-    known = {*PUBLISHERS, *extensions.added_names(extensions.PUBLISHERS)}
+    known = {*PUBLISHERS, *packages.added_names(packages.PUBLISHERS)}
     raise ConfigError(no_such("publisher", kind, sorted(known)))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, name_some
-from tactile_rt.core.extras import lacking
+from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import convert, read_toml
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame

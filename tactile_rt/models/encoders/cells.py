@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.convolution import Convolution, convolve
 
@@ -264,7 +264,7 @@ def make_cell(name: str, channels: int) -> Cell:
     if name in CELLS:
         return CELLS[name](channels)
     base = name.removesuffix("-ln")
-    found = extensions.added(extensions.CELLS, base)
+    found = packages.added(packages.CELLS, base)
     if not (isinstance(found, type) and issubclass(found, Cell)):
         raise ConfigError(f"cell {base}: {found} is no class of encoders.cells.Cell")
     return found(channels, layer_norm=name != base)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
 from tactile_rt.models.grid.results import GridResults, Row
 

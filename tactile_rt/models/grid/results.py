@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
-from tactile_rt.models.evaluation import Interval, accuracy
+from tactile_rt.models.evaluation.measures import Interval, accuracy
 from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
-from tactile_rt.models.data_checks import check_sets, check_split
+from tactile_rt.models.data_checks import check_sets
 from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
-from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, posteriors
+from tactile_rt.models.evaluation.measures import CutWindows, among, cut_windows, hits, posteriors
 from tactile_rt.models.grid.outcomes import (
     POINT,
     SUBSET,
@@ -41,7 +41,7 @@ from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeCo
 from tactile_rt.models.training.devices import launched
 from tactile_rt.models.training.loop import initialise, train
 from tactile_rt.models.training.probing import probe
-from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.sets.manifest import SweepManifest, check_split
 
 __all__ = ["Workbench"]
 

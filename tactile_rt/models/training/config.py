@@ -10,11 +10,10 @@ from pathlib import Path
 
 from tactile_rt.core.errors import ConfigError, ModelError, name_some
 from tactile_rt.models.checkpoint_files import NETWORK
-from tactile_rt.models.data_checks import check_labelled, check_split
 from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
-from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.sweep_set import SweepManifest, join_manifests
+from tactile_rt.sets.manifest import SweepManifest, check_labelled, check_split, join_manifests
+from tactile_rt.sets.sensor_faults import SensorFaults
 
 __all__ = [
     "AUGMENTATIONS",

@@ -24,7 +24,7 @@ from tactile_rt.core.locks import alone_in
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
-from tactile_rt.models.data_checks import check_sets, trained_objects
+from tactile_rt.models.data_checks import check_sets
 from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of, joined, relabelled
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.objectives import (
@@ -49,7 +49,7 @@ from tactile_rt.models.training.optimizers import build_optimizer
 from tactile_rt.models.training.replay import batch_loss
 from tactile_rt.models.training.resuming import RunState, as_json, begin_run, log_epoch
 from tactile_rt.models.training.validation import Validation
-from tactile_rt.sweep_set import OUTLIERS
+from tactile_rt.sets.manifest import OUTLIERS, trained_objects
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric

@@ -16,17 +16,13 @@ from torch.nn import functional as F
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import alone_in
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
-from tactile_rt.models.data_checks import (
-    check_sets,
-    check_split,
-    probed_on,
-    trained_objects,
-)
+from tactile_rt.models.data_checks import check_sets, probed_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, of_categories, windows
-from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.evaluation.measures import hits, predict
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.resuming import log_epoch
+from tactile_rt.sets.manifest import check_split, trained_objects
 
 __all__ = ["linear_probe", "probe"]
 

@@ -12,7 +12,7 @@ from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import run_on
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, RATED
-from tactile_rt.models.evaluation import among, cut_windows, hits, posteriors
+from tactile_rt.models.evaluation.measures import among, cut_windows, hits, posteriors
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.batches import partners
 from tactile_rt.models.training.config import TWO_SWEEPS, TrainingConfig

@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.extras import lacking
 from tactile_rt.core.files import open_regular
+from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.codecs.column_words import compress_columns
@@ -29,8 +29,8 @@ from tactile_rt.recording.importing.table import Table, import_table, shown_name
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
+from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2_form import ARRAY
-from tactile_rt.ros2 import messages
 
 __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
 

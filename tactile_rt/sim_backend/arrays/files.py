@@ -36,7 +36,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.core.settings import (
@@ -126,7 +126,7 @@ def species_array(name: str) -> WhiskerArray:
     animal, _, side = name.partition("-")
     known = [*SPECIES, *(f"{a}-{s}" for a in SPECIES for s in SIDES)]
     if name not in known:
-        known += [*ROBOTS, *extensions.added_names(extensions.ARRAYS)]
+        known += [*ROBOTS, *packages.added_names(packages.ARRAYS)]
         near = difflib.get_close_matches(name, known, 1)
         raise ConfigError(
             f"no simulated array {name!r}: "
@@ -202,7 +202,7 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
         return read_animals(path)
     if name in ROBOTS:
         return read_animals(Path(f"{name}.toml"), robot_text(name))
-    file = extensions.added(extensions.ARRAYS, name)
+    file = packages.added(packages.ARRAYS, name)
     return (species_array(name),) if file is None else read_animals(Path(file))
 
 

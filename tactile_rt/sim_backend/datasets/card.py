@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import ArraySpec
+from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.card_survey import Card, Fit, Separability, survey
-from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["write_card"]
 

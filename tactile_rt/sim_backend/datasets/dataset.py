@@ -20,9 +20,12 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError, SourceError, TactileError
+from tactile_rt.core.packages import VERSION
 from tactile_rt.core.sensor_spec import LOADS
 from tactile_rt.core.settings import no_such
 from tactile_rt.core.stream import Chunk
+from tactile_rt.sets.manifest import MANIFEST, SweepManifest, has_object
+from tactile_rt.sets.objects import read_skipped, write_object, write_skipped
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.inventory import remove_leftovers, write_sums, written_sum
@@ -35,15 +38,6 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
-from tactile_rt.sweep_set import (
-    MANIFEST,
-    SweepManifest,
-    has_object,
-    read_skipped,
-    write_object,
-    write_skipped,
-)
-from tactile_rt.version import VERSION
 
 __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
 

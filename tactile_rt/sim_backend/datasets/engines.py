@@ -18,7 +18,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any
 
 from tactile_rt.core.errors import ConfigError, TactileError
-from tactile_rt.core.extras import lacking
+from tactile_rt.core.packages import lacking
 
 __all__ = ["ENGINES", "Outcome", "Work", "run_processes", "run_ray"]
 

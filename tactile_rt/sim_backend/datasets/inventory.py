@@ -13,14 +13,8 @@ import numpy as np
 
 from tactile_rt.core.errors import RecordingError, name_some
 from tactile_rt.core.files import write_whole
-from tactile_rt.sweep_set import (
-    MANIFEST,
-    SKIPPED,
-    SweepManifest,
-    has_object,
-    object_path,
-    read_skipped,
-)
+from tactile_rt.sets.manifest import MANIFEST, SKIPPED, SweepManifest, has_object, object_path
+from tactile_rt.sets.objects import read_skipped
 
 __all__ = [
     "SUMS",

@@ -21,12 +21,12 @@ from tactile_rt.core.settings import (
     refusal,
     set_keys,
 )
+from tactile_rt.core.stream import STEP_MS, Timing
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.recipes import GENERATED, SweepRecipe
 from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sim_backend.world import SAMPLE_MS
-from tactile_rt.timing import STEP_MS, Timing
 
 __all__ = [
     "DEFAULT_RECIPE",

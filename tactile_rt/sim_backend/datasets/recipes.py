@@ -36,7 +36,7 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import no_such
-from tactile_rt.sensor_faults import SensorFaults
+from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor_model import SensorModel

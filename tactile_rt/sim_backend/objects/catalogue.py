@@ -2,7 +2,7 @@
 
 `make_object` draws the n-th mug, bottle, ...; `load_object` also takes a mesh file. "mug-17" is of
 the one plan that its kind has; "varied-mug-17" is of any plan, see `shapes.varied`. Other packages
-may add categories (`extensions`): of one plan, and known by their names only.
+may add categories (`core.packages`): of one plan, and known by their names only.
 """
 
 import difflib
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tactile_rt.core import extensions
+from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
@@ -99,7 +99,7 @@ OUTLIERS: tuple[str, ...] = tuple(_OUTLIERS)  # of no kind: what a model may lea
 
 def added_categories() -> tuple[str, ...]:
     """Names of the categories that other packages add."""
-    return extensions.added_names(extensions.OBJECTS)
+    return packages.added_names(packages.OBJECTS)
 
 
 def make_object(category: str, index: int) -> TactileObject:
@@ -111,7 +111,7 @@ def make_object(category: str, index: int) -> TactileObject:
     kind = _check(category, index)
     # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])
-    build: _Builder = _BUILDERS.get(kind) or extensions.added(extensions.OBJECTS, kind)
+    build: _Builder = _BUILDERS.get(kind) or packages.added(packages.OBJECTS, kind)
     if kind == category:
         pieces = build(rng)
     else:

@@ -7,7 +7,7 @@ pytest.importorskip("mujoco")
 
 from bench.models import area
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 
 

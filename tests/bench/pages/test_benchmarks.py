@@ -8,7 +8,7 @@ pytest.importorskip("mujoco")
 
 from bench.pages.benchmarks import PAGE, Measurement, read, row, section, written
 from tactile_rt.cli.bench import AREAS
-from tactile_rt.evidence.records import Record
+from tactile_rt.models.evaluation.records import Record
 
 
 def test_the_page_is_made_of_what_is_kept() -> None:

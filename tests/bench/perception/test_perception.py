@@ -17,8 +17,9 @@ from bench.perception.methods import Method, of_kinds
 from bench.perception.scores import accuracy_by_source, score
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
+from tactile_rt.sets.objects import write_object
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
-from tactile_rt.sweep_set import OUTLIERS, WITHHELD, write_object
 from tests.helpers.source_tree import ROOT
 
 LIST = ROOT / "tactile_rt/sim_backend/objects/lists/real.csv"

@@ -12,6 +12,8 @@ from matplotlib.image import imread
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.models.svm import fit
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.objects import write_object, write_skipped
 from tactile_rt.sim_backend.datasets.card import write_card
 from tactile_rt.sim_backend.datasets.card_survey import (
     Features,
@@ -19,7 +21,6 @@ from tactile_rt.sim_backend.datasets.card_survey import (
     survey,
     window_features,
 )
-from tactile_rt.sweep_set import SweepManifest, write_object, write_skipped
 from tactile_rt.testing import small_spec
 
 SPEC = small_spec()  # 3 elements

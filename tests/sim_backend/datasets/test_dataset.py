@@ -17,6 +17,8 @@ pytest.importorskip("trimesh")
 
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError, RecordingError, SourceError, TactileError
+from tactile_rt.sets.manifest import SPLITS, SweepManifest
+from tactile_rt.sets.objects import read_object, read_sweeps
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.dataset import (
@@ -40,12 +42,6 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, UNITS
-from tactile_rt.sweep_set import (
-    SPLITS,
-    SweepManifest,
-    read_object,
-    read_sweeps,
-)
 from tactile_rt.testing import cut
 
 # Short sweeps of few objects: what is tested here is where they end up.

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.extras import install_extra
+from tactile_rt.core.packages import install_extra
 from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tests.helpers.frail_work import FrailWork
 from tests.helpers.source_tree import ROOT

@@ -9,8 +9,9 @@ import pytest
 pytest.importorskip("mujoco")
 
 from tactile_rt.core.errors import RecordingError
+from tactile_rt.sets.manifest import object_path
+from tactile_rt.sets.objects import write_object, write_skipped
 from tactile_rt.sim_backend.datasets.inventory import Tally, remove_leftovers, tally
-from tactile_rt.sweep_set import object_path, write_object, write_skipped
 
 
 @pytest.fixture

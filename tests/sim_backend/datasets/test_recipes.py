@@ -13,7 +13,8 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.sensor_faults import SensorFaults
+from tactile_rt.sets.manifest import WITHHELD
+from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import (
     read_recipe,
@@ -30,7 +31,6 @@ from tactile_rt.sim_backend.datasets.recipes import (
 )
 from tactile_rt.sim_backend.objects import catalogue as objects
 from tactile_rt.sim_backend.sweep import Sweep
-from tactile_rt.sweep_set import WITHHELD
 
 
 def write(path: Path, text: str) -> str:

@@ -14,13 +14,13 @@ import trimesh
 from manifold3d import Manifold, OpType
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects import meshes
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.object_sets import open_objects
-from tactile_rt.sweep_set import SweepManifest
 from tests.helpers import mesh_truth
 
 MM = 40.0  # largest extent that errors are given at

@@ -1,0 +1,291 @@
+"""Activations of every layer of a torch network, for the six stimuli.
+
+A layer is what a reader of the paper would call one: a node of the encoder's graph after its ReLU,
+a residual block's sum, a transformer block's output at the action token, a linear layer after its
+ReLU. Always in evaluation mode: dropout and batch statistics would make a score depend on chance
+and on what else is in the batch.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.alignment.layers import Layers, table
+from tactile_rt.alignment.stimuli_input import StimuliInput
+from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.sensor_spec import ChannelLimits
+from tactile_rt.core.stream import ArraySpec, Timing
+from tactile_rt.models.attenders.gpt import GPT, TOKENS
+from tactile_rt.models.attenders.mamba import MambaStack
+from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, untrained
+from tactile_rt.models.ead import EADConfig, count_parameters
+from tactile_rt.models.encoders.graph import Graph, Node
+from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
+from tactile_rt.models.encoders.gru import GRUEncoder
+
+__all__ = [
+    "checkpoint_layers",
+    "network_layers",
+    "reach",
+    "untrained_card_layers",
+    "untrained_layers",
+]
+
+Traces = dict[str, Tensor]
+Change = Callable[[Tensor], Tensor]
+
+
+def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[str, Any]]:
+    """Layers of a `best.pt`, and what else it holds.
+
+    Raises:
+        ModelError: no such checkpoint.
+        ConfigError: the stimuli are of another array.
+    """
+    model, saved = load_checkpoint(path)
+    timing, period = model.timing, saved.get("period_ns")  # which earlier ones do not say
+    stimuli.check(
+        ArraySpec.from_json(saved["spec"]),
+        timing.steps,
+        timing.substeps,
+        str(path),
+        period if isinstance(period, int) else None,
+    )
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    name = path.resolve().parent.name if path.stem in ("best", "last") else path.stem
+    layers = network_layers(model, stimuli, name, sha256)
+    return replace(layers, training=table(saved.get("config"))), saved
+
+
+def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0) -> Layers:
+    """Layers of a checkpoint's network as it might be before training: its random control."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = _begun(untrained(saved), saved.get("config"))
+    return network_layers(model, stimuli, f"untrained, seed {seed}")
+
+
+def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0) -> Layers | None:
+    """Layers of the network that an exported file's card describes, with random weights.
+
+    None for a card that describes no network that can be built here, as one of another program or
+    of a later release might.
+
+    Raises:
+        ConfigError: the stimuli are of another array.
+    """
+    network = card.provenance.get("network")
+    if not isinstance(network, dict):
+        return None
+    scale, floor, clip = (
+        np.asarray(v, dtype=np.float32) for v in (card.scale, card.floor, card.clip)
+    )
+    spec = ArraySpec.from_json(card.spec)
+    stimuli.check(spec, card.steps, card.substeps, card.name, card.period_ns)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        limits = ChannelLimits(scale, floor, clip, scale)
+        try:
+            model = TactileClassifier(spec, EADConfig(**network), limits)
+        except (TypeError, ValueError, ConfigError):
+            return None
+        if model.timing != Timing(card.steps, card.substeps):
+            return None
+        model = _begun(model, card.provenance.get("training"))
+    return network_layers(model, stimuli, f"untrained, seed {seed}")
+
+
+def network_layers(
+    model: TactileClassifier, stimuli: StimuliInput, name: str = "network", sha256: str = ""
+) -> Layers:
+    """Layers of a network; its mode is left as it was.
+
+    Raises:
+        ConfigError: the network wants more than the frames of one array.
+    """
+    mode = model.training
+    model.eval()
+    try:
+        with torch.inference_mode():
+            device = model.inputs.clip.device
+            loads = (stimuli.samples, stimuli.offset, stimuli.sigma)
+            frames = model.inputs(*(torch.from_numpy(a).to(device) for a in loads))
+            network = model.network
+            traces, features, first = _encoder(network.encoder, frames)
+            after = dict.fromkeys(traces, 0) | first
+            with _recorded(_attender_layers(network.attender), "attender", frames) as recorded:
+                features = network.attender(features)
+            traces |= recorded
+            with _recorded(_decoder_layers(network.decoder), "decoder", frames) as recorded:
+                network.decoder(features)
+            traces |= recorded
+            logits = network(frames)
+    finally:
+        model.train(mode)
+    return Layers(
+        name=name,
+        traces={k: v.float().cpu().numpy() for k, v in traces.items()},
+        first={k: after.get(k, network.lag) for k in traces},
+        logits=logits.float().cpu().numpy(),
+        parameters=count_parameters(network),
+        sha256=sha256,
+        network=asdict(network.config),
+    )
+
+
+def _begun(model: TactileClassifier, training: object) -> TactileClassifier:
+    """With the first weights that its training drew, as far as that is known."""
+    paper = table(training).get("first_weights") == "paper"
+    if paper and isinstance(model.network.encoder, GraphEncoder):
+        draw_as_published(model.network.encoder)
+    return model
+
+
+def reach(graph: Graph) -> dict[str, int]:
+    """By node, the first step whose output depends on the frame: the shortest path to it."""
+    distance = {graph.frame.name: -1}
+    nodes = graph.nodes
+    for _ in graph.nodes:
+        for node in nodes:
+            # The frame is read at once, everything else a step late.
+            known = [distance[e.source] for e in node.reads if e.source in distance]
+            if known:
+                distance[node.name] = min(min(known) + 1, distance.get(node.name, len(nodes)))
+    return {n.name: distance[n.name] for n in nodes if n.name in distance}
+
+
+def _encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, int]]:
+    """Traces, features (6, step, feature), and first steps."""
+    if isinstance(encoder, GraphEncoder):
+        traces, features = _graph(encoder, frames)
+        return traces, features, {f"encoder.{k}": v for k, v in reach(encoder.graph).items()}
+    if isinstance(encoder, GRUEncoder):
+        state, steps = encoder.initial_state(len(frames)), []
+        for t in range(frames.shape[1]):
+            _, state = encoder.step(frames[:, t], torch.zeros(0), state)
+            steps.append(state["gru_h"])
+        layers = torch.stack(steps, 1).unbind(2)
+        return {f"encoder.layer{i}": x for i, x in enumerate(layers)}, layers[-1], {}
+    with _recorded(_encoder_layers(encoder), "encoder", frames) as recorded:
+        features = encoder(frames)
+    if not recorded:  # of a kind that is not known here
+        recorded["encoder.features"] = features
+    return recorded, features, {}
+
+
+def _graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
+    """Every node's output, step by step: the window form leaves out what reaches no feature."""
+    found: dict[str, list[Tensor]] = {node.name: [] for node in encoder.graph.nodes}
+    original = encoder._cell
+
+    def recording(node: Node, *rest: Any) -> tuple[Tensor, tuple[Tensor, ...]]:
+        h, memory = original(node, *rest)
+        found[node.name].append(h.movedim(2, 0).flatten(1))
+        return h, memory
+
+    encoder._cell = recording  # type: ignore[method-assign, assignment]
+    try:
+        state, steps = encoder.initial_state(len(frames)), []
+        for t in range(frames.shape[1]):
+            out, state = encoder.step(frames[:, t], torch.zeros(0), state)
+            steps.append(out)
+    finally:
+        del encoder.__dict__["_cell"]
+    return {f"encoder.{k}": torch.stack(v, 1) for k, v in found.items()}, torch.stack(steps, 1)
+
+
+# (name, module, whether its input is meant, what is done to it)
+Tap = tuple[str, nn.Module, bool, Change | None]
+
+
+def _encoder_layers(encoder: Any) -> list[Tap]:
+    taps: list[Tap] = []
+    for name in ("stem", "embed"):
+        if hasattr(encoder, name):
+            taps.append((name, getattr(encoder, name), False, F.relu if name == "stem" else None))
+    if hasattr(encoder, "blocks"):  # of ResNet18 and S4: whole, residual included
+        taps += [(f"block{i}", block, False, None) for i, block in enumerate(encoder.blocks)]
+    if isinstance(stack := getattr(encoder, "stack", None), MambaStack):
+        taps += _mamba(stack)
+    taps += [(n, getattr(encoder, n), False, None) for n in ("fc", "out") if hasattr(encoder, n)]
+    return taps
+
+
+def _attender_layers(attender: nn.Module) -> list[Tap]:
+    if isinstance(attender, MambaStack):
+        return _mamba(attender)
+    if isinstance(attender, GPT):
+
+        def action(x: Tensor) -> Tensor:
+            return x[:, TOKENS - 1 :: TOKENS]
+
+        blocks: list[Tap] = [(f"block{i}", b, False, action) for i, b in enumerate(attender.blocks)]
+        last = [(n, getattr(attender, n), False, None) for n in ("norm", "project_out")]
+        return [*blocks, *last]
+    return []
+
+
+def _mamba(stack: MambaStack) -> list[Tap]:
+    """The residual sum after each block is what the next norm reads."""
+    after = [*list(stack.norms)[1:], stack.norm]
+    taps: list[Tap] = [(f"block{i}", norm, True, None) for i, norm in enumerate(after)]
+    return [*taps, ("norm", stack.norm, False, None)]
+
+
+def _decoder_layers(decoder: nn.Module) -> list[Tap]:
+    if isinstance(decoder, nn.Sequential):
+        hidden = [m for m in decoder if isinstance(m, nn.ReLU)]
+        taps: list[Tap] = [(f"fc{i + 1}", m, False, None) for i, m in enumerate(hidden)]
+        return [*taps, ("logits", decoder[-1], False, None)]
+    if hasattr(decoder, "layer2") and hasattr(decoder, "layer3"):
+        two, three = decoder.layer2, decoder.layer3
+        assert isinstance(two, nn.Module) and isinstance(three, nn.Module)
+        return [
+            ("fc1", two, True, None),
+            ("fc2", three, True, None),
+            ("logits", three, False, None),
+        ]
+    return [("logits", decoder, False, None)]
+
+
+@contextmanager
+def _recorded(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
+    """Record, in the order of `taps`, what they give within the block, (6, step, unit)."""
+    traces: Traces = {}
+    shape = frames.shape[:2]
+
+    def keep(name: str, change: Change | None, x: Tensor) -> None:
+        x = change(x) if change else x
+        traces[f"{part}.{name}"] = x.reshape(*shape, -1)
+
+    handles = []
+    for name, module, before, change in taps:
+        if before:
+            handles.append(
+                module.register_forward_pre_hook(
+                    lambda _, args, n=name, c=change: keep(n, c, args[0])
+                )
+            )
+        else:
+            handles.append(
+                module.register_forward_hook(lambda _, __, out, n=name, c=change: keep(n, c, out))
+            )
+    try:
+        yield traces
+    finally:
+        for handle in handles:
+            handle.remove()
+    order = {f"{part}.{name}": i for i, (name, *_) in enumerate(taps)}
+    for name in sorted(traces, key=order.__getitem__):
+        traces[name] = traces.pop(name)

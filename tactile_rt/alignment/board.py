@@ -1,0 +1,241 @@
+"""The board: models by datasets by metrics, each value as a share of what the noise permits.
+
+In every cell a model's layer is chosen on the other animals (`statistics.held_out`), so that the
+board tells no maximum. What it is to be read against stands in rows of the same kind: the sensors
+themselves, each network before its training, and another animal.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from tactile_rt.alignment.datasets import NeuralDataset
+from tactile_rt.alignment.json_file import Floats, Number
+from tactile_rt.alignment.layers import Layers
+from tactile_rt.alignment.metrics import METRICS, Measure, find_metric
+from tactile_rt.alignment.metrics.halves import LONGEST, bins_of, means_of, sessions_of
+from tactile_rt.alignment.neural import Animal
+from tactile_rt.alignment.selection import part_of
+from tactile_rt.alignment.statistics import held_out, standard_error
+from tactile_rt.alignment.stimuli_input import StimuliInput
+
+__all__ = [
+    "ANOTHER",
+    "Alignments",
+    "BoardCell",
+    "BoardColumn",
+    "BoardDataset",
+    "BoardRow",
+    "joined",
+    "traces_of",
+    "traces_of_stimuli",
+    "with_cells",
+]
+
+Traces = Mapping[str, Floats]  # by layer, (6, step, unit), NaN where input cannot reach
+
+ANOTHER = "another animal"
+
+
+class BoardRow(msgspec.Struct, frozen=True):
+    """What is compared with the recordings.
+
+    Attributes:
+        kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or
+            ``animal``.
+        sha256: The SHA-256 sum of the model's file, hex; empty for what has no file.
+        parameters: The count of numbers that the model is made of; 0 where there are none.
+    """
+
+    name: str
+    kind: str
+    sha256: str = ""
+    parameters: int = 0
+    notes: tuple[str, ...] = ()
+
+
+class BoardColumn(msgspec.Struct, frozen=True):
+    """Part of a dataset under a metric.
+
+    Attributes:
+        part: The part of cortex, such as ``all`` or ``L4``.
+        animals: The number of animals with units of that part.
+        usable: The number of animals whose noise is low enough to be corrected for.
+        ceiling: The mean over these of the value that a perfect model is expected to reach; NaN
+            without any.
+    """
+
+    dataset: str
+    part: str
+    metric: str
+    animals: int
+    usable: int
+    ceiling: Number
+
+
+class BoardCell(msgspec.Struct, frozen=True):
+    """A row's value in a column.
+
+    Attributes:
+        score: The mean over animals of the value as a share of the ceiling; NaN without any.
+        sem: The standard error of that mean; NaN with fewer than two animals.
+        value: The mean over animals before the division by the ceiling.
+        layer: The name of the layer that was chosen most often.
+    """
+
+    score: Number = math.nan
+    sem: Number = math.nan
+    value: Number = math.nan
+    layer: str = ""
+
+
+class BoardDataset(msgspec.Struct, frozen=True):
+    """Where a dataset comes from; attributes as in `datasets.NeuralDataset`, and what was read.
+
+    Attributes:
+        units: The number of units of all animals together.
+    """
+
+    name: str
+    title: str
+    citation: str
+    license: str
+    url: str
+    size: str
+    about: str
+    animals: tuple[str, ...]
+    units: int
+    notes: tuple[str, ...]
+
+
+class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt board 2"):
+    """A whole board.
+
+    Attributes:
+        cells: (row, column) The value of each row in each column.
+        metrics: What each metric is, in a line, by its name.
+    """
+
+    rows: tuple[BoardRow, ...]
+    columns: tuple[BoardColumn, ...]
+    cells: tuple[tuple[BoardCell, ...], ...]
+    datasets: tuple[BoardDataset, ...]
+    metrics: dict[str, str]
+
+
+def traces_of(layers: Layers) -> Traces:
+    """Layers as metrics take them: NaN before the step that input reaches.
+
+    What was computed elsewhere for a whole stimulus, one step, holds at every step.
+    """
+    out: dict[str, Floats] = {}
+    for name, trace in layers.traces.items():
+        values = np.asarray(trace, dtype=np.float64).copy()
+        values[:, : layers.first[name]] = np.nan
+        out[name] = np.repeat(values, LONGEST, axis=1) if values.shape[1] == 1 else values
+    return out
+
+
+def traces_of_stimuli(stimuli: StimuliInput) -> Traces:
+    """The loads themselves as a layer, mean over a step's samples, SI."""
+    steps = stimuli.samples.astype(np.float64).mean(axis=2)
+    return {"raw": steps.reshape(*steps.shape[:2], -1)}
+
+
+def with_cells(
+    rows: Sequence[tuple[BoardRow, Traces]],
+    dataset: NeuralDataset,
+    animals: Sequence[Animal],
+    parts: Sequence[str],
+    metrics: Sequence[str],
+    notes: Iterable[str] = (),
+    progress: Callable[[float], None] = lambda share: None,
+) -> Alignments:
+    """The board of one dataset; the row of another animal is added to the given ones.
+
+    Args:
+        rows: each with its layers for this dataset's conditions.
+        parts: of cortex, from `targets.TARGET_PARTS`.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigError: no such part or metric.
+        ModuleNotFoundError: threadpoolctl is not installed.
+    """
+    from threadpoolctl import threadpool_limits
+
+    columns: list[BoardColumn] = []
+    cells: list[list[BoardCell]] = [[] for _ in range(len(rows) + 1)]
+    # Matrices are small: more threads wait for each other, on a busy machine for minutes.
+    with threadpool_limits(1):
+        for done, (part, metric) in enumerate((p, m) for p in parts for m in metrics):
+            targets = part_of(animals, part)
+            measured = [(target, find_metric(metric)(target)) for target in targets]
+            usable = [(target, measure) for target, measure in measured if measure.usable]
+            measures = [measure for _, measure in usable]
+            ceiling = float(np.mean([m.ceiling for m in measures])) if measures else math.nan
+            columns.append(
+                BoardColumn(dataset.name, part, metric, len(targets), len(usable), ceiling)
+            )
+            for row, (_, traces) in zip(cells, rows, strict=False):
+                row.append(_cell(traces, measures))
+            cells[-1].append(_another(usable))
+            progress((done + 1) / (len(parts) * len(metrics)))
+    card = BoardDataset(
+        **{key: getattr(dataset, key) for key in BoardDataset.__struct_fields__[:7]},
+        animals=tuple(a.name for a in animals),
+        units=sum(s.rates.shape[1] for a in animals for s in a.sessions),
+        notes=tuple(notes),
+    )
+    said = {name: METRICS[name][1] if name in METRICS else "of another package" for name in metrics}
+    named = (*(row for row, _ in rows), BoardRow(ANOTHER, "animal"))
+    return Alignments(named, tuple(columns), tuple(map(tuple, cells)), (card,), said)
+
+
+def joined(boards: Sequence[Alignments]) -> Alignments:
+    """Boards of the same rows side by side."""
+    return msgspec.structs.replace(
+        boards[0],
+        columns=tuple(column for board in boards for column in board.columns),
+        cells=tuple(sum(rows, ()) for rows in zip(*(b.cells for b in boards), strict=True)),
+        datasets=tuple(one for board in boards for one in board.datasets),
+    )
+
+
+def _cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
+    """A model's cell: of each animal the layer that is best on the others."""
+    values = np.array([[m.fit(trace) for m in measures] for trace in traces.values()])
+    values = values.reshape(len(traces), len(measures))
+    there = np.flatnonzero(np.isfinite(values).all(axis=1)) if len(measures) else np.empty(0, int)
+    shares = values[there] / [m.ceiling for m in measures]
+    scores, best = held_out(shares)
+    if not np.isfinite(scores).any():
+        return BoardCell()
+    names = [tuple(traces)[k] for k in there]
+    chosen = [names[k] for k in best]
+    raw = values[there][best, np.arange(len(measures))]
+    layer = max(set(chosen), key=chosen.count)
+    return BoardCell(float(scores.mean()), standard_error(scores), float(raw.mean()), layer)
+
+
+def _another(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
+    """The cell of animals as models of each other: each measured by all others, one at a time."""
+    scores, raw = [], []
+    for target, measure in animals:
+        found = [measure.fit(_as_layer(a)) for a, _ in animals if a is not target]
+        there = np.array([value for value in found if np.isfinite(value)])
+        if there.size:
+            scores.append(float(there.mean()) / measure.ceiling)
+            raw.append(float(there.mean()))
+    if not scores:
+        return BoardCell()
+    return BoardCell(float(np.mean(scores)), standard_error(scores), float(np.mean(raw)))
+
+
+def _as_layer(animal: Animal) -> Floats:
+    """An animal's mean responses, (6, bin, unit); without a time course the same in every bin."""
+    sessions = sessions_of(animal)
+    means = means_of(sessions, bins_of(sessions))
+    return np.repeat(means, LONGEST, axis=1) if means.shape[1] == 1 else means

@@ -1,0 +1,286 @@
+"""From recordings to a frozen benchmark."""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.benchmark import PROTOCOLS, Benchmark
+from tactile_rt.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
+from tactile_rt.alignment.neural import (
+    NeuralSession,
+    by_animal,
+    published_layout,
+    read_published,
+)
+from tactile_rt.alignment.nwb import Reading, find_nwb, read_nwb
+from tactile_rt.alignment.paper_code import freeze_paper_code
+from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, trial_mean
+from tactile_rt.alignment.selection import Selection
+from tactile_rt.alignment.strict import freeze_strict
+from tactile_rt.core.errors import ConfigError, name_some
+
+__all__ = ["animal_means", "build", "checked_sessions", "refuse_copies"]
+
+# Of the time that a build takes; the rest is bootstraps.
+READING = 0.8
+# Of two copies of a session.
+MOST = 0.5  # of the smaller one's trials or units
+FEWEST = 3  # of trials or units that say something
+
+
+def build(
+    inputs: Sequence[Path],
+    protocol: str = "strict",
+    bootstraps: int = BOOTSTRAPS,
+    seed: int = SEED,
+    progress: Callable[[float], None] = lambda share: None,
+    selection: Selection | None = None,
+    clock: str | None = None,
+) -> Benchmark:
+    """Freeze a benchmark from NWB files or from rates in the published layout.
+
+    Args:
+        inputs: NWB files and folders of them; or, for paper-code, one published ``.npz``.
+        protocol: ``strict`` or ``paper-code``.
+        progress: called with the share done, 0 to 1.
+        selection: which sessions and units of NWB files are kept; None for all.
+        clock: spike times are on the ``session``'s clock, as NWB has it and strict by default, or
+            on the ``recording``'s, as the published analysis has it and paper-code by default.
+
+    Returns:
+        A benchmark with a reliable animal at least. Its notes begin with what the clock's check
+        found, and say what was left out.
+
+    Raises:
+        ConfigError: recordings that cannot be used, and why: no animal is reliable, a session is
+            there twice, or, under strict, contacts show that spikes are on another clock.
+    """
+    if protocol not in PROTOCOLS:
+        raise ConfigError(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
+    if clock is not None and clock not in CLOCKS:
+        raise ConfigError(f"no clock {clock!r}: there are {', '.join(CLOCKS)}")
+    if not inputs:
+        raise ConfigError("name NWB files or a folder of them to build from")
+    if bootstraps < 1:
+        raise ConfigError(f"{bootstraps} bootstraps: at least one")
+    archives = [path for path in inputs if path.suffix == ".npz"]
+    if archives and len(inputs) > 1:
+        raise ConfigError(f"{archives[0]}: an .npz holds all animals: name nothing beside it")
+    if archives and protocol == "strict":
+        raise ConfigError(
+            f"{archives[0]}: its stimuli have no names, and trials that did not show a stimulus "
+            "count as zero: build with protocol paper-code, or strict from the NWB files"
+        )
+    if archives and (clock or str(selection or "")):
+        raise ConfigError(
+            f"{archives[0]}: holds rates, not spikes: neither a clock nor a selection of sessions "
+            "or units applies to it"
+        )
+
+    def reading(share: float) -> None:
+        progress(READING * share)
+
+    def splitting(share: float) -> None:
+        progress(READING + (1 - READING) * share)
+
+    if archives:
+        rates = read_published(archives[0])
+        made = freeze_paper_code(rates, bootstraps, seed, splitting)
+        units = sum(array.shape[2] for array in rates.values())
+        note = f"{archives[0].name}: {len(rates)} animals, {units} units"
+        made = replace(made, sources=(archives[0].name,), notes=(note, *made.notes))
+        _check_reliable(made)
+        return made
+    strict = protocol == "strict"
+    files = find_nwb(inputs)
+    sessions, notes = checked_sessions(files, strict, reading, clock, selection)
+    if strict:
+        made = freeze_strict(by_animal(sessions), bootstraps, seed, splitting)
+    else:
+        sessions = _complete(sessions, notes)
+        layouts = {animal.name: published_layout(animal) for animal in by_animal(sessions)}
+        made = freeze_paper_code(layouts, bootstraps, seed, splitting)
+    made = replace(
+        made,
+        sources=tuple(sorted(f.name for f in files)),
+        notes=(*notes, *made.notes),
+    )
+    _check_reliable(made)
+    return made
+
+
+def checked_sessions(
+    files: Sequence[Path],
+    strict: bool = True,
+    progress: Callable[[float], None] = lambda share: None,
+    clock: str | None = None,
+    selection: Selection | None = None,
+) -> tuple[list[NeuralSession], list[str]]:
+    """Sessions of NWB files whose clock is the one that contacts show, and none of them twice.
+
+    Args:
+        strict: rates count from first contact, and sessions of another clock are left out; else
+            from the start of the trial, and a note warns of them.
+        progress: called with the share done, 0 to 1.
+        clock, selection: as `build` has them.
+
+    Returns:
+        Sessions, and notes that begin with what the clock's check found.
+
+    Raises:
+        ConfigError: recordings that cannot be used, and why.
+    """
+    clock = clock or ("session" if strict else "recording")
+    window = "contact" if strict else "start"
+    readings, notes = read_nwb(files, window, progress, clock, selection or Selection())
+    readings, said = _clock_checked(readings, clock, strict)
+    tasks = {
+        task: len({r.session.animal for r in readings if r.task == task})
+        for task in sorted({r.task for r in readings})
+    }
+    if len(tasks) > 1:
+        pooled = " and ".join(f"{n} of {task}" for task, n in tasks.items())
+        notes.append(f"animals of two tasks are together, {pooled}: --task keeps one")
+    sessions = [reading.session for reading in readings]
+    refuse_copies(sessions)
+    return sessions, [*said, *notes]
+
+
+def _clock_checked(
+    readings: list[Reading], clock: str, strict: bool
+) -> tuple[list[Reading], list[str]]:
+    """Readings whose contacts do not speak against their clock, and what the check found."""
+    responses = [r.response for r in readings if r.response is not None]
+    if not responses:
+        return readings, [
+            WARNING + "the clock of the spikes is unchecked: no contacts, or no spikes"
+        ]
+    said = [said_of(responses, clock)]
+    wrong = [response for response in responses if response.elsewhere]
+    if not wrong:
+        return readings, said
+    why = _other(wrong, readings)
+    if strict and 2 * len(wrong) > len(responses):
+        raise ConfigError(f"{said[0].removeprefix(WARNING)}; {why}: see --clock")
+    if not strict:
+        return readings, [*said, WARNING + why]
+    names = {response.session for response in wrong}
+    kept = [r for r in readings if r.session.name not in names]
+    return kept, [*said, f"{WARNING}{why}: left out: {', '.join(sorted(names))}"]
+
+
+def _other(wrong: Sequence[ContactResponse], readings: Sequence[Reading]) -> str:
+    first = wrong[0]
+    return (
+        f"in {len(wrong)} of {len(readings)} sessions another offset fits contacts better: in "
+        f"{first.session} rates rise most (z = {first.other_z:.1f}) if {first.other_s:.3f} s is "
+        f"subtracted from spike times, and not {first.shift_s:.3f} s (z = {first.z:.1f})"
+    )
+
+
+def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[NeuralSession]:
+    """Sessions with every stimulus, which paper-code can place; the others are noted."""
+    kept = []
+    for session in sessions:
+        missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
+        if missing:
+            notes.append(
+                f"session {session.name} left out: it has no correct trial of {', '.join(missing)}"
+            )
+        else:
+            kept.append(session)
+    if not kept:
+        raise ConfigError(f"no session can be used: {name_some(notes, 1)}")
+    return kept
+
+
+def _check_reliable(made: Benchmark) -> None:
+    if not made.reliable:
+        found = name_some(
+            f"{t.name} {t.chosen.reliability:.2f} ({t.chosen.units} of {t.unfiltered.units} units)"
+            for t in made.targets
+        )
+        raise ConfigError(f"no animal is reliable enough to score on; reliabilities: {found}")
+
+
+def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
+    """Refuse recordings that hold a session twice, in another sorting or order, or units less.
+
+    Two copies of a session would be split into the same halves and agree with each other perfectly.
+    Two sessions are copies if they share most of their trials (when each began, and its stimulus),
+    or most of their units (how often which rate came with which stimulus), whatever the order.
+
+    Raises:
+        ConfigError: naming two sessions that are copies.
+    """
+    trials = [_count_trials(session) for session in sessions]
+    units = [_count_units(session) for session in sessions]
+    for j, later in enumerate(sessions):
+        for i, earlier in enumerate(sessions[:j]):
+            if _share_most(units[i], units[j]):
+                how = ""
+            elif _share_most(trials[i], trials[j]):
+                how = " with other units"
+            else:
+                continue
+            raise ConfigError(
+                f"sessions {earlier.name} and {later.name} hold the same trials{how}: "
+                "give one of them"
+            )
+
+
+def _share_most(one: Counter[bytes], other: Counter[bytes]) -> bool:
+    fewer = min(one.total(), other.total())
+    return fewer >= FEWEST and (one & other).total() > MOST * fewer
+
+
+def _count_trials(session: NeuralSession) -> Counter[bytes]:
+    """Count trials by when they began, to a ms, and their stimulus."""
+    if session.begin is None:
+        return Counter()
+    began = np.round(session.begin * 1e3).astype(np.int64)
+    return Counter(row.tobytes() for row in np.stack([began, session.stimulus], axis=1))
+
+
+def _count_units(session: NeuralSession) -> Counter[bytes]:
+    """Count units by their rates, sorted within stimuli; three rates at least."""
+    found: Counter[bytes] = Counter()
+    for rates in session.rates.T:
+        if len(np.unique(rates)) >= FEWEST:
+            order = np.lexsort((rates, session.stimulus))
+            found[session.stimulus[order].tobytes() + rates[order].tobytes()] += 1
+    return found
+
+
+def animal_means(path: Path) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
+    """Read the mean responses (6, unit) of animals, and notes on what was left out.
+
+    Args:
+        path: rates in the published layout, ``.npz``, as their authors publish them, mistakes
+            included (`neural.published_layout`); or an NWB file, or a folder of them.
+
+    Raises:
+        ConfigError: recordings that cannot be used, and why.
+    """
+    if path.suffix == ".npz":
+        return {name: trial_mean(rates) for name, rates in read_published(path).items()}, []
+    sessions, notes = checked_sessions(find_nwb([path]))
+    means = {}
+    for animal in by_animal(sessions):
+        whole = [s for s in animal.sessions if s.trials.min() > 0]
+        if not whole:
+            notes.append(f"animal {animal.name} left out: no session has every stimulus")
+            continue
+        means[animal.name] = np.concatenate(
+            [
+                np.stack([s.rates[s.stimulus == k].mean(axis=0) for k in range(len(STIMULI))])
+                for s in whole
+            ],
+            axis=1,
+        )
+    return means, notes

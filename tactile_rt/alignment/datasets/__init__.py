@@ -1,0 +1,102 @@
+"""Recordings that models are compared with, by name, each imported when it is asked for.
+
+A dataset says where its recordings come from (title, citation, license, size), and reads what its
+user downloaded or fetched: animals, and the input of the models if it is not the six stimuli that
+ship. Its six conditions stand on the axis of `STIMULI`, under names of their own. Recordings are
+never bundled. Datasets of other packages are found by the entry points
+``tactile_rt.alignment_datasets``.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+from tactile_rt.alignment.neural import Animal
+from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.alignment.stimuli_input import StimuliInput
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.packages import added, added_names
+from tactile_rt.core.settings import no_such
+
+__all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
+
+ENTRY_POINTS = "tactile_rt.alignment_datasets"  # of other packages
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetContents:
+    """What was read of a dataset.
+
+    Attributes:
+        stimuli: The input that models get for its conditions; None for the six stimuli that ship
+            or that the user names.
+    """
+
+    animals: tuple[Animal, ...]
+    stimuli: StimuliInput | None = None
+    notes: tuple[str, ...] = ()
+
+
+Reader = Callable[[Sequence[Path], StimuliInput, Callable[[float], None]], DatasetContents]
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralDataset:
+    """A public set of recordings, and how to read it.
+
+    Attributes:
+        name: The name that a user gives, such as the number of a DANDI set.
+        license: The SPDX name of its license; empty for a set of the user's own.
+        url: The address of its page; empty if there is none.
+        size: The size and the number of its files, in words.
+        conditions: The names of its six conditions, in the order of the stimulus axis.
+        about: Sentences on what is compared and what that leaves out.
+        read: The function that reads downloaded files or folders. It takes them, the input of the
+            six stimuli, and a function to call with the share done, 0 to 1, and raises
+            `ConfigError` where they cannot be used.
+        listing: The file beside `fetching` that lists the files of one version, of which
+            `align fetch` gets what is needed; empty if they must be downloaded.
+        counts: The mice and the units that the published analysis is of, which what is fetched is
+            held against; None where that is not known.
+    """
+
+    name: str
+    title: str
+    citation: str
+    license: str
+    url: str
+    size: str
+    about: str
+    read: Reader
+    conditions: tuple[str, ...] = STIMULI
+    listing: str = ""
+    counts: tuple[int, int] | None = None
+
+
+# name: where the dataset is
+DATASETS = {
+    "000231": f"{__name__}.rodgers:DANDI_000231",
+    "example": f"{__name__}.rodgers:EXAMPLE",
+}
+
+
+def dataset_names() -> tuple[str, ...]:
+    """All datasets that are installed, ours first."""
+    return (*DATASETS, *(name for name in added_names(ENTRY_POINTS) if name not in DATASETS))
+
+
+def find_dataset(name: str) -> NeuralDataset:
+    """A dataset by its name.
+
+    Raises:
+        ConfigError: no such dataset, or it cannot be loaded.
+    """
+    if name in DATASETS:
+        module, _, attribute = DATASETS[name].partition(":")
+        ours: NeuralDataset = getattr(import_module(module), attribute)
+        return ours
+    theirs: NeuralDataset | None = added(ENTRY_POINTS, name)
+    if theirs is None:
+        raise ConfigError(no_such("dataset", name, dataset_names()))
+    return theirs

@@ -1,0 +1,303 @@
+"""The sessions of a published dataset, by name, size and checksum, and what is needed of them.
+
+A session is gigabytes, of which its voltages are nearly all. What alignment reads, trials, contacts
+and spikes, is read from the archive's own files by HTTP ranges and written to small NWB files of
+the same structure, which everything else takes like whole ones.
+
+The list is of one version of the dataset, and its addresses are of one version of every file, so
+that whoever fetches gets the same.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+from urllib.request import getproxies
+
+from tactile_rt.alignment.nwb import read_nwb
+from tactile_rt.alignment.nwb_parts import (
+    COLUMNS,
+    CONTACTS,
+    EXPERIMENT,
+    LARGEST,
+    SUBJECT,
+    TRIALS,
+    WHISKER,
+    last_time,
+)
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import write_whole
+
+if TYPE_CHECKING:
+    import urllib3
+
+__all__ = [
+    "Fetched",
+    "PublishedFile",
+    "RangeFile",
+    "connections",
+    "counted",
+    "fetch",
+    "published_files",
+]
+
+UNITS = ("spike_times", "spike_times_index", "depth", "inhibitory")
+BLOCK = 1 << 16  # bytes
+KEPT = 1 << 10  # blocks
+PATIENCE_S = 60.0  # of a request that is answered with nothing
+AGAIN = 4  # times that a request is repeated, after 0, 1, 2 and 4 s
+BUSY = (429, 500, 502, 503, 504)
+
+
+def connections() -> "urllib3.PoolManager":
+    """Connections to servers, kept open from request to request, through the proxy that is set.
+
+    Raises:
+        ModuleNotFoundError: urllib3 is not installed.
+    """
+    import urllib3
+
+    again = urllib3.Retry(AGAIN, backoff_factor=0.5, status_forcelist=BUSY, raise_on_status=False)
+    proxy = getproxies().get("https")
+    if proxy:
+        return urllib3.ProxyManager(proxy, retries=again, timeout=PATIENCE_S)
+    return urllib3.PoolManager(retries=again, timeout=PATIENCE_S)
+
+
+class RangeFile(io.RawIOBase):
+    """Read a file of known size from a web server, by HTTP ranges.
+
+    Bytes come in blocks, which are kept: what HDF5 says of its data is small, read again and again,
+    and strewn over gigabytes. Blocks that are missing beside each other come by one request.
+    h5py swallows what its file raises and says something else; the first error stays in `error`.
+
+    Args:
+        pool: of `connections`.
+        url: of the file.
+        size: in bytes; a server that has another size has another file.
+
+    Attributes:
+        error: The first error of a request, in words; empty: none.
+        transferred: The bytes that came so far.
+    """
+
+    def __init__(self, pool: "urllib3.PoolManager", url: str, size: int) -> None:
+        self.error = ""
+        self.transferred = 0
+        self._pool, self._url, self._size = pool, url, size
+        self._blocks: dict[int, bytes] = {}
+        self._place = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._place = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._place}.get(whence, self._size)
+        return self._place
+
+    def tell(self) -> int:
+        return self._place
+
+    def readinto(self, buffer: "memoryview | bytearray") -> int:  # type: ignore[override]
+        wanted = memoryview(buffer).cast("B")
+        begin, end = self._place, min(self._place + len(wanted), self._size)
+        if begin >= end:
+            return 0
+        first, last = begin // BLOCK, (end - 1) // BLOCK
+        missing = [k for k in range(first, last + 1) if k not in self._blocks]
+        if missing:
+            self._fetch(missing[0], missing[-1])
+        data = b"".join(self._blocks[k] for k in range(first, last + 1))
+        wanted[: end - begin] = data[begin - first * BLOCK : end - first * BLOCK]
+        self._place = end
+        while len(self._blocks) > KEPT:
+            del self._blocks[next(iter(self._blocks))]
+        return end - begin
+
+    def _fetch(self, first: int, last: int) -> None:
+        """Get blocks, all between them included.
+
+        Raises:
+            ConfigError: the server did not give them.
+        """
+        import urllib3
+
+        begin, end = first * BLOCK, min((last + 1) * BLOCK, self._size)
+        try:
+            answer = self._pool.request(
+                "GET",
+                self._url,
+                headers={"Range": f"bytes={begin}-{end - 1}"},
+                preload_content=False,
+            )
+            try:
+                whole = answer.headers.get("Content-Range", "").rpartition("/")[2]
+                if answer.status in (206, 416) and whole != str(self._size):
+                    raise ConfigError(f"it has {whole or 'no'} bytes, and not {self._size}")
+                if answer.status == 200:
+                    raise ConfigError("the server sends whole files, no ranges")
+                if answer.status != 206:
+                    raise ConfigError(f"the server says {answer.status} {answer.reason or ''}")
+                data = answer.read()
+            except ConfigError:
+                answer.close()  # what it still sends would be taken for the next answer
+                raise
+            answer.release_conn()
+            if len(data) != end - begin:
+                raise ConfigError(f"{len(data)} bytes came where {end - begin} were asked for")
+        except (ConfigError, urllib3.exceptions.HTTPError) as error:
+            reason = str(getattr(error, "reason", error))  # of many tries, the last one
+            self.error = self.error or " ".join(reason.split())
+            raise ConfigError(self.error) from None
+        self.transferred += len(data)
+        for k in range(first, last + 1):
+            self._blocks[k] = data[k * BLOCK - begin : (k + 1) * BLOCK - begin]
+
+
+@dataclass(frozen=True)
+class PublishedFile:
+    """A session's file in an archive.
+
+    Attributes:
+        path: The path in the dataset, ``sub-231CR/sub-231CR_ses-20190921T144923_....nwb``.
+        size: Bytes.
+        sha256: The checksum of the whole file, hexadecimal.
+    """
+
+    path: str
+    size: int
+    sha256: str
+    url: str
+
+    @property
+    def name(self) -> str:
+        """The name of the file alone."""
+        return PurePosixPath(self.path).name
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What came of it.
+
+    Attributes:
+        files: The number of files that are in the folder now.
+        new: The number of those that were not there before.
+        transferred: The bytes that came over the network.
+    """
+
+    files: int
+    new: int
+    transferred: int
+
+
+def published_files(listing: str) -> tuple[PublishedFile, ...]:
+    """The files with spikes of a dataset, from the list of them that ships."""
+    text = resources.files(__package__).joinpath(listing).read_text("utf-8")
+    return tuple(
+        PublishedFile(row["path"], int(row["bytes"]), row["sha256"], row["url"])
+        for row in csv.DictReader(text.splitlines())
+    )
+
+
+def fetch(
+    files: Sequence[PublishedFile],
+    folder: Path,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Fetched:
+    """Write what alignment needs of some files to a folder, one small NWB file each.
+
+    What is there already stays, so that a fetch that broke off goes on.
+
+    Args:
+        folder: is made if it is not there.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigError: a file cannot be had, or is not the one that was published; those before it
+            are in the folder.
+        ModuleNotFoundError: h5py or urllib3 is not installed.
+    """
+    pool = connections()
+    new = transferred = 0
+    for done, file in enumerate(files, start=1):
+        path = folder / file.name
+        if not path.exists():
+            small, came = _needed(RangeFile(pool, file.url, file.size), file)
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(path, lambda out, small=small: out.write(small))  # type: ignore[misc]
+            new, transferred = new + 1, transferred + came
+        progress(done / len(files))
+    return Fetched(len(files), new, transferred)
+
+
+def counted(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
+    """Mice and units of sessions with valid trials, and notes on what was left out.
+
+    Raises:
+        ConfigError: none can be read.
+    """
+    readings, notes = read_nwb(paths, "start")
+    mice = {reading.session.animal for reading in readings}
+    return len(mice), sum(r.session.rates.shape[1] for r in readings), notes
+
+
+def _needed(remote: RangeFile, published: PublishedFile) -> tuple[bytes, int]:
+    """An NWB file of what is needed of another, and the bytes that came for it."""
+    import h5py
+
+    small = io.BytesIO()
+    try:
+        with h5py.File(remote, "r") as source, h5py.File(small, "w") as target:
+            for name in _columns(source):
+                _copy(source, target, name)
+            for name, end in _clocks(source):
+                target[name] = [end]
+            target.attrs["source"] = published.url
+            target.attrs["source_sha256"] = published.sha256
+    except Exception as error:  # of what a file over the network raises, h5py makes many things
+        reason = remote.error or " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{published.path} cannot be fetched: {reason}") from None
+    return small.getvalue(), remote.transferred
+
+
+def _columns(file: Any) -> Iterator[str]:
+    """Datasets that `nwb` reads, those that are there."""
+    yield from (name for name in (SUBJECT, EXPERIMENT) if name in file)
+    for table, columns in ((TRIALS, COLUMNS), ("units", UNITS)):
+        yield from (f"{table}/{c}" for c in columns if table in file and c in file[table])
+    yield from (
+        f"acquisition/{name}/starting_time"
+        for name, series in file.get("acquisition", {}).items()
+        if "starting_time" in series
+    )
+    for module in file.get("processing", {}).values():
+        yield from (
+            f"{table.name[1:]}/start_time"
+            for name, table in module.items()
+            if name.startswith(CONTACTS) and "start_time" in table
+        )
+
+
+def _clocks(file: Any) -> Iterator[tuple[str, float]]:
+    """Clocks of whiskers, millions of times, and the last time, which alone counts."""
+    for module in file.get("processing", {}).values():
+        for name, group in module.items():
+            end = last_time(group) if name.startswith(WHISKER) else None
+            if end is not None:
+                yield f"{group.name[1:]}/angle/timestamps", end
+
+
+def _copy(source: Any, target: Any, name: str) -> None:
+    data, (place, _, leaf) = source[name], name.rpartition("/")
+    if data.size * max(data.dtype.itemsize, 1) > LARGEST:
+        raise ConfigError(f"{name} has {data.size} values, more than a session can have")
+    group = target.require_group(place)
+    source.copy(data, group, leaf)
+    if "neurodata_type" in data.parent.attrs:  # by which the recording is known among series
+        group.attrs["neurodata_type"] = data.parent.attrs["neurodata_type"]

@@ -1,0 +1,147 @@
+"""A made-up brain with known truth, to try the benchmark on and to measure it with.
+
+- *Geometry.* Six stimuli are points in a space of `FEATURES` features, placed by distance, by shape
+  and at random. A mouse's features are this shared geometry, but for a share `private` of their
+  variance, which is its own.
+- *Units* mix the features with weights of their own into the logarithm of a firing rate. Spikes
+  are Poisson, and all units of a trial share a gain that varies from trial to trial.
+- *Damage.* A model that lost a share d of what is shared has private variance in its place. At
+  d = 0 it is another mouse, at d = 1 it shares nothing.
+
+Every random number comes from one seed.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import DISTANCES, SHAPES, STIMULI
+from tactile_rt.core.errors import ConfigError
+
+__all__ = ["MODELS", "Brain", "example_models"]
+
+Floats = NDArray[np.float64]
+
+FEATURES = 6
+# Of a unit: the middle of the rates in spikes per second, the spread of their logarithm over units.
+MIDDLE_HZ, SPREAD = 5.0, 0.8
+GAIN_SHAPE = 8.0  # of the gamma distribution of a trial's gain: a standard deviation of 35 %
+# Layers of a model, each by the share of its variance that comes from its own geometry: the first
+# is random, the last is the best.
+LAYERS = (0.0, 0.4, 0.7, 1.0)
+LAYER_UNITS = 200
+# The example's models: the share of the shared variance that each has lost.
+MODELS = {"another-mouse": 0.0, "lost-25": 0.25, "lost-50": 0.5, "random": 1.0}
+
+
+@dataclass(frozen=True)
+class Brain:
+    """Who is recorded, and how much of it is shared.
+
+    Attributes:
+        sessions: The number of sessions of each mouse; each records units of its own.
+        trials: The number of trials of each of the six stimuli in each session.
+        private: The share of the variance of a mouse's features that is its own, 0 to 1.
+        tuning: The standard deviation over stimuli of the logarithm of a unit's rate.
+        distance, shape, own: The weights of the three parts of the shared geometry: distance,
+            shape, and what is particular to each stimulus.
+    """
+
+    mice: int = 11
+    sessions: int = 2
+    units: int = 45
+    trials: int = 40
+    private: float = 0.15
+    tuning: float = 0.32
+    distance: float = 1.0
+    shape: float = 0.5
+    own: float = 0.7
+
+    def __post_init__(self) -> None:
+        for name in ("mice", "sessions", "units", "trials"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name}: at least 1, not {getattr(self, name)}")
+        if not 0 <= self.private <= 1:
+            raise ConfigError(f"private: a share from 0 to 1, not {self.private}")
+
+    def geometry(self, rng: np.random.Generator) -> Floats:
+        """The shared geometry (6, feature): zero mean over stimuli, mean square one."""
+        shape = np.repeat([-1.0, 1.0], len(DISTANCES))[:, None]
+        distance = np.tile([-1.0, 0.0, 1.0], len(SHAPES))[:, None]
+        return _standard(
+            self.distance * distance * rng.normal(size=FEATURES)
+            + self.shape * shape * rng.normal(size=FEATURES)
+            + self.own * rng.normal(size=(len(STIMULI), FEATURES))
+        )
+
+    def features(self, rng: np.random.Generator, shared: Floats, lost: float = 0.0) -> Floats:
+        """Features (6, feature) of one more mouse that lost a share of what is shared."""
+        kept = (1 - self.private) * (1 - lost)
+        own = _standard(rng.normal(size=shared.shape))
+        return np.asarray(np.sqrt(kept) * shared + np.sqrt(1 - kept) * own)
+
+    def rates(self, rng: np.random.Generator, features: Floats, units: int) -> Floats:
+        """Rates (6, unit) in spikes per second, without noise, of units drawn anew."""
+        weights = rng.normal(size=(features.shape[1], units)) / np.sqrt(features.shape[1])
+        level = np.log(MIDDLE_HZ) + SPREAD * rng.normal(size=units)
+        return np.asarray(np.exp(level + self.tuning * features @ weights))
+
+    def animals(self, rng: np.random.Generator, shared: Floats) -> tuple[Animal, ...]:
+        """Mice whose trials last a second each, without the detour over files."""
+        return tuple(
+            self.animal(rng, self.features(rng, shared), f"mouse-{k + 1:02d}")
+            for k in range(self.mice)
+        )
+
+    def animal(self, rng: np.random.Generator, features: Floats, name: str) -> Animal:
+        """One mouse of given features, recorded."""
+        sessions = []
+        for k in range(self.sessions):
+            rates = self.rates(rng, features, self.units)
+            stimulus = rng.permutation(np.repeat(np.arange(len(STIMULI)), self.trials))
+            spikes = rng.poisson(rates[stimulus] * gains(rng, len(stimulus))[:, None])
+            sessions.append(NeuralSession(name, f"{name}-{k + 1}", spikes.astype(float), stimulus))
+        return Animal(name, tuple(sessions))
+
+    def model(self, rng: np.random.Generator, features: Floats) -> dict[str, Floats]:
+        """Layers of a model of given features, by name: responses (6, unit) without noise."""
+        base = self.rates(rng, features, LAYER_UNITS)
+        return {
+            f"encoder.layer{k}": _blend(base, _like(rng, base), kept)
+            for k, kept in enumerate(LAYERS)
+        }
+
+
+def example_models(
+    brain: Brain, rng: np.random.Generator, shared: Floats
+) -> Mapping[str, dict[str, Floats]]:
+    """Models of known truth by name (`MODELS`): what share of the shared variance each has lost."""
+    return {
+        name: brain.model(rng, brain.features(rng, shared, lost)) for name, lost in MODELS.items()
+    }
+
+
+def gains(rng: np.random.Generator, trials: int) -> Floats:
+    """The gain of every trial (trial,), mean one."""
+    return rng.gamma(GAIN_SHAPE, 1 / GAIN_SHAPE, size=trials)
+
+
+def _standard(values: Floats) -> Floats:
+    centred = values - values.mean(axis=0)
+    return np.asarray(centred / np.sqrt((centred**2).mean()))
+
+
+def _like(rng: np.random.Generator, rates: Floats) -> Floats:
+    """Random responses that vary over stimuli as much as given ones, about the same levels."""
+    level = rates.mean(axis=0)
+    spread = np.sqrt(((rates - level) ** 2).mean())
+    return np.asarray(level + spread * _standard(rng.normal(size=rates.shape)))
+
+
+def _blend(rates: Floats, others: Floats, kept: float) -> Floats:
+    level = rates.mean(axis=0)
+    mixed = level + np.sqrt(kept) * (rates - level) + np.sqrt(1 - kept) * (others - level)
+    return np.asarray(mixed)

@@ -1,0 +1,300 @@
+"""The made-up brain as files: sessions in NWB as the recordings have them, and models to score.
+
+A trial lasts four seconds. Whiskers touch a few times between its first contact and the choice.
+From `LATENCY_S` after first contact to the choice a unit fires at the rate that the stimulus asks
+for, most of it just after each contact; without contact, at a third of its mean rate. Spikes are on
+the session's clock, as NWB has it: the electrical recording begins at `BEGIN_S` on that clock, and
+there are no spikes before.
+"""
+
+import json
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactile_rt.alignment.example import MODELS, Brain, example_models, gains
+from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import whole_folder
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["write_example"]
+
+Floats = NDArray[np.float64]
+
+TRIAL_S = 4.0
+FIRST_S, BEGIN_S = 5.9, 10.03  # when the first trial and the electrical recording begin
+CONTACT_S, CHOICE_S = (0.8, 1.2), (0.8, 1.2)  # first contact after the start; choice after contact
+CONTACTS = 3  # in a trial, on average, after the first
+LATENCY_S, BURST_S = 0.005, 0.035  # from contact to the burst that it causes, and how long that is
+BURST = 3.0  # a burst's rate, beside what a unit fires between bursts
+REST = 1 / 3  # of a unit's mean rate, without contact
+WRONG = 12  # trials that end in error, of every session; they do not count
+SAMPLING_HZ, WHISKER_HZ = 30_000.0, 200.0
+WHISKERS = ("C0", "C1", "C2", "C3")
+DATE = "2020-01-01T00:00:00+00:00"
+DEPTHS_UM = (100.0, 1100.0)
+INHIBITORY = 0.2  # of the units
+
+
+def write_example(
+    folder: Path,
+    brain: Brain,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> tuple[Path, Path]:
+    """Write recordings of a made-up brain, and models of known truth.
+
+    Args:
+        folder: is made; it must not be there yet.
+        seed: of every random number in it, 0 or more.
+        progress: called with the share done, 0 to 1.
+
+    Returns:
+        The folder of NWB files, one a session, and the folder of models, ``.npz`` of responses
+        (6, unit) by layer. ``truth.json`` beside them says what was made.
+
+    Raises:
+        ConfigError: the folder is there, or the seed is below 0.
+        ModuleNotFoundError: h5py is not installed.
+        OSError: naming `folder`: the medium is full.
+    """
+    import h5py
+
+    if seed < 0:
+        raise ConfigError(f"a seed is at least 0, not {seed}")
+    if folder.exists():
+        raise ConfigError(f"{folder} is there already: name a new folder")
+    truth, models, mice = (np.random.default_rng([seed, part]) for part in range(3))
+    shared = brain.geometry(truth)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with whole_folder(folder) as made:
+        for part in ("recordings", "models"):
+            (made / part).mkdir()
+        for name, layers in example_models(brain, models, shared).items():
+            np.savez(made / "models" / f"{name}.npz", **layers)  # type: ignore[arg-type]
+        for k in range(brain.mice):
+            name = f"mouse-{k + 1:02d}"
+            features = brain.features(mice, shared)
+            home = made / "recordings" / f"sub-{name}"
+            home.mkdir()
+            for j in range(brain.sessions):
+                path = home / f"sub-{name}_ses-{j + 1}_behavior+ecephys.nwb"
+                rates = brain.rates(mice, features, brain.units)
+                whole = BytesIO()  # of a full disk HDF5 tells in dozens of lines, and no OSError
+                with h5py.File(whole, "w") as file:
+                    _session(file, mice, name, rates, brain.trials)
+                path.write_bytes(whole.getbuffer())
+                progress((k * brain.sessions + j + 1) / (brain.mice * brain.sessions))
+        told = {"brain": asdict(brain), "seed": seed, "lost": MODELS, "shared": shared.tolist()}
+        (made / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
+    return folder / "recordings", folder / "models"
+
+
+def _session(
+    file: "h5py.File", rng: np.random.Generator, animal: str, rates: Floats, trials: int
+) -> None:
+    """One session of units of given rates (6, unit), spikes per second."""
+    n = len(STIMULI) * trials + WRONG
+    stimulus = rng.permutation(np.resize(np.arange(len(STIMULI)), n))
+    correct = np.zeros(n, dtype=np.bool_)
+    for k in range(len(STIMULI)):  # as many correct trials of each as were asked for
+        correct[rng.permutation(np.flatnonzero(stimulus == k))[:trials]] = True
+    start = FIRST_S + TRIAL_S * np.arange(n)
+    first = start + rng.uniform(*CONTACT_S, size=n)
+    choice = first + rng.uniform(*CHOICE_S, size=n)
+    later = [
+        np.sort(rng.uniform(a + 0.1, b - 0.05, rng.poisson(CONTACTS)))
+        for a, b in zip(first, choice, strict=True)
+    ]
+    contacts = [np.concatenate([[a], more]) for a, more in zip(first, later, strict=True)]
+    end = float(start[-1] + TRIAL_S)
+    shapes, places = zip(*(STIMULI[s].split("-") for s in stimulus), strict=True)
+
+    _head(file, animal)
+    columns: dict[str, ArrayLike] = {
+        "start_time": start,
+        "stop_time": start + TRIAL_S,
+        "choice_time": choice,
+        "outcome": np.where(correct, "correct", "error"),
+        "stimulus": shapes,
+        "servo_position": places,
+        "ignore_trial": np.zeros(n, dtype=np.bool_),
+    }
+    _table(file, "intervals/trials", columns, "TimeIntervals", "trials")
+    whiskers = rng.integers(len(WHISKERS), size=n)
+    _whiskers(file, contacts, whiskers, end)
+    gain = gains(rng, n)
+    spikes = [
+        _spikes(rng, rates[stimulus, unit] * gain, rates[:, unit].mean(), contacts, choice, end)
+        for unit in range(rates.shape[1])
+    ]
+    _units(file, rng, spikes)
+
+
+def _spikes(
+    rng: np.random.Generator,
+    rate: Floats,
+    mean: float,
+    contacts: list[Floats],
+    choice: Floats,
+    end: float,
+) -> Floats:
+    """A unit's spike times, s: at rate (trial,) from contact to choice, else at `REST`."""
+    begin = np.array([times[0] for times in contacts]) + LATENCY_S
+    bursts = np.array([len(times) for times in contacts]) * BURST_S
+    # Rates keep their mean: what bursts have more, the time between them has less.
+    calm = rate / (1 + (BURST - 1) * bursts / (choice - begin))
+    parts = [
+        _drawn(rng, begin, choice - begin, calm),
+        _drawn(
+            rng,
+            np.concatenate(contacts) + LATENCY_S,
+            np.full(sum(map(len, contacts)), BURST_S),
+            np.repeat((BURST - 1) * calm, [len(times) for times in contacts]),
+        ),
+        _drawn(
+            rng,
+            np.concatenate([[0], choice]),
+            np.diff(np.stack([np.concatenate([[0], choice]), np.append(begin, end)]), axis=0)[0],
+            np.full(len(choice) + 1, REST * mean),
+        ),
+    ]
+    times: Floats = np.sort(np.round(np.concatenate(parts) * SAMPLING_HZ) / SAMPLING_HZ)
+    return times[times >= BEGIN_S]
+
+
+def _drawn(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
+    """Poisson spikes at given rates in windows, (window,) each."""
+    number = rng.poisson(rate * length)
+    spikes: Floats = np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
+    return spikes
+
+
+# NWB 2, as far as its readers need it.
+
+
+def _typed(what: Any, kind: str, namespace: str = "core", **attributes: Any) -> Any:
+    what.attrs["neurodata_type"] = kind
+    what.attrs["namespace"] = namespace
+    whose = f"{Path(what.file.filename).name}{what.name}"
+    what.attrs["object_id"] = str(uuid.uuid5(uuid.NAMESPACE_URL, whose))
+    for name, value in attributes.items():
+        what.attrs[name] = value
+    return what
+
+
+def _group(file: "h5py.File", name: str, kind: str, **attributes: Any) -> Any:
+    return _typed(file.require_group(name), kind, **attributes)
+
+
+def _text(values: ArrayLike) -> Any:
+    return np.array(values, dtype=np.object_)
+
+
+def _head(file: "h5py.File", animal: str) -> None:
+    import h5py
+
+    _typed(file, "NWBFile", nwb_version="2.7.0")
+    file["identifier"] = Path(file.filename).name
+    file["session_description"] = "made up: a synthetic session of known truth"
+    file["session_start_time"] = file["timestamps_reference_time"] = DATE
+    file["file_create_date"] = _text([DATE])
+    for name in ("acquisition", "analysis", "general", "intervals", "processing", "stimulus"):
+        file.create_group(name)
+    for name in ("stimulus/presentation", "stimulus/templates"):
+        file.create_group(name)
+    subject = _group(file, "general/subject", "Subject")
+    subject["subject_id"], subject["species"] = animal, "none: synthetic"
+    _group(file, "general/devices/probe", "Device", description="none: synthetic")
+    shank = _group(file, "general/extracellular_ephys/shank", "ElectrodeGroup",
+                   description="none: synthetic", location="barrel cortex")  # fmt: skip
+    shank["device"] = h5py.SoftLink("/general/devices/probe")
+    electrodes = _table(
+        file,
+        "general/extracellular_ephys/electrodes",
+        {"location": ["barrel cortex"], "group_name": ["shank"]},
+        "DynamicTable",
+        "the one electrode",
+        more=("group",),
+    )
+    references = np.array([shank.ref], dtype=h5py.ref_dtype)
+    _typed(electrodes.create_dataset("group", data=references, dtype=h5py.ref_dtype),
+           "VectorData", "hdmf-common", description="group")  # fmt: skip
+    series = _group(file, "acquisition/extracellular array recording", "ElectricalSeries",
+                    description="not kept", comments="no comments")  # fmt: skip
+    data = series.create_dataset("data", data=np.zeros((1, 1)))
+    data.attrs.update(unit="volts", conversion=1.0, offset=0.0, resolution=-1.0)
+    start = series.create_dataset("starting_time", data=BEGIN_S)
+    start.attrs.update(rate=SAMPLING_HZ, unit="seconds")
+    region = series.create_dataset("electrodes", data=np.zeros(1, dtype=np.int64))
+    _typed(region, "DynamicTableRegion", "hdmf-common", description="all", table=electrodes.ref)
+
+
+def _table(
+    file: "h5py.File",
+    name: str,
+    columns: Mapping[str, ArrayLike],
+    kind: str,
+    description: str,
+    more: tuple[str, ...] = (),
+) -> Any:
+    """A table of columns by name; `more` are added by whoever asks for them."""
+    namespace = "hdmf-common" if kind == "DynamicTable" else "core"
+    table = _typed(file.require_group(name), kind, namespace, description=description,
+                   colnames=_text([*columns, *more]))  # fmt: skip
+    rows = 0
+    for column, values in columns.items():
+        array = np.asarray(values)
+        rows = len(array)
+        stored = _text(array) if array.dtype.kind == "U" else array
+        data = table.create_dataset(column, data=stored)
+        _typed(data, "VectorData", "hdmf-common", description=column)
+    identity = table.create_dataset("id", data=np.arange(rows))
+    _typed(identity, "ElementIdentifiers", "hdmf-common")
+    return table
+
+
+def _whiskers(
+    file: "h5py.File", contacts: list[Floats], whisker: NDArray[np.int64], end: float
+) -> None:
+    _group(file, "processing/behavior", "ProcessingModule", description="whiskers")
+    for k, name in enumerate(WHISKERS):
+        own = [times for times, w in zip(contacts, whisker, strict=True) if w == k]
+        times = np.concatenate([np.empty(0), *own])
+        columns = {"start_time": times, "stop_time": times + 0.02}
+        where = f"processing/behavior/contacts_by_whisker_{name}"
+        _table(file, where, columns, "TimeIntervals", "contacts")
+        where = f"processing/behavior/processed_position_whisker_{name}"
+        _group(file, where, "CompassDirection")
+        angle = _group(file, f"{where}/angle", "SpatialSeries",
+                       description="not kept", comments="no comments")  # fmt: skip
+        # Two samples say how long the video lasted.
+        data = angle.create_dataset("data", data=np.zeros(2))
+        data.attrs.update(unit="degrees", conversion=1.0, offset=0.0, resolution=-1.0)
+        clock = angle.create_dataset("timestamps", data=[0.0, end + 1 / WHISKER_HZ])
+        clock.attrs.update(interval=1, unit="seconds")
+        angle["reference_frame"] = "face"
+
+
+def _units(file: "h5py.File", rng: np.random.Generator, spikes: list[Floats]) -> None:
+    number = len(spikes)
+    columns = {
+        "depth": rng.uniform(*DEPTHS_UM, size=number),
+        "inhibitory": rng.random(number) < INHIBITORY,
+    }
+    table = _table(file, "units", columns, "Units", "made-up units", more=("spike_times",))
+    times = table.create_dataset(
+        "spike_times", data=np.concatenate(spikes), compression="gzip", shuffle=True
+    )
+    _typed(times, "VectorData", "hdmf-common", description="spike times, s")
+    ends = table.create_dataset("spike_times_index", data=np.cumsum([len(s) for s in spikes]))
+    _typed(ends, "VectorIndex", "hdmf-common", description="ends", target=times.ref)

@@ -1,0 +1,120 @@
+"""Whether an exported model represents the stimuli as the model that it was made from.
+
+Needs no neural data: two files of one network, six stimuli, and the RDM of every layer in both.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tactile_rt.alignment.gate import FAIL, INCONCLUSIVE, PASS, Check
+from tactile_rt.alignment.layers import Layers
+from tactile_rt.alignment.rdm import pearson, rdm
+from tactile_rt.alignment.stimuli_input import StimuliInput
+
+__all__ = ["LayerFidelity", "compare", "export_layers", "fidelity_check"]
+
+OUTPUT = "output"
+LEAST_PEARSON = {"fp32": 0.9999}
+REDUCED_PEARSON = 0.98  # of any other precision
+LARGEST_DIFFERENCE = 1e-5
+FLAT = 1e-6  # an RDM that spans less says nothing: of two classes the output's may be all zeros
+
+
+@dataclass(frozen=True)
+class LayerFidelity:
+    """One layer in both models.
+
+    Attributes:
+        layer: The name of the layer; `OUTPUT` is what the model decides with.
+        pearson: The correlation of the two RDMs of the layer; NaN if one has none, or both are
+            flat.
+        difference: The largest difference between the two (6, unit) responses, as a share of the
+            reference's largest response where that is above 1; infinite for another number of
+            units.
+        kept: Whether both figures are within the bars of the precision.
+    """
+
+    layer: str
+    pearson: float
+    difference: float
+    kept: bool
+
+
+def compare(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
+    """Every layer that both have, and the output."""
+    ours, theirs = reference.patterns, exported.patterns
+    begin = reference.first.get("decoder.logits", 0)
+    for layers, patterns in ((reference, ours), (exported, theirs)):
+        patterns[OUTPUT] = layers.logits[:, begin:].mean(axis=1, dtype=np.float64)
+    return tuple(
+        _compared(name, ours[name], theirs[name], exported.precision)
+        for name in ours
+        if name in theirs
+    )
+
+
+def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[LayerFidelity, ...]]:
+    """Test 4 of the gate, and every layer's figures."""
+    rows = compare(reference, exported)
+    layers = [row for row in rows if row.layer != OUTPUT]
+    missing = [name for name in reference.traces if name not in exported.traces]
+    bad = [row for row in rows if not row.kept]
+    bar = LEAST_PEARSON.get(exported.precision, REDUCED_PEARSON)
+    what = f"{exported.precision}: RDM correlation at least {bar}"
+    if exported.precision == "fp32":
+        what += f" and responses within {LARGEST_DIFFERENCE:.0e}"
+    if bad:
+        worst = min(bad, key=lambda row: (np.nan_to_num(row.pearson, nan=-1.0), -row.difference))
+        why = (
+            f"{len(bad)} of {len(rows)} taps miss it, {worst.layer} by most: correlation "
+            f"{worst.pearson:.6f}, difference {worst.difference:.1e}"
+        )
+        return Check("fidelity", FAIL, f"{what}; {why}"), rows
+    if missing:
+        what += f"; {len(missing)} layers could not be compared ({', '.join(missing[:4])}, ...)"
+    if not layers:
+        return Check("fidelity", INCONCLUSIVE, f"{what}; no layer but the output"), rows
+    return Check("fidelity", PASS, f"{what}; kept by {len(rows)} taps{_closest(rows)}"), rows
+
+
+def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layers:
+    """Read the layers of an ONNX file for a comparison with a reference.
+
+    Raises:
+        ModelError, ConfigError: as `onnx_activations.onnx_layers`.
+    """
+    from tactile_rt.alignment.onnx_activations import onnx_layers
+
+    exported, _ = onnx_layers(path, stimuli)
+    # The reference knows from which step on a layer counts; of a file that is found by what differs
+    # in it, which in a network that hardly responds is less than single precision can tell.
+    known = {k: step for k, step in reference.first.items() if k in exported.traces}
+    return replace(exported, first={**exported.first, **known})
+
+
+def _compared(name: str, a: np.ndarray, b: np.ndarray, precision: str) -> LayerFidelity:
+    if a.shape != b.shape:
+        return LayerFidelity(name, float("nan"), float("inf"), False)
+    one, other = rdm(a), rdm(b)
+    flat = np.ptp(one) < FLAT and np.ptp(other) < FLAT
+    r = float("nan") if flat else float(pearson(one, other))
+    difference = float(np.abs(a - b).max() / max(1.0, np.abs(a).max()))
+    bar = LEAST_PEARSON.get(precision, REDUCED_PEARSON)
+    none = not (np.isfinite(one).all() or np.isfinite(other).all())
+    same = r >= bar or none or flat
+    near = difference <= LARGEST_DIFFERENCE or precision != "fp32"
+    return LayerFidelity(name, r, difference, bool(same and near and np.isfinite(difference)))
+
+
+def _closest(rows: Sequence[LayerFidelity]) -> str:
+    there = [row for row in rows if np.isfinite(row.pearson)]
+    if not there:
+        return ""
+    least = min(there, key=lambda row: row.pearson)
+    return (
+        f", the least alike {least.layer}: correlation {least.pearson:.6f}, largest difference "
+        f"{max(row.difference for row in rows):.1e}"
+    )

@@ -1,0 +1,204 @@
+"""Layers of any model file: a checkpoint, an ONNX file, or responses computed elsewhere."""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from tactile_rt.alignment.layers import PARTS, Layers
+from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.alignment.stimuli_input import StimuliInput
+from tactile_rt.classifier.model_file import read_model
+from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.models.checkpoint_files import describe_checkpoint
+
+__all__ = [
+    "RESPONSES",
+    "check_models",
+    "load_layers",
+    "load_untrained",
+    "responses_layers",
+    "told_apart",
+]
+
+CHECKPOINT, BEST = ".pt", "best.pt"
+OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
+FIGURES = re.compile(r"(test_|validation_)?top1")
+
+
+def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
+    """Refuse what is no model file before the first is scored, and before torch is loaded.
+
+    Returns:
+        What to call each: what a file calls itself; a training run by its folder, one of a grid by
+        its task, and where runs are alike in that, by as many folders as tell them apart. What is
+        called alike all the same is told apart as `told_apart` has it.
+
+    Raises:
+        ModelError, ConfigError: one is not such a file.
+    """
+    names: list[str] = []
+    runs = {path: path.resolve().parent for path in paths if path.name == BEST}
+    called = {folder: _run_name(folder) for folder in runs.values()}
+    depth = 1
+    while len(set(called.values())) < len(called):
+        depth += 1
+        called = {folder: "/".join(folder.parts[-depth:]) for folder in called}
+    for path in paths:
+        own = _own_name(path)
+        names.append(called[runs[path]] if path in runs else own)
+    return told_apart(names, paths)
+
+
+def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of which no two are alike: what is called as one before has its file beside its name.
+
+    The file has as many folders as it takes, and one that is named again a number.
+    """
+    found: list[str] = []
+    for k, (name, path) in enumerate(zip(names, paths, strict=True)):
+        alike = [o.resolve().parts for n, o in zip(names[:k], paths[:k], strict=True) if n == name]
+        called = name
+        if name in found:
+            mine = path.resolve().parts
+            depths = range(1, len(mine) + 1)
+            differ = (d for d in depths if all(mine[-d:] != other[-d:] for other in alike))
+            called = f"{name} ({Path(*mine[-next(differ, 1) :])})"
+        again = (f"{called[:-1]}, {number})" for number in count(2))
+        found.append(called if called not in found else next(a for a in again if a not in found))
+    return tuple(found)
+
+
+def _run_name(folder: Path) -> str:
+    return folder.parent.name if (folder / OF_GRID).exists() else folder.name
+
+
+def _own_name(path: Path) -> str:
+    if path.suffix == RESPONSES:
+        return responses_layers(path).name
+    if path.suffix == ".npy":
+        raise ModelError(f"{path}: name responses by layer, in an .npz: numpy.savez")
+    if path.suffix == CHECKPOINT:
+        describe_checkpoint(path)
+        return path.stem
+    return read_model(path)[0].name
+
+
+def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float, str] | None]:
+    """Layers, and the model's accuracy on its task with what it was measured on, where known.
+
+    Raises:
+        ModelError: not such a file.
+        ConfigError: the stimuli are of another array.
+    """
+    if path.suffix == CHECKPOINT:
+        from tactile_rt.alignment.activations import checkpoint_layers
+
+        layers, saved = checkpoint_layers(path, stimuli)
+        return layers, _accuracy(saved.get("metrics", {}))
+    if path.suffix == RESPONSES:
+        return responses_layers(path), None
+    from tactile_rt.alignment.onnx_activations import onnx_layers
+
+    layers, card = onnx_layers(path, stimuli)
+    return layers, _accuracy(card.figures) if card else None
+
+
+def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
+    """Layers of a model's network before training: of the same architecture, with random weights.
+
+    An ONNX file knows its architecture by the card in its metadata. None for responses, and for a
+    card that does not name its network.
+
+    Raises:
+        ModelError: not such a file.
+        ConfigError: a seed below 0.
+    """
+    if path.suffix == RESPONSES:
+        return None
+    if seed < 0:
+        raise ConfigError(f"a seed is at least 0, not {seed}")
+    from tactile_rt.alignment.activations import (
+        untrained_card_layers,
+        untrained_layers,
+    )
+
+    if path.suffix == CHECKPOINT:
+        from tactile_rt.models.checkpoints import load_checkpoint
+
+        return untrained_layers(load_checkpoint(path)[1], stimuli, seed)
+    return untrained_card_layers(read_model(path, None)[0], stimuli, seed)
+
+
+def _accuracy(figures: object) -> tuple[float, str] | None:
+    if not isinstance(figures, dict):
+        return None
+    for key in sorted(k for k in figures if isinstance(k, str) and FIGURES.fullmatch(k)):
+        value = figures[key]
+        if isinstance(value, int | float) and 0 <= value <= 1:
+            return float(value), key.replace("_", " ").replace("top1", "top-1")
+    return None
+
+
+RESPONSES = ".npz"
+NUMBERS = "fiu"
+LARGEST = np.finfo(np.float32).max
+
+
+def responses_layers(path: Path) -> Layers:
+    """Layers of a file of responses.
+
+    Args:
+        path: ``.npz``; each array is a layer, (6, unit) or (6, step, unit), its stimuli in the
+            order of `STIMULI`. A layer whose name does not begin with ``encoder.``, ``attender.``
+            or ``decoder.`` is one of the encoder's.
+
+    Raises:
+        ConfigError: no such file, an array that is no layer, by name, or two that are one layer.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    traces = {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            for name in archive.files:
+                array = archive[name]
+                if (
+                    array.dtype.kind not in NUMBERS
+                    or array.ndim not in (2, 3)
+                    or array.shape[0] != len(STIMULI)
+                    or 0 in array.shape
+                    or array.shape[-1] < 2
+                    or not (np.abs(array) <= LARGEST).all()
+                ):
+                    raise ConfigError(
+                        f"{path}: array {name} ({array.dtype}, {array.shape}) is no layer: finite "
+                        f"numbers ({len(STIMULI)} stimuli, 2 or more units)"
+                    )
+                part, dot, _ = name.partition(".")
+                full = name if dot and part in PARTS else f"encoder.{name}"
+                if full in traces:
+                    short = full.removeprefix("encoder.")
+                    raise ConfigError(f"{path}: arrays {short} and {full} are one layer: name one")
+                traces[full] = (array if array.ndim == 3 else array[:, None]).astype(np.float32)
+    except ConfigError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path}: no archive of arrays ({reason})") from None
+    if not traces:
+        raise ConfigError(f"{path}: has no array, so no layer")
+    return Layers(
+        name=path.stem,
+        traces=traces,
+        first=dict.fromkeys(traces, 0),
+        logits=np.zeros((len(STIMULI), 1, 0), dtype=np.float32),
+        parameters=0,
+        sha256=hashlib.sha256(content).hexdigest(),
+        notes=("responses computed elsewhere",),
+    )

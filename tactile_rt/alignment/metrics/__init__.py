@@ -1,0 +1,103 @@
+"""Metrics: how like a layer and an animal are, beside what the noise of the recording lets through.
+
+A metric is one function. It takes an animal and gives its `Measure`: the value that a perfect model
+is expected to reach (the ceiling), and a function that measures a layer. Whatever depends on the
+animal alone is thus computed once for all layers and models. Metrics of other packages are found
+by the entry points ``tactile_rt.alignment_metrics``.
+
+halves      means of random halves of the trials, over which ceilings are estimated
+geometry    rsa, rsa-time and cka: the similarity of two geometries
+crossnobis  distances that noise does not lengthen
+linear      what a linear readout of a layer predicts of every unit
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.neural import Animal
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.packages import added, added_names
+from tactile_rt.core.settings import no_such
+
+__all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "metric_names"]
+
+Floats = NDArray[np.float64]
+
+ENTRY_POINTS = "tactile_rt.alignment_metrics"  # of other packages
+# Of a correlation: with a lower one the correction for noise would more than double a value.
+MINIMUM_CEILING = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """What a metric makes of one animal.
+
+    Attributes:
+        ceiling: The value that a perfect model is expected to reach on these trials; NaN if the
+            animal cannot be measured on.
+        fit: The function that measures a layer, given as responses (6 stimuli, step, unit) with
+            NaN in the steps that input cannot reach. NaN for a layer that tells nothing apart.
+        minimum: The lowest ceiling that is corrected for; for a share of variance the square of
+            that for a correlation.
+    """
+
+    ceiling: float
+    fit: Callable[[Floats], float]
+    minimum: float = MINIMUM_CEILING
+
+    @property
+    def usable(self) -> bool:
+        """Whether the noise is low enough to be corrected for."""
+        return bool(self.ceiling >= self.minimum)
+
+
+Metric = Callable[[Animal], Measure]
+
+# name: (where the function is, what it says in a line)
+METRICS = {
+    "rsa": (
+        f"{__name__}.geometry:rsa",
+        "correlation of the dissimilarities (1 - r) of the stimuli, mean over time",
+    ),
+    "rsa-time": (
+        f"{__name__}.geometry:rsa_time",
+        "the same in each bin of 45 ms by itself, mean over bins",
+    ),
+    "crossnobis": (
+        f"{__name__}.crossnobis:crossnobis",
+        "correlation of distances in units of the noise, cross-validated",
+    ),
+    "cka": (
+        f"{__name__}.geometry:cka",
+        "centred kernel alignment, linear, without the bias of few stimuli",
+    ),
+    "linear": (
+        f"{__name__}.linear:linear",
+        "share of the units' variance that a ridge regression predicts on a held-out stimulus",
+    ),
+}
+
+
+def metric_names() -> tuple[str, ...]:
+    """All metrics that are installed, ours first."""
+    return (*METRICS, *(name for name in added_names(ENTRY_POINTS) if name not in METRICS))
+
+
+def find_metric(name: str) -> Metric:
+    """The function of a metric.
+
+    Raises:
+        ConfigError: no such metric, or it cannot be loaded.
+    """
+    if name in METRICS:
+        module, _, function = METRICS[name][0].partition(":")
+        ours: Metric = getattr(import_module(module), function)
+        return ours
+    theirs: Metric | None = added(ENTRY_POINTS, name)
+    if theirs is None:
+        raise ConfigError(no_such("metric", name, metric_names()))
+    return theirs

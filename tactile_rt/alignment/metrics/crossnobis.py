@@ -1,0 +1,113 @@
+"""Squared distances between responses in units of the noise, without the bias that noise adds.
+
+Every session's units are whitened by the covariance of their trials about the stimulus's mean,
+shrunk towards its diagonal as far as its own uncertainty says (Schäfer & Strimmer 2005). Products
+run over pairs of *different* trials only, all of them: noise then lengthens no distance, 0 means
+the same response, and nothing depends on how trials are divided (Walther et al. 2016; Diedrichsen
+et al. 2021). Sessions add up, as units of their own.
+
+A layer has no noise: its distances are Euclidean. The fit is Pearson's r of the two.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.metrics import Measure
+from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
+from tactile_rt.alignment.metrics.halves import ceiling_of, divisions, sessions_of
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import STIMULI, UPPER, pearson
+
+__all__ = ["crossnobis", "distances", "shrunk_covariance"]
+
+Floats = NDArray[np.float64]
+
+
+def crossnobis(animal: Animal) -> Measure:
+    """Correlation of a layer's squared distances with an animal's cross-validated ones."""
+    sessions = sessions_of(animal)
+    if not sessions:
+        return NOTHING
+    units = sum(s.rates.shape[1] for s in sessions)
+    whole, halves = np.zeros(15), np.zeros((2, 1, 15))
+    for session in sessions:
+        white = session.rates @ _whitening(session)
+        every = np.ones((1, len(white)), dtype=np.bool_)
+        first = divisions(session)
+        whole = whole + distances(white, session.stimulus, every)[0] / units
+        halves = halves + np.stack(
+            [distances(white, session.stimulus, half) / units for half in (first, ~first)]
+        )
+    goal = whole
+    return Measure(
+        ceiling_of(pearson(halves[0], halves[1])),
+        lambda layer: float(pearson(_euclidean(mean_pattern(layer)), goal)),
+    )
+
+
+def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
+    """Cross-validated squared distances, summed over units.
+
+    Args:
+        white: (trial, unit), whitened.
+        stimulus: (trial,) of each.
+        chosen: (division, trial), which trials count; at least two of every stimulus.
+
+    Returns:
+        (division, 15).
+    """
+    weights = np.stack([chosen * (stimulus == k) for k in range(len(STIMULI))], axis=1).astype(
+        np.float64
+    )  # (division, 6, trial)
+    number = weights.sum(axis=-1)
+    total = weights @ white
+    alone = weights @ (white**2).sum(axis=-1)
+    own = ((total**2).sum(axis=-1) - alone) / (number * (number - 1))
+    mean = total / number[..., None]
+    between = np.matmul(mean, mean.swapaxes(-1, -2))
+    i, j = UPPER
+    return np.asarray(own[:, i] + own[:, j] - 2 * between[:, i, j])
+
+
+def shrunk_covariance(residuals: Floats, freedom: int) -> Floats:
+    """Covariance of (trial, unit) about zero, its correlations shrunk towards none.
+
+    Args:
+        residuals: about the mean of each trial's stimulus.
+        freedom: the number of trials less that of the means.
+    """
+    n = len(residuals)
+    products = residuals.T @ residuals
+    squares = (residuals**2).T @ residuals**2
+    variance = np.diag(products) / freedom
+    scale = np.sqrt(np.outer(variance, variance))
+    r, r2 = products / scale / (n - 1), squares / scale**2 / (n - 1)
+    off = ~np.eye(len(products), dtype=bool)
+    uncertain = (n / freedom**2 * (r2 - r**2))[off].sum()
+    size = (r[off] ** 2).sum()
+    shrinkage = min(max(uncertain / size, 0.0), 1.0) if size > 0 else 1.0
+    return np.asarray(products / freedom * np.where(off, 1 - shrinkage, 1.0))
+
+
+def _whitening(session: NeuralSession) -> Floats:
+    """(unit, unit) whose product with its transpose is the inverse covariance of the noise."""
+    rates, stimulus = session.rates, session.stimulus
+    residuals = rates.copy()
+    for k in range(len(STIMULI)):
+        residuals[stimulus == k] -= rates[stimulus == k].mean(axis=0)
+    live = (residuals**2).sum(axis=0) > 0  # a unit that never varies has no noise to measure by
+    out = np.zeros((len(live), len(live)))
+    if live.any():
+        freedom = len(rates) - len(STIMULI)
+        covariance = shrunk_covariance(residuals[:, live], freedom)
+        # With few trials it may be short of positive: such directions are left out.
+        values, vectors = np.linalg.eigh(covariance)
+        kept = values > 1e-9 * values.max()
+        roots = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1)), 0)
+        out[np.ix_(live, live)] = (vectors * roots) @ vectors.T
+    return out
+
+
+def _euclidean(patterns: Floats) -> Floats:
+    i, j = UPPER
+    return np.asarray(((patterns[i] - patterns[j]) ** 2).sum(axis=-1))

@@ -1,0 +1,137 @@
+"""Similarity of two geometries: of a layer's responses to six stimuli and of an animal's.
+
+- `rsa`: Pearson's r of the 15 dissimilarities 1 - r (Kriegeskorte 2008), mean over time.
+- `rsa_time`: the same in each bin of 45 ms, which is a step of the model, both counted from the
+  first contact; r and ceiling are each averaged over the bins in which the animal is reliable. In
+  a bin in which a layer does not tell the stimuli apart it fits by 0.
+- `cka`: the cosine of the U-centred linear kernels. Dropping the diagonal and centring so makes
+  the mean of both HSIC and noise zero (Song et al. 2012, equation 5), where the usual linear CKA
+  of six stimuli and many units is near 1 for any pair.
+
+The ceiling is the root of the Spearman-Brown reliability of the animal's own geometry.
+"""
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.metrics import Measure
+from tactile_rt.alignment.metrics.halves import (
+    bins_of,
+    ceiling_of,
+    half_means,
+    means_of,
+    sessions_of,
+)
+from tactile_rt.alignment.neural import Animal
+from tactile_rt.alignment.rdm import UPPER, pearson, rdm
+
+__all__ = [
+    "NOTHING",
+    "cka",
+    "cosine",
+    "mean_pattern",
+    "rsa",
+    "rsa_time",
+    "time_course",
+    "u_centred",
+]
+
+Floats = NDArray[np.float64]
+
+NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # of an animal that has too little
+
+
+def rsa(animal: Animal) -> Measure:
+    """Representational similarity of mean responses."""
+    sessions = sessions_of(animal)
+    if not sessions:
+        return NOTHING
+    goal = rdm(means_of(sessions, 0)[:, 0])
+    halves = rdm(np.concatenate([half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
+    return Measure(
+        ceiling_of(pearson(halves[:, 0], halves[:, 1])),
+        lambda layer: float(pearson(rdm(mean_pattern(layer)), goal)),
+    )
+
+
+def rsa_time(animal: Animal) -> Measure:
+    """Representational similarity in every bin of 45 ms."""
+    found = time_course(animal)
+    if found is None:
+        return NOTHING
+    goal, ceilings = found
+    there = np.isfinite(ceilings)
+    if not there.any():
+        return NOTHING
+
+    def fit(layer: Floats) -> float:
+        bins = min(len(goal), layer.shape[1])
+        r = pearson(rdm(layer[:, :bins].swapaxes(0, 1)), goal[:bins])
+        if not np.isfinite(r).any():
+            return float("nan")
+        whole = np.zeros(len(goal))
+        whole[:bins] = np.nan_to_num(r)
+        return float(whole[there].mean())
+
+    return Measure(float(ceilings[there].mean()), fit)
+
+
+def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
+    """RDMs (bin, 15) of an animal and the ceiling (bin,) of each; None without a time course."""
+    sessions = sessions_of(animal)
+    bins = bins_of(sessions) if sessions else 0
+    if not bins:
+        return None
+    goal = rdm(means_of(sessions, bins).swapaxes(0, 1))
+    whole = np.concatenate([half_means(s, bins) for s in sessions], axis=-1)
+    halves = rdm(np.moveaxis(whole, 3, 0))  # (bin, division, 2, 15)
+    r = pearson(halves[:, :, 0], halves[:, :, 1])
+    return goal, np.array([ceiling_of(row) for row in r])
+
+
+def cka(animal: Animal) -> Measure:
+    """Centred kernel alignment of mean responses, U-centred."""
+    sessions = sessions_of(animal)
+    if not sessions:
+        return NOTHING
+    goal = u_centred(means_of(sessions, 0)[:, 0])
+    halves = u_centred(np.concatenate([half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
+    return Measure(
+        ceiling_of(cosine(halves[:, 0], halves[:, 1])),
+        lambda layer: float(cosine(u_centred(mean_pattern(layer)), goal)),
+    )
+
+
+def u_centred(patterns: Floats) -> Floats:
+    """The U-centred linear kernel of responses (..., n, unit), its entries above the diagonal.
+
+    Returns:
+        (..., n (n - 1) / 2), for n of at least 4.
+    """
+    kernel = np.matmul(patterns, np.swapaxes(patterns, -1, -2))
+    n = kernel.shape[-1]
+    upper = UPPER if n == 6 else np.triu_indices(n, 1)
+    kernel = kernel * (1 - np.eye(n))
+    rows = kernel.sum(axis=-1)
+    centred = (
+        kernel
+        - (rows[..., :, None] + rows[..., None, :]) / (n - 2)
+        + rows.sum(axis=-1)[..., None, None] / ((n - 1) * (n - 2))
+    )
+    return np.asarray(centred[..., upper[0], upper[1]])
+
+
+def cosine(a: Floats, b: Floats) -> Floats:
+    """Cosine along the last axis; NaN where a vector is zero."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+        return np.asarray((a * b).sum(axis=-1) / np.where(lengths > 0, lengths, np.nan))
+
+
+def mean_pattern(layer: Floats) -> Floats:
+    """Mean over the steps that input reaches: (6, step, unit) -> (6, unit)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a layer that no input reaches is NaN
+        return np.asarray(np.nanmean(layer, axis=1))

@@ -1,0 +1,123 @@
+"""Means of an animal's trials, and of random halves of them.
+
+Halves are drawn within every session and stimulus; how two halves agree says how far their whole
+can be relied on (Spearman-Brown). Bins that some trials do not reach are means over those that do.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.alignment.reliability import spearman_brown
+
+__all__ = [
+    "DIVISIONS",
+    "MINIMUM_TRIALS",
+    "MINIMUM_UNITS",
+    "bins_of",
+    "ceiling_of",
+    "divisions",
+    "half_means",
+    "means_of",
+    "sessions_of",
+    "values_of",
+]
+
+Floats = NDArray[np.float64]
+
+DIVISIONS = 100
+SEED = 1234
+MINIMUM_TRIALS = 4  # of every stimulus in a session: two in each half
+MINIMUM_UNITS = 5  # of an animal: with fewer its correlations over units are mostly 1 or -1
+LONGEST = 22  # bins: the steps of the models
+
+
+def sessions_of(animal: Animal) -> tuple[NeuralSession, ...]:
+    """The sessions with enough trials of every stimulus; none if they have too few units."""
+    kept = tuple(s for s in animal.sessions if s.trials.min() >= MINIMUM_TRIALS)
+    return kept if sum(s.rates.shape[1] for s in kept) >= MINIMUM_UNITS else ()
+
+
+def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
+    """The bins that enough trials of every stimulus reach in all sessions; 0 without any."""
+    reached = [LONGEST]
+    for session in sessions:
+        if session.course is None:
+            return 0
+        there = np.asarray(np.isfinite(session.course).all(axis=2))  # (trial, bin)
+        trials = [there[session.stimulus == k].sum(axis=0) for k in range(len(STIMULI))]
+        enough = np.min(trials, axis=0) >= MINIMUM_TRIALS
+        reached.append(int(enough.size if enough.all() else enough.argmin()))
+    return min(reached)
+
+
+def values_of(session: NeuralSession, bins: int) -> Floats:
+    """Rates (trial, bin, unit): the course's first bins, or with none, one bin of whole rates."""
+    if bins and session.course is not None:
+        return session.course[:, :bins]
+    return session.rates[:, None]
+
+
+def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.bool_]:
+    """Random divisions of a session's trials: (division, trial), whether it is in half 1."""
+    rng = np.random.default_rng([SEED, len(session.stimulus)])
+    first = np.zeros((number, len(session.stimulus)), dtype=np.bool_)
+    for stimulus in range(len(STIMULI)):
+        rows = np.flatnonzero(session.stimulus == stimulus)
+        places = rng.permuted(np.tile(np.arange(len(rows)), (number, 1)), axis=1)
+        first[:, rows] = places < len(rows) // 2
+    return first
+
+
+def half_means(session: NeuralSession, bins: int, number: int = DIVISIONS) -> Floats:
+    """Means of both halves of every division: (division, 2, 6, bin, unit)."""
+    values = values_of(session, bins)
+    first = divisions(session, number)
+    return np.stack([_means(values, session.stimulus, half) for half in (first, ~first)], axis=1)
+
+
+def means_of(sessions: tuple[NeuralSession, ...], bins: int) -> Floats:
+    """Means over all trials of the units of all sessions: (6, bin, unit)."""
+    return np.concatenate(
+        [
+            _means(values_of(s, bins), s.stimulus, np.ones((1, len(s.stimulus)), np.bool_))[0]
+            for s in sessions
+        ],
+        axis=-1,
+    )
+
+
+def ceiling_of(agreements: Floats) -> float:
+    """What a perfect model reaches, from how halves agree: the root of their reliability.
+
+    Args:
+        agreements: (division,) between both halves of each.
+
+    Returns:
+        NaN where the reliability is not above 0.
+    """
+    there = agreements[np.isfinite(agreements)]
+    reliability = float(spearman_brown(there.mean())) if there.size else np.nan
+    return float(np.sqrt(reliability)) if reliability > 0 else float("nan")
+
+
+def _means(values: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
+    """Means over chosen trials (division, trial) of every stimulus: (division, 6, bin, unit)."""
+    trials, bins, units = values.shape
+    there = np.asarray(np.isfinite(values).all(axis=2), dtype=np.float64)  # (trial, bin)
+    flat = np.nan_to_num(values).reshape(trials, -1)
+    out = np.empty((len(chosen), len(STIMULI), bins, units))
+    for k, rows in _by_stimulus(stimulus):
+        weights = chosen[:, rows].astype(np.float64)
+        number = weights @ there[rows]
+        total = (weights @ flat[rows]).reshape(-1, bins, units)
+        out[:, k] = total / np.where(number > 0, number, np.nan)[..., None]
+    return out
+
+
+def _by_stimulus(stimulus: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+    for k in range(len(STIMULI)):
+        yield k, np.flatnonzero(stimulus == k)

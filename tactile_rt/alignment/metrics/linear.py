@@ -1,0 +1,114 @@
+"""How much of each unit's response to a stimulus a linear readout of a layer predicts unseen.
+
+One of six stimuli is held out at a time. A ridge regression from the layer's steps to the units'
+bins of 45 ms (without a time course: from means to means) learns from the other five, its penalty
+chosen by holding out each of these in turn. Both sides are taken about the mean of the learning
+stimuli in each bin, so that a course which all stimuli share, such as the onset of touch, earns
+nothing, and a regression that knows nothing scores 0 (a correlation would be negative: the mean of
+the others lies opposite to what was held out).
+
+The score is 1 - error / variance over all bins and units, each unit in units of its noise, so that
+units which tell stimuli apart weigh most. The ceiling
+is what is left of the variance without the noise of the means, known from the spread of trials: a
+perfect model reaches it in expectation.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.metrics import MINIMUM_CEILING, Measure
+from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
+from tactile_rt.alignment.metrics.halves import bins_of, means_of, sessions_of, values_of
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import STIMULI
+
+__all__ = ["PENALTIES", "linear", "predicted"]
+
+Floats = NDArray[np.float64]
+
+PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel's diagonal
+
+
+def linear(animal: Animal) -> Measure:
+    """Held-out variance explained, pooled over units."""
+    sessions = sessions_of(animal)
+    if not sessions:
+        return NOTHING
+    bins = bins_of(sessions)
+    goal = means_of(sessions, bins)
+    noise = np.concatenate([_noise(s, bins) for s in sessions], axis=-1)
+    spread = (goal - goal.mean(axis=0)).std(axis=(0, 1))
+    live = spread > 1e-12 * np.abs(goal).max(initial=0.0)
+    if not live.any():
+        return NOTHING
+    scale = np.sqrt(noise.mean(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, spread)[live]
+    goal, noise = goal[..., live] / scale, noise[..., live] / scale**2
+    variance = sum(
+        float(((goal[i] - np.delete(goal, i, axis=0).mean(axis=0)) ** 2).sum())
+        for i in range(len(goal))
+    )
+    # Of what is held out, and of the mean of the others that it is measured from.
+    others = len(goal) - 1
+    unknown = float(noise.sum() * (1 + 1 / others))
+
+    def fit(layer: Floats) -> float:
+        steps = np.nan_to_num(layer[:, : goal.shape[1]]) if bins else mean_pattern(layer)[:, None]
+        if not np.isfinite(steps).all() or not np.ptp(steps, axis=0).any():
+            return float("nan")
+        missing = goal.shape[1] - steps.shape[1]
+        steps = np.pad(steps, ((0, 0), (0, max(missing, 0)), (0, 0)))
+        return 1 - float(((goal - predicted(steps, goal)) ** 2).sum()) / variance
+
+    return Measure(1 - unknown / variance, fit, MINIMUM_CEILING**2)
+
+
+def predicted(layer: Floats, goal: Floats) -> Floats:
+    """Responses of every stimulus, predicted from the others.
+
+    Args:
+        layer: (6, bin, feature).
+        goal: (6, bin, unit).
+
+    Returns:
+        (6, bin, unit).
+    """
+    out = np.empty_like(goal)
+    for i in range(len(goal)):
+        rest = [k for k in range(len(goal)) if k != i]
+        errors = np.zeros(len(PENALTIES))
+        for j in rest:
+            inner = [k for k in rest if k != j]
+            for p, guess in enumerate(_ridge(layer, goal, inner, j, PENALTIES)):
+                errors[p] += ((guess - goal[j]) ** 2).sum()
+        best = PENALTIES[int(errors.argmin())]
+        out[i] = _ridge(layer, goal, rest, i, (best,))[0]
+    return out
+
+
+def _ridge(
+    layer: Floats, goal: Floats, known: list[int], held: int, penalties: tuple[float, ...]
+) -> list[Floats]:
+    """Predictions (bin, unit) of a stimulus from the known ones, one for every penalty."""
+    middle, level = layer[known].mean(axis=0), goal[known].mean(axis=0)
+    x = (layer[known] - middle).reshape(-1, layer.shape[-1])
+    y = (goal[known] - level).reshape(-1, goal.shape[-1])
+    new = layer[held] - middle
+    values, vectors = np.linalg.eigh(x @ x.T)
+    values = np.maximum(values, 0)
+    size = float(values.mean())
+    if size <= 0:
+        return [level] * len(penalties)
+    turned, towards = vectors.T @ y, (new @ x.T) @ vectors
+    return [level + (towards / (values + penalty * size)) @ turned for penalty in penalties]
+
+
+def _noise(session: NeuralSession, bins: int) -> Floats:
+    """Variance of the mean over trials: (6, bin, unit)."""
+    values = values_of(session, bins)
+    out = np.empty((len(STIMULI), *values.shape[1:]))
+    for k in range(len(STIMULI)):
+        trials = values[session.stimulus == k]
+        number = np.isfinite(trials).sum(axis=0)
+        out[k] = np.nanvar(trials, axis=0, ddof=1) / number
+    return out

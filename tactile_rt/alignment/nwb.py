@@ -1,0 +1,281 @@
+"""NWB files of the barrel-cortex recordings (Rodgers 2022, DANDI 000231), read with h5py alone.
+
+    general/subject/subject_id                            animal
+    general/experiment_description                        task
+    intervals/trials/...                                  one column per dataset
+    units/spike_times, units/spike_times_index            ragged: unit k ends at index[k]
+    units/depth, units/inhibitory                         um, putative cell type
+    acquisition/<electrical series>/starting_time         see below
+    processing/*/contacts_by_whisker_*/start_time         touches
+    processing/*/processed_position_whisker_*/angle/...   the clock that touches are read on
+
+NWB defines spike times on the session's clock, as it does all times. The published analysis takes
+them to be on the recording's, and subtracts its starting time; `clock` says which, and the module
+of that name checks it.
+A rate is a number of spikes over the bins of 45 ms that cover the window, as published.
+"""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.clock import CLOCKS, ContactResponse, contact_response
+from tactile_rt.alignment.neural import NeuralSession
+from tactile_rt.alignment.nwb_parts import (
+    TRIALS,
+    animal_name,
+    contact_times,
+    flags,
+    inhibitory_units,
+    numbers,
+    spike_times,
+    starting_time,
+    task_of,
+    text,
+    trial_columns,
+    unit_column,
+)
+from tactile_rt.alignment.rdm import DISTANCES, SHAPES, stimulus_index
+from tactile_rt.alignment.selection import Selection
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.packages import lacking
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["BIN_S", "WINDOWS", "Reading", "find_nwb", "read_nwb", "read_session"]
+
+Floats = NDArray[np.float64]
+
+BIN_S = 0.045
+COURSE_BINS = 22  # as many as the steps of a model that is compared
+WINDOWS = ("contact", "start")  # where a trial's window begins; it ends with the choice
+LONGEST_TRIAL_S, LONGEST_SESSION_S = 600.0, 1e6
+NAMED = 5  # trials that a note names
+
+
+class Reading(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        task: The task of the mouse, ``discrimination`` or ``detection``.
+        response: The change of the rates with contact; None without contacts to tell by.
+    """
+
+    session: NeuralSession
+    notes: list[str]
+    task: str
+    response: ContactResponse | None
+
+
+def find_nwb(paths: Iterable[Path]) -> list[Path]:
+    """Files named, and those in folders named.
+
+    Of a folder, files with ``ecephys`` in their names if there are any: others have no spikes.
+
+    Raises:
+        ConfigError: nothing there.
+    """
+    found = []
+    for path in paths:
+        if path.is_dir():
+            files = sorted(path.rglob("*.nwb"))
+            files = [f for f in files if "ecephys" in f.name] or files
+            if not files:
+                raise ConfigError(f"no .nwb file in {path}")
+            found += files
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise ConfigError(f"no file or folder {path}")
+    return found
+
+
+def read_nwb(
+    files: Iterable[Path],
+    window: str = "contact",
+    progress: Callable[[float], None] = lambda share: None,
+    clock: str = "session",
+    selection: Selection | None = None,
+) -> tuple[list[Reading], list[str]]:
+    """Sessions of NWB files.
+
+    Args:
+        window: rates count from first ``contact`` or from the ``start`` of the trial, to choice.
+        progress: called with the share done, 0 to 1, after every unit.
+        clock: spike times are on the ``session``'s clock, or the ``recording``'s.
+        selection: which sessions and units are kept; None for all.
+
+    Returns:
+        What was read of the sessions that are selected, and notes on what was left out, sessions
+        that cannot be read among these.
+
+    Raises:
+        ConfigError: no session is left; why, of each.
+    """
+    _h5py()
+    wanted = selection or Selection()
+    named = list(files)
+    files = [path for path in named if wanted.takes(path.stem)]
+    readings: list[Reading] = []
+    spoilt: list[str] = []
+    for i, path in enumerate(files):
+
+        def read(share: float, i: int = i) -> None:
+            progress((i + share) / len(files))
+
+        try:
+            reading = read_session(path, window, read, clock, wanted)
+        except ConfigError as error:
+            spoilt.append(f"session {path.stem} left out: {error}")
+        else:
+            if wanted.task in (None, reading.task) and reading.session.rates.shape[1]:
+                readings.append(reading)
+        read(1.0)
+    if not readings:
+        raise ConfigError(name_some(spoilt, 1) or f"no session of {len(named)} is of {wanted}")
+    notes = [*spoilt, *(note for reading in readings for note in reading.notes)]
+    if str(wanted):
+        units = sum(r.session.rates.shape[1] for r in readings)
+        notes.insert(
+            0, f"selected: {wanted}: {len(readings)} of {len(named)} sessions, {units} units"
+        )
+    return readings, notes
+
+
+def read_session(
+    path: Path,
+    window: str = "contact",
+    progress: Callable[[float], None] = lambda share: None,
+    clock: str = "session",
+    selection: Selection | None = None,
+) -> Reading:
+    """One NWB file; see `read_nwb`.
+
+    Raises:
+        ConfigError: naming the file, which cannot be read as one of these recordings, and why.
+    """
+    for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
+        if value not in known:
+            raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
+    h5py = _h5py()
+    try:
+        with h5py.File(path, "r") as file:
+            return _session(file, path.stem, window, progress, clock, selection or Selection())
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except Exception as error:  # of a damaged file HDF5 raises a dozen unrelated types
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path}: cannot be read as NWB ({reason})") from None
+
+
+def _h5py() -> Any:
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise lacking("reading NWB needs", "align", error) from None
+    return h5py
+
+
+def _session(
+    file: "h5py.File",
+    name: str,
+    window: str,
+    progress: Callable[[float], None],
+    clock: str,
+    selection: Selection,
+) -> Reading:
+    notes: list[str] = []
+    trials = trial_columns(file)
+    shapes, places = text(trials["stimulus"]), text(trials["servo_position"])
+    ignored = flags(trials["ignore_trial"], "ignore_trial")
+    start, stop = (numbers(trials[c], c) for c in ("start_time", "choice_time"))
+    kept = (ignored != 1) & (text(trials["outcome"]) == "correct") & np.isin(shapes, SHAPES)
+    task = task_of(file, shapes[ignored == 0])
+
+    def drop(bad: NDArray[np.bool_], why: str) -> None:
+        """Leave bad trials out, and say which."""
+        nonlocal kept
+        rows = np.flatnonzero(bad & kept)
+        if rows.size:
+            few = ", ".join(map(str, rows[:NAMED])) + (", ..." if rows.size > NAMED else "")
+            notes.append(f"{rows.size} of {kept.sum()} correct trials left out ({few}): {why}")
+        kept = kept & ~bad
+
+    drop(ignored == -1, "ignore_trial is neither true nor false")
+    drop(~np.isin(places, DISTANCES), f"servo_position is not one of {', '.join(DISTANCES)}")
+    with np.errstate(invalid="ignore", over="ignore"):
+        lasts = stop - start
+        good = (lasts > 0) & (lasts < LONGEST_TRIAL_S) & (np.abs(start) < LONGEST_SESSION_S)
+    drop(~good, f"choice_time is not after start_time, by {LONGEST_TRIAL_S:g} s at most")
+    units = spike_times(file, notes)
+    origin = starting_time(file)
+    if clock == "recording" and origin is None:
+        raise ConfigError(
+            "acquisition has no electrical recording with a starting_time, which the published "
+            "analysis counts spike times from"
+        )
+    shift = origin or 0.0 if clock == "recording" else 0.0
+    response = None
+    try:
+        contacts = contact_times(file, notes)
+    except ConfigError:
+        if window == "contact":
+            raise
+    else:
+        response = contact_response(name, units, contacts, shift, origin or 0.0)
+        if window == "contact":
+            start = _first_contacts(contacts, start, stop)
+            drop(~np.isfinite(start), "no contact before the choice")
+    rows = np.flatnonzero(kept)
+    if not rows.size:
+        left = f"no trial is left in {TRIALS}: correct, not ignored, convex or concave"
+        raise ConfigError(name_some([left, *notes], 2, "; "))
+    depth = unit_column(file, "depth", len(units), notes)
+    inhibitory = inhibitory_units(file, len(units), notes)
+    chosen = selection.units(depth, inhibitory, len(units))
+    spikes = [times - shift for times, wanted in zip(units, chosen, strict=True) if wanted]
+    rates, course = _rates(spikes, start[rows], stop[rows], progress)
+    session = NeuralSession(
+        animal=animal_name(file, name),
+        name=name,
+        rates=rates,
+        stimulus=np.array([stimulus_index(shapes[r], places[r]) for r in rows], dtype=np.int64),
+        course=course,
+        depth=None if depth is None else depth[chosen],
+        inhibitory=None if inhibitory is None else inhibitory[chosen],
+        begin=numbers(trials["start_time"], "start_time")[rows],
+    )
+    return Reading(session, [f"session {name}: {note}" for note in notes], task, response)
+
+
+def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:
+    """Time of the first contact in [start, stop), NaN without one."""
+    padded = np.append(contacts, np.inf)
+    first = padded[np.searchsorted(contacts, start)]
+    return np.where(first < stop, first, np.nan)
+
+
+def _rates(
+    spikes: list[Floats],
+    start: Floats,
+    stop: Floats,
+    progress: Callable[[float], None],
+) -> tuple[Floats, Floats]:
+    """Spikes per second in [start, stop), (trial, unit), and by bin, (trial, bin, unit)."""
+    bins = np.array(
+        [len(np.arange(a, b + BIN_S, BIN_S)) - 1 for a, b in zip(start, stop, strict=True)]
+    )
+    edges = start[:, None] + BIN_S * np.arange(COURSE_BINS + 1)
+    rates = np.empty((len(start), len(spikes)))
+    course = np.empty((len(start), COURSE_BINS, len(spikes)))
+    for unit, times in enumerate(spikes):
+        before = np.searchsorted(times, [start, stop])  # spikes before each edge
+        rates[:, unit] = (before[1] - before[0]) / (bins * BIN_S)
+        course[:, :, unit] = np.diff(np.searchsorted(times, edges), axis=1) / BIN_S
+        progress((unit + 1) / len(spikes))
+    course[edges[:, 1:] > stop[:, None]] = np.nan
+    return rates, course

@@ -1,0 +1,224 @@
+"""Parts of an NWB file of the barrel-cortex recordings, each checked as it is read.
+
+What spoils a session raises a `ConfigError` that names the place in the file; the file is named by
+who reads it. What spoils a trial, a contact or a spike alone is left out, and a note says so.
+"""
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.selection import TASKS
+from tactile_rt.core.errors import ConfigError, name_some
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = [
+    "COLUMNS",
+    "CONTACTS",
+    "EXPERIMENT",
+    "LARGEST",
+    "RECORDING",
+    "SUBJECT",
+    "TRIALS",
+    "WHISKER",
+    "animal_name",
+    "contact_times",
+    "flags",
+    "inhibitory_units",
+    "last_time",
+    "numbers",
+    "spike_times",
+    "starting_time",
+    "stored",
+    "task_of",
+    "text",
+    "trial_columns",
+    "unit_column",
+]
+
+Floats = NDArray[np.float64]
+
+COLUMNS = ("start_time", "choice_time", "outcome", "stimulus", "servo_position", "ignore_trial")
+TRIALS = "intervals/trials"
+RECORDING = "extracellular array recording"  # of the published files; else the only one there is
+CONTACTS = "contacts_by_whisker_"
+WHISKER = "processed_position_whisker_"
+SUBJECT = "general/subject/subject_id"
+EXPERIMENT = "general/experiment_description"  # says which task it was
+LARGEST = 1 << 30  # bytes of a column; the longest ones, of spike times, have some millions
+
+
+def stored(file: Any, name: str) -> NDArray[Any]:
+    """A column as it is stored, of one dimension.
+
+    Raises:
+        ConfigError: it is something else, or larger than anything that belongs here.
+    """
+    data = file[name]
+    if getattr(data, "ndim", None) != 1:
+        raise ConfigError(f"{name} is not a column of values")
+    if data.size * max(data.dtype.itemsize, 1) > LARGEST:
+        raise ConfigError(f"{name} has {data.size} values, more than a session can have")
+    values: NDArray[Any] = data[()]
+    return values
+
+
+def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
+    """The columns of the trials that are needed, as stored, of one length."""
+    if TRIALS not in file:
+        raise ConfigError(f"has no {TRIALS}")
+    table = file[TRIALS]
+    missing = [name for name in COLUMNS if name not in table]
+    if missing:
+        there = ", ".join(sorted(table))
+        raise ConfigError(
+            f"{TRIALS} lacks the column{'s' * (len(missing) > 1)} {name_some(missing)} "
+            f"(it has {there})"
+        )
+    columns = {name: stored(table, name) for name in COLUMNS}
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise ConfigError(f"columns of {TRIALS} differ in length: {lengths}")
+    return columns
+
+
+def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
+    """Start times of all contacts, sorted, s; what was left out is said in `notes`."""
+    modules = [file["processing"][name] for name in file.get("processing", {})]
+    found = {name: module[name] for module in modules for name in module}
+    clocks = {name: last_time(group) for name, group in found.items() if name.startswith(WHISKER)}
+    last = {name: end for name, end in clocks.items() if end is not None}
+    times = []
+    for name, table in found.items():
+        if not name.startswith(CONTACTS):
+            continue
+        if "start_time" not in table:
+            raise ConfigError(f"{table.name} lacks the column start_time")
+        starts = numbers(stored(table, "start_time"), f"{name} start_time")
+        end = last.get(WHISKER + name.removeprefix(CONTACTS), max(last.values(), default=np.inf))
+        good = np.isfinite(starts) & (starts <= end)
+        if not good.all():
+            k = int(np.flatnonzero(~good)[0])
+            notes.append(
+                f"{(~good).sum()} of {len(starts)} contacts in {name} left out: {starts[k]:.3f} s "
+                f"is no time, or after the last timestamp of the whiskers, {end:.3f} s"
+            )
+        times.append(starts[good])
+    if not sum(map(len, times)):
+        raise ConfigError(
+            f"has no contacts (processing/*/{CONTACTS}*): without them only protocol paper-code "
+            "can use it"
+        )
+    return np.sort(np.concatenate(times))
+
+
+def last_time(clock: Any) -> float | None:
+    """Last timestamp of a whisker's angle, s; None where it has no clock."""
+    angle = clock.get("angle") if hasattr(clock, "get") else None
+    if angle is None:
+        return None
+    if "timestamps" in angle and len(angle["timestamps"]):
+        return float(angle["timestamps"][-1])
+    if "starting_time" in angle and "data" in angle:
+        begin, rate = angle["starting_time"], float(angle["starting_time"].attrs["rate"])
+        return float(begin[()]) + (len(angle["data"]) - 1) / rate
+    return None
+
+
+def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
+    """Spike times of every unit as stored, s, sorted; what was left out is said in `notes`."""
+    for name in ("units/spike_times", "units/spike_times_index"):
+        if name not in file:
+            raise ConfigError(f"has no {name}: is this a session with spikes?")
+    times = numbers(stored(file, "units/spike_times"), "units/spike_times")
+    index = stored(file, "units/spike_times_index")
+    edges = np.concatenate([[0], index.astype(np.int64) if index.dtype.kind in "iu" else [-1]])
+    if index.size == 0 or (np.diff(edges) < 0).any() or edges[-1] != len(times):
+        raise ConfigError(
+            f"units/spike_times_index does not divide the {len(times)} spike times: "
+            f"it has {index.size} units and ends at {index[-1] if index.size else 0}"
+        )
+    finite = np.isfinite(times)
+    if not finite.all():
+        notes.append(f"{(~finite).sum()} of {len(times)} spikes left out: their times are no times")
+    return [np.sort(times[a:b][finite[a:b]]) for a, b in pairwise(edges)]
+
+
+def unit_column(file: "h5py.File", name: str, units: int, notes: list[str]) -> Floats | None:
+    """A column of the units as numbers, (unit,); None if there is none that can be used."""
+    if "units" not in file or name not in file["units"]:
+        return None
+    values = stored(file["units"], name)
+    if len(values) != units or values.dtype.kind not in "fiub":
+        notes.append(f"column units/{name} left out: it is not a number for each of {units} units")
+        return None
+    return values.astype(np.float64)
+
+
+def inhibitory_units(file: "h5py.File", units: int, notes: list[str]) -> NDArray[np.bool_] | None:
+    """Whether each unit is a putative inhibitory neuron, (unit,); None if that cannot be told."""
+    values = unit_column(file, "inhibitory", units, notes)
+    if values is None:
+        return None
+    odd = np.flatnonzero(~np.isin(values, (0, 1)))
+    if odd.size:
+        notes.append(
+            f"column units/inhibitory left out: {odd.size} of {units} are neither 0 nor 1, unit "
+            f"{odd[0]} is {values[odd[0]]:g}"
+        )
+        return None
+    return np.asarray(values == 1)
+
+
+def starting_time(file: "h5py.File") -> float | None:
+    """When the electrical recording began on the session's clock, s; None if it is not said."""
+    series = file.get("acquisition", {})
+    timed = [name for name in series if "starting_time" in series[name]]
+    electrical = [n for n in timed if series[n].attrs.get("neurodata_type") == "ElectricalSeries"]
+    name = RECORDING if RECORDING in timed else electrical[0] if len(electrical) == 1 else None
+    if name is None:
+        return None
+    time = float(series[name]["starting_time"][()])
+    return time if np.isfinite(time) else None
+
+
+def animal_name(file: "h5py.File", stem: str) -> str:
+    """The subject; without one, the first part of the file's name, as published."""
+    if SUBJECT in file:
+        return str(text(np.atleast_1d(file[SUBJECT][()]))[0])
+    return stem.partition("_")[0].removeprefix("sub-")
+
+
+def task_of(file: "h5py.File", shown: NDArray[np.str_]) -> str:
+    """The mouse's task: what the file says, or whether trials without a shape were part of it."""
+    if EXPERIMENT in file:
+        said = str(text(np.atleast_1d(file[EXPERIMENT][()]))[0])
+        named = [task for task in TASKS if task in said]
+        if len(named) == 1:
+            return named[0]
+    return TASKS[1] if (shown == "nothing").any() else TASKS[0]
+
+
+def text(column: NDArray[Any]) -> NDArray[np.str_]:
+    """Text, whether it was stored as text or as bytes."""
+    decoded = [v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in column]
+    return np.array(decoded, dtype=np.str_)
+
+
+def flags(column: NDArray[Any], what: str) -> NDArray[np.int64]:
+    """A column of trials that is true or false, of any type: 1, 0, or -1 for neither."""
+    if column.dtype.kind not in "biu":
+        raise ConfigError(f"{TRIALS} column {what} is {column.dtype}, not true or false")
+    return np.where(np.isin(column, (0, 1)), column, -1).astype(np.int64)
+
+
+def numbers(values: NDArray[Any], what: str) -> Floats:
+    """Times in seconds; `what` names them if they are something else."""
+    if values.dtype.kind not in "fiu":
+        raise ConfigError(f"{what} is {values.dtype}, not times in seconds")
+    times: Floats = values.astype(np.float64)
+    return times

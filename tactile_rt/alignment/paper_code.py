@@ -1,0 +1,143 @@
+"""Protocol `paper-code`: the published analysis as its code does it, mistakes included.
+
+It exists so that published numbers can be checked. What it does otherwise than the paper says:
+
+- rates count from the start of a trial, not from first contact (`nwb.read_nwb`);
+- the recording's starting time is subtracted from spike times, which NWB has on the session's clock
+  already: the published shift (clock ``recording`` of `nwb.read_nwb`);
+- the stimulus axis is the order of first appearance in each session (`neural.published_layout`);
+- a stimulus that a trial did not show counts as a rate of zero (same place);
+- no neuron is filtered; bootstraps are, by raw r_yy and r_xx >= 0.5 (`reliability.filtered_mean`);
+- the numerator is the RSA of full trial means, not of half 1 against half 2;
+- two negative reliabilities pass for a positive product (`reliability.noise_corrected`);
+- a model's score is its highest over all layers and all targets, the pooled animals among these,
+  not a mean over mice (`scoring.score`);
+- raw sensor input is scored by the median without the filter (`Target.unfiltered`), models by the
+  mean with it;
+- standard errors divide by the number of values without a degree of freedom for the mean.
+
+Where the published code stops with an assertion (a stimulus without a trial), this one says why.
+"""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
+from tactile_rt.alignment.neural import pad, rates_sha256
+from tactile_rt.alignment.rdm import STIMULI, pearson, rdm
+from tactile_rt.alignment.reliability import (
+    BOOTSTRAPS,
+    SEED,
+    filtered_mean,
+    first_halves,
+    noise_corrected,
+    spearman_brown,
+    split_half,
+    trial_mean,
+)
+from tactile_rt.core.errors import ConfigError, name_some
+
+__all__ = ["POOLED", "freeze_paper_code"]
+
+Floats = NDArray[np.float64]
+
+POOLED = "concatenated"  # the published name of all animals as one
+
+
+def freeze_paper_code(
+    rates: Mapping[str, Floats],
+    bootstraps: int = BOOTSTRAPS,
+    seed: int = SEED,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Benchmark:
+    """Reliabilities and RDMs of animals, and their consistency.
+
+    Args:
+        rates: (row, 6, unit) per animal, in the published layout.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigError: no animal has a mean response that makes an RDM; one of several is left out.
+    """
+    steps = 2 * len(rates) + 1
+    targets: list[Target] = []
+    notes: list[str] = []
+    halves: dict[str, Floats] = {}
+    done = 0
+    for name in rates:
+        try:
+            targets.append(_target(name, rates[name], bootstraps, seed, halves))
+        except ConfigError as error:
+            notes.append(f"{error}: left out")
+        progress((done := done + 1) / steps)
+    if not targets:
+        raise ConfigError(name_some(notes, 1) or "there is no animal")
+    names = tuple(target.name for target in targets)
+    rates = {name: rates[name] for name in names}
+    pooled = None
+    if len(names) > 1:
+        pooled = _target(POOLED, pad(list(rates.values())), bootstraps, seed, halves)
+    progress((done := done + 1) / steps)
+
+    held_out = np.full(len(names), np.nan)
+    for i, name in enumerate(names):
+        others = [rates[other] for other in names if other != name]
+        if others:
+            source = pad(others)
+            r_xx = split_half(source, first_halves(len(source), bootstraps, seed))
+            r_xy = pearson(rdm(trial_mean(source)), targets[i].chosen.rdm)
+            held_out[i] = _score(r_xy, r_xx, halves[name])
+        progress((done := done + 1) / steps)
+    pairwise = np.full((len(names), len(names)), np.nan)
+    for i, j in zip(*np.nonzero(~np.eye(len(names), dtype=bool)), strict=True):
+        r_xy = pearson(targets[i].chosen.rdm, targets[j].chosen.rdm)
+        pairwise[i, j] = _score(r_xy, halves[names[i]], halves[names[j]])
+    return Benchmark(
+        protocol="paper-code",
+        targets=tuple(targets),
+        pooled=pooled,
+        a2a=Consistency(names, held_out, pairwise, ddof=0),
+        bootstraps=bootstraps,
+        seed=seed,
+        notes=tuple(notes),
+    )
+
+
+def _target(
+    name: str, rates: Floats, bootstraps: int, seed: int, halves: dict[str, Floats]
+) -> Target:
+    """Freeze one target; its split-half correlations go into `halves`."""
+    mean = trial_mean(rates)
+    dissimilarities = rdm(mean)
+    if not np.isfinite(dissimilarities).all():
+        where = [s for s, row in zip(STIMULI, mean, strict=True) if not np.ptp(row) > 0]
+        raise ConfigError(
+            f"animal {name}: no RDM, since the mean response to stimulus "
+            f"{', '.join(str(STIMULI.index(s)) for s in where)} is missing or the same in all units"
+        )
+    r_yy = halves[name] = split_half(rates, first_halves(len(rates), bootstraps, seed))
+    factor = noise_corrected(1.0, 1.0, r_yy)
+    there = r_yy[np.isfinite(r_yy)]
+    reliability = float(spearman_brown(there.mean())) if there.size else np.nan
+    usable = factor[np.isfinite(factor)]
+    filtered = filtered_mean(factor, r_yy)
+    units = rates.shape[2]
+    return Target(
+        name=name,
+        chosen=Frozen(dissimilarities, reliability, filtered, units),
+        unfiltered=Frozen(
+            dissimilarities,
+            reliability,
+            float(np.median(usable)) if usable.size else np.nan,
+            units,
+        ),
+        reliable=bool(np.isfinite(filtered)),
+        trials=len(rates),
+        sha256=rates_sha256({"rates": rates}),
+    )
+
+
+def _score(r_xy: Floats, r_xx: Floats, r_yy: Floats) -> float:
+    return filtered_mean(noise_corrected(r_xy, r_xx, r_yy), r_yy, r_xx)

@@ -1,0 +1,185 @@
+"""Scores at rest: one JSON file that a report is drawn from and a gate compares with."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_benchmark
+from tactile_rt.alignment.gate import neural_checks
+from tactile_rt.alignment.json_file import Floats, Number, read_json
+from tactile_rt.alignment.layers import Layers
+from tactile_rt.alignment.rdm import PAIRS, STIMULI, normalised
+from tactile_rt.alignment.scoring import Score, score
+from tactile_rt.alignment.stimuli_input import StimuliInput
+from tactile_rt.core.errors import ConfigError
+
+__all__ = ["ModelResult", "Results", "baseline_of", "model_result", "read_results", "results_of"]
+
+
+class ModelResult(Score, frozen=True, eq=False, kw_only=True):
+    """Everything that is shown of a model: its score, and fields as in `layers.Layers`.
+
+    Attributes:
+        performance: The accuracy on the task, 0 to 1; NaN if no accuracy is known.
+        performance_of: The words that say what that accuracy was measured on.
+        untrained: The score of the network before its training, where there is one.
+        groups: The groups that the model belongs to, by what they divide models by: encoder,
+            attender, objective, augmentation, masking; without those that are not known.
+        turing: The verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty
+            under paper-code.
+        turing_why: The reason for that verdict, and what the test would find in this benchmark.
+    """
+
+    name: str
+    sha256: str
+    precision: str
+    parameters: int
+    first: tuple[int, ...]
+    units: tuple[int, ...]
+    performance: Number = math.nan
+    performance_of: str = ""
+    untrained: Score | None = None
+    notes: tuple[str, ...] = ()
+    groups: dict[str, str] = msgspec.field(default_factory=dict)
+    turing: str = ""
+    turing_why: str = ""
+
+
+class Results(
+    msgspec.Struct, frozen=True, eq=False, tag_field="kind", tag="tactile_rt alignment scores 2"
+):
+    """One file of scores.
+
+    Attributes:
+        raw: The control that no model is needed for: the readings of the sensors themselves.
+        input: The file name and the SHA-256 sum of the stimuli's loads.
+    """
+
+    benchmark: Benchmark
+    models: tuple[ModelResult, ...]
+    raw: Score
+    input: dict[str, str]
+
+
+def results_of(
+    benchmark: Benchmark, stimuli: StimuliInput, models: Sequence[ModelResult]
+) -> Results:
+    """Scores of models on one benchmark, the sensors themselves beside them."""
+    raw = score(benchmark, {"raw": stimuli.raw()})
+    return Results(benchmark, tuple(models), raw, {"file": stimuli.name, "sha256": stimuli.sha256})
+
+
+def model_result(
+    benchmark: Benchmark,
+    layers: Layers,
+    untrained: Layers | None = None,
+    performance: tuple[float, str] | None = None,
+) -> ModelResult:
+    """Score a model."""
+    patterns = layers.patterns
+    made = score(benchmark, patterns)
+    # The test takes stimuli by their names, which paper-code has lost.
+    checks = neural_checks(made, benchmark) if benchmark.protocol == "strict" else ()
+    test = next((check for check in checks if check.name == "turing"), None)
+    accuracy, measured_on = performance or (math.nan, "")
+    return ModelResult(
+        **{name: getattr(made, name) for name in Score.__struct_fields__},
+        name=layers.name,
+        sha256=layers.sha256,
+        precision=layers.precision,
+        parameters=layers.parameters,
+        first=tuple(int(layers.first[n]) for n in patterns),
+        units=tuple(p.shape[1] for p in patterns.values()),
+        performance=accuracy,
+        performance_of=measured_on,
+        untrained=score(benchmark, untrained.patterns) if untrained else None,
+        notes=(*layers.notes, *_without_rdm(patterns)),
+        groups=_groups(layers),
+        turing=test.verdict if test else "",
+        turing_why=test.why if test else "",
+    )
+
+
+def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
+    """What takes no part in a score, and why: a line for all layers of one reason."""
+    found: dict[tuple[str, ...], list[str]] = {}
+    for layer, responses in patterns.items():
+        there = np.asarray(np.isfinite(normalised(responses)).all(axis=1))
+        if not there.all():
+            alike = tuple(s for s, one in zip(STIMULI, there, strict=True) if not one)
+            found.setdefault(alike, []).append(layer)
+    for alike, layers in found.items():
+        stimuli = "every stimulus" if len(alike) == len(STIMULI) else ", ".join(alike)
+        yield (
+            f"{len(layers)} of {len(patterns)} layers have no RDM and take no part, for all units "
+            f"of each answer {stimuli} alike: {', '.join(layers)}"
+        )
+
+
+def read_results(path: Path) -> Results:
+    """Read scores from the JSON that `tactile-rt align score` writes.
+
+    Raises:
+        ConfigError: not there, damaged, or of another version.
+    """
+    results = read_json(path, Results, "tactile-rt align score --json")
+    check_benchmark(results.benchmark, path)
+    targets = tuple(t.name for t in results.benchmark.all_targets)
+    _check_score(results.raw, targets, ("raw",), f"{path} is damaged: raw sensor input")
+    for model in results.models:
+        where = f"{path} is damaged: {model.name}"
+        _check_score(model, targets, model.layers, where)
+        if not len(model.units) == len(model.first) == len(model.layers):
+            raise ConfigError(f"{where}: units and layers do not fit")
+        if model.untrained is not None:
+            _check_score(model.untrained, targets, model.untrained.layers, where)
+    return results
+
+
+def _check_score(
+    made: Score, targets: tuple[str, ...], layers: tuple[str, ...], where: str
+) -> None:
+    """Check the shapes of the tables of a score."""
+    shape = (len(layers), len(targets))
+    if not (
+        made.layers == layers
+        and made.targets == targets
+        and made.rdms.shape == (len(layers), len(PAIRS))
+        and made.r.shape == made.corrected.shape == made.unfiltered.shape == shape
+        and made.per_target.shape == (len(targets),)
+        and len(made.chosen) == len(made.reliable) == len(targets)
+    ):
+        raise ConfigError(f"{where}: the tables do not fit")
+
+
+def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floats:
+    """RDMs (layer, 15) of the one model in a file of scores on this benchmark and these stimuli.
+
+    Raises:
+        ConfigError: unreadable, of several models, or of another benchmark or other stimuli.
+    """
+    results = read_results(path)
+    if len(results.models) != 1:
+        raise ConfigError(f"{path} has {len(results.models)} models; a baseline is one")
+    if benchmark_sha256(results.benchmark) != benchmark_sha256(benchmark):
+        raise ConfigError(f"{path} was scored on another benchmark: score the baseline on this one")
+    if results.input.get("sha256") != stimuli.sha256:
+        raise ConfigError(
+            f"{path} was scored on other stimuli ({results.input.get('file', 'not named')}) than "
+            f"{stimuli.name}: score the baseline on these"
+        )
+    return results.models[0].rdms
+
+
+def _groups(layers: Layers) -> dict[str, str]:
+    told = {key: layers.network.get(key) for key in ("encoder", "attender")}
+    told |= {key: layers.training.get(key) for key in ("objective", "augmentation", "masking")}
+    return {
+        key: f"{value:g}" if isinstance(value, float) else str(value)
+        for key, value in told.items()
+        if value is not None
+    }

@@ -1,0 +1,136 @@
+"""Scores of a model's layers against a frozen benchmark."""
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tactile_rt.alignment.benchmark import Benchmark
+from tactile_rt.alignment.json_file import Floats, Number
+from tactile_rt.alignment.rdm import PAIRS, STIMULI, pearson, rdm
+from tactile_rt.alignment.statistics import (
+    held_out,
+    highest,
+    max_statistic,
+    mean_held_out,
+    standard_error,
+)
+from tactile_rt.core.errors import ConfigError
+
+__all__ = ["Score", "layer_rdms", "score", "score_rdms"]
+
+
+class Score(msgspec.Struct, frozen=True, eq=False):
+    """How well a model's layers fit a benchmark's targets.
+
+    Attributes:
+        targets: The names of the targets; for paper-code the pooled animals are the last.
+        rdms: (layer, 15) The RDM of each layer.
+        r: (layer, target) Correlations before the correction for noise.
+        corrected: (layer, target) Correlations after the correction for noise; NaN where a layer
+            has no RDM or a target is too noisy.
+        unfiltered: (layer, target) Corrected correlations without the protocol's filter of units.
+        reliable: (target,) Whether each target counts in the score.
+        chosen: The names of the chosen layers: for strict, per target the layer that is best on all
+            other animals, "" where there is none; for paper-code, the one layer of the score.
+        per_target: (target,) The chosen layer's corrected correlation; NaN for unreliable targets.
+        score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
+            `corrected`.
+        sem: The standard error of the score over targets.
+        p: The share of the 720 relabellings of the stimuli, layers chosen anew, that reach the
+            score, at least 1/720.
+        null_95: The 95th percentile of their scores, which chance exceeds once in twenty times.
+    """
+
+    protocol: str
+    layers: tuple[str, ...]
+    targets: tuple[str, ...]
+    rdms: Floats
+    r: Floats
+    corrected: Floats
+    unfiltered: Floats
+    reliable: tuple[bool, ...]
+    chosen: tuple[str, ...]
+    per_target: Floats
+    score: Number
+    sem: Number
+    p: Number
+    null_95: Number
+
+
+def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
+    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`; NaN of a single unit's.
+
+    Raises:
+        ConfigError: a layer of another shape.
+    """
+    rdms = np.empty((len(layers), len(PAIRS)))
+    for i, (name, values) in enumerate(layers.items()):
+        patterns = np.asarray(values, dtype=np.float64)
+        if patterns.ndim != 2 or patterns.shape[0] != len(STIMULI) or patterns.shape[1] < 1:
+            raise ConfigError(
+                f"layer {name}: responses {patterns.shape}, not ({len(STIMULI)} stimuli, units)"
+            )
+        rdms[i] = rdm(patterns)
+    return rdms
+
+
+def score(benchmark: Benchmark, layers: Mapping[str, ArrayLike]) -> Score:
+    """Score layers, given as responses (6, unit) in the order of `STIMULI`.
+
+    Raises:
+        ConfigError: no layer, or one of another shape.
+    """
+    return score_rdms(benchmark, tuple(layers), layer_rdms(layers))
+
+
+def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> Score:
+    """Score layers, given as RDMs (layer, 15); a layer with a NaN scores NaN.
+
+    Raises:
+        ConfigError: no layer, or names and RDMs that do not fit.
+    """
+    rdms = np.asarray(rdms, dtype=np.float64)
+    if not names or rdms.shape != (len(names), len(PAIRS)):
+        raise ConfigError(f"{len(names)} layers and RDMs {rdms.shape} do not fit")
+    targets = benchmark.all_targets
+    goal = np.array([t.chosen.rdm for t in targets])
+    factor = np.array([t.chosen.factor for t in targets])
+    r = pearson(rdms[:, None], goal)
+    corrected = r * factor
+    other = np.array([t.unfiltered.rdm for t in targets])
+    unfiltered = pearson(rdms[:, None], other) * [t.unfiltered.factor for t in targets]
+    reliable = np.array([t.reliable for t in targets])
+    finite = np.flatnonzero(np.isfinite(rdms).all(axis=1) & np.isfinite(r).any(axis=1))
+
+    strict = benchmark.protocol == "strict"
+    values = corrected[np.ix_(finite, reliable)]
+    chosen = np.full(len(targets), -1, dtype=np.intp)
+    if strict:
+        _, best = held_out(values)
+        chosen[reliable] = np.where(best >= 0, finite[best] if finite.size else -1, -1)
+    elif values.size:
+        chosen[:] = finite[np.unravel_index(np.argmax(values), values.shape)[0]]
+    there = (chosen >= 0) & reliable
+    per_target = np.full(len(targets), np.nan)
+    per_target[there] = corrected[chosen[there], np.flatnonzero(there)]
+    test = max_statistic(
+        rdms, goal[reliable], factor[reliable], mean_held_out if strict else highest
+    )
+    return Score(
+        protocol=benchmark.protocol,
+        layers=tuple(names),
+        targets=tuple(t.name for t in targets),
+        rdms=rdms,
+        r=r,
+        corrected=corrected,
+        unfiltered=unfiltered,
+        reliable=tuple(reliable.tolist()),
+        chosen=tuple(names[i] if i >= 0 else "" for i in chosen.tolist()),
+        per_target=per_target,
+        score=test.statistic,
+        sem=standard_error(per_target, ddof=int(strict)),
+        p=test.p,
+        null_95=test.percentile_95,
+    )

@@ -1,0 +1,158 @@
+"""Which recordings and which of their units a benchmark is made of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.settings import no_such
+
+__all__ = ["CELLS", "LAYERS_UM", "TARGET_PARTS", "TASKS", "Selection", "part_of"]
+
+TASKS = ("discrimination", "detection")
+CELLS = ("excitatory", "inhibitory")
+# Depth below the pia in um, as the recordings' author draws them (github.com/cxrodgers/my,
+# plot.py); he calls what is below 1366 um L6b.
+LAYERS_UM = {
+    "L1": (0.0, 128.0),
+    "L2/3": (128.0, 419.0),
+    "L4": (419.0, 626.0),
+    "L5": (626.0, 1006.0),
+    "L6": (1006.0, 1366.0),
+}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is kept of some recordings; by default everything.
+
+    Attributes:
+        task: The task of the sessions, ``discrimination`` or ``detection``; None for both.
+        sessions: Patterns of session names with ``*`` and ``?``, of which one must fit a part of
+            the name; empty for all.
+        depth_um: The depths below the pia in um that units lie between, the first included; None
+            for all.
+        cells: The type of the units, ``excitatory`` or ``inhibitory`` (putative); None for both.
+    """
+
+    task: str | None = None
+    sessions: tuple[str, ...] = ()
+    depth_um: tuple[float, float] | None = None
+    cells: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        task: str | None = None,
+        sessions: Sequence[str] = (),
+        depth: str | None = None,
+        cells: str | None = None,
+    ) -> "Selection":
+        """A selection from texts; depth is a layer, ``L4``, or a range in um, ``419-626``.
+
+        Raises:
+            ConfigError: no such task, layer or cell type, or a range that is none.
+        """
+        for what, value, known in (("task", task, TASKS), ("cell type", cells, CELLS)):
+            if value is not None and value not in known:
+                raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
+        return cls(task, tuple(sessions), _depths(depth) if depth else None, cells)
+
+    def takes(self, session: str) -> bool:
+        """Whether a session's name fits."""
+        return not self.sessions or any(fnmatchcase(session, f"*{p}*") for p in self.sessions)
+
+    def units(
+        self, depth: NDArray[np.float64] | None, inhibitory: NDArray[np.bool_] | None, number: int
+    ) -> NDArray[np.bool_]:
+        """Which of a session's units are kept, (unit,).
+
+        Args:
+            depth: (unit,) in um below the pia, or None.
+            inhibitory: (unit,) or None.
+            number: of units.
+
+        Raises:
+            ConfigError: what is asked for is not known of the session's units.
+        """
+        kept = np.ones(number, dtype=np.bool_)
+        if self.depth_um is not None:
+            if depth is None:
+                raise ConfigError("has no column units/depth to select by")
+            low, high = self.depth_um
+            kept &= (depth >= low) & (depth < high)
+        if self.cells is not None:
+            if inhibitory is None:
+                raise ConfigError("has no column units/inhibitory of 0 and 1 to select by")
+            kept &= inhibitory == (self.cells == "inhibitory")
+        return kept
+
+    def __str__(self) -> str:
+        parts = [
+            self.task or "",
+            " or ".join(self.sessions),
+            "{:g}-{:g} um deep".format(*self.depth_um) if self.depth_um else "",
+            self.cells or "",
+        ]
+        return ", ".join(part for part in parts if part)
+
+
+def _depths(text: str) -> tuple[float, float]:
+    named = {name.replace("/", ""): depths for name, depths in LAYERS_UM.items()}
+    if (known := named.get(text.upper().replace("/", ""))) is not None:
+        return known
+    low, _, high = text.partition("-")
+    try:
+        depths = float(low), float(high)
+    except ValueError:
+        depths = (0.0, 0.0)
+    if not 0 <= depths[0] < depths[1] < np.inf:
+        raise ConfigError(
+            f"depth {text!r} is neither a layer ({', '.join(LAYERS_UM)}) nor a range in um, 419-626"
+        )
+    return depths
+
+
+TARGET_PARTS = ("all", *LAYERS_UM, *CELLS)
+
+
+def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
+    """Keep the units of one part of cortex; animals without any are left out.
+
+    A mouse's borders differ from those of `LAYERS_UM`, and what lies at a border is what its depth
+    says.
+
+    Raises:
+        ConfigError: no such part.
+    """
+    if part not in TARGET_PARTS:
+        raise ConfigError(no_such("part of cortex", part, TARGET_PARTS))
+    if part == "all":
+        return tuple(animals)
+    kept = []
+    for animal in animals:
+        sessions = tuple(cut for s in animal.sessions if (cut := _cut_session(s, part)) is not None)
+        if sessions:
+            kept.append(replace(animal, sessions=sessions))
+    return tuple(kept)
+
+
+def _cut_session(session: NeuralSession, part: str) -> NeuralSession | None:
+    wanted = Selection(depth_um=LAYERS_UM.get(part), cells=part if part in CELLS else None)
+    try:
+        chosen = wanted.units(session.depth, session.inhibitory, session.rates.shape[1])
+    except ConfigError:  # it is not known of them
+        return None
+    if not chosen.any():
+        return None
+    return replace(
+        session,
+        rates=session.rates[:, chosen],
+        course=None if session.course is None else session.course[..., chosen],
+        depth=None if session.depth is None else session.depth[chosen],
+        inhibitory=None if session.inhibitory is None else session.inhibitory[chosen],
+    )

@@ -1,0 +1,296 @@
+"""Protocol `strict`: the default.
+
+- Stimuli are named; sessions pool by name, and nothing that was not shown counts.
+- *Cross-fit.* Trials are divided in two within every session and stimulus: on one half units are
+  chosen (reliability of their tuning > 0.5), on the other everything is scored, and the other way
+  round. An RDM is the mean over many such divisions, in both directions; no one draw decides.
+- An animal's reliability is that of the RDM of a scored half: its own halves correlate by r, and
+  Spearman-Brown makes that of the mean over all divisions, negative ones included. It corrects for
+  noise once, and an animal at or below zero is not scored. Only animals whose RDM has a reliability
+  of at least 0.5 count in a mean.
+- The same without the choice of units stands beside it.
+- Divisions are drawn from trials in an order that depends on nothing but the data (`canonical`), so
+  that neither the order of files, trials and units nor the scale of rates matters.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
+from tactile_rt.alignment.canonical import canonical
+from tactile_rt.alignment.neural import Animal, NeuralSession, rates_sha256
+from tactile_rt.alignment.rdm import CONSTANT, STIMULI, UPPER, normalised, pearson
+from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
+from tactile_rt.core.errors import ConfigError, name_some
+
+__all__ = [
+    "MINIMUM_RELIABILITY",
+    "MINIMUM_TRIALS",
+    "MINIMUM_UNITS",
+    "Divided",
+    "Moments",
+    "divided",
+    "freeze_strict",
+    "moments_of",
+]
+
+Floats = NDArray[np.float64]
+
+MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
+MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves
+TIE = 1e-9
+MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over units of responses to six stimuli.
+
+    Attributes:
+        units: (...) The number of units that the sums run over.
+        sums: (..., 6) The sum over units of the response to each stimulus.
+        products: (..., 6, 6) The sum over units of the products of the responses to two stimuli.
+    """
+
+    units: Floats
+    sums: Floats
+    products: Floats
+
+    def __add__(self, other: "Moments") -> "Moments":
+        return Moments(
+            self.units + other.units, self.sums + other.sums, self.products + other.products
+        )
+
+    def rdm(self) -> Floats:
+        """RDMs (..., 15); NaN where a stimulus's response is the same in all units."""
+        units = np.maximum(self.units, 1)[..., None]
+        mean = self.sums / units
+        covariance = self.products - units[..., None] * mean[..., :, None] * mean[..., None, :]
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        scale = np.diagonal(self.products, axis1=-2, axis2=-1)
+        deviation = np.sqrt(np.where(variance > np.sqrt(CONSTANT) * scale, variance, np.nan))
+        correlation = covariance / (deviation[..., :, None] * deviation[..., None, :])
+        return np.asarray(1 - correlation[..., UPPER[0], UPPER[1]])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pool:
+    """Units of an animal, or of several, in every division and both halves of it.
+
+    Attributes:
+        halves: (division, 2, ...) The moments of the mean responses over each half of the trials,
+            of the units that were chosen on the other half.
+        quarters: (division, 2, 2, ...) The same of the two halves of each half.
+    """
+
+    halves: Moments
+    quarters: Moments
+
+    def __add__(self, other: "_Pool") -> "_Pool":
+        return _Pool(self.halves + other.halves, self.quarters + other.quarters)
+
+    def freeze(self) -> Frozen:
+        """Mean RDM, reliability and the factor that corrects for noise.
+
+        A model's score is the mean over halves of its correlation with their RDMs, over the root of
+        their reliability. Correlations are products of RDMs of length one, so that mean is the
+        product with the mean of these, whose length goes into the factor.
+        """
+        enough = self.halves.units >= MINIMUM_UNITS
+        rdms = self.halves.rdm()
+        parts = self.quarters.rdm()
+        r = pearson(parts[..., 0, :], parts[..., 1, :])
+        unit = normalised(rdms)
+        there = enough & np.isfinite(r) & np.isfinite(unit).all(axis=-1)
+        units = round(float(self.halves.units.mean()))
+        if 2 * there.sum() < there.size:
+            return Frozen(np.zeros(rdms.shape[-1]), np.nan, np.nan, units)
+        reliability = float(spearman_brown(r[there].mean()))
+        mean = unit[there].mean(axis=0)
+        length = float(np.sqrt(mean @ mean))
+        factor = length / np.sqrt(reliability) if reliability > 0 else np.nan
+        level = rdms[there].mean(axis=-1, keepdims=True)
+        spread = np.sqrt(((rdms[there] - level) ** 2).sum(axis=-1)).mean()
+        return Frozen(level.mean() + spread * mean, reliability, float(factor), units)
+
+
+def freeze_strict(
+    animals: Sequence[Animal],
+    bootstraps: int = BOOTSTRAPS,
+    seed: int = SEED,
+    progress: Callable[[float], None] = lambda share: None,
+) -> Benchmark:
+    """Reliabilities and RDMs of animals, and their consistency.
+
+    Args:
+        animals: whose rates count from first contact to choice, and no session twice.
+        bootstraps: the number of divisions of the trials; each is used in both directions.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigError: no session can be used.
+    """
+    names, notes = [], []
+    targets: list[Target] = []
+    pools: list[_Pool] = []
+    for done, animal in enumerate(sorted(animals, key=lambda a: a.name), start=1):
+        sessions = []
+        for session in sorted(animal.sessions, key=lambda s: s.name):
+            few = [f"{n} of {s}" for s, n in zip(STIMULI, session.trials, strict=True)
+                   if n < MINIMUM_TRIALS]  # fmt: skip
+            if few:
+                notes.append(
+                    f"session {session.name} left out: it has {', '.join(few)}, "
+                    f"and every stimulus needs {MINIMUM_TRIALS} correct trials"
+                )
+            else:
+                sessions.append(session)
+        if not sessions:
+            notes.append(f"animal {animal.name} left out: none of its sessions can be used")
+            progress(done / len(animals))
+            continue
+        ordered = sorted((canonical(s) for s in sessions), key=lambda pair: pair[1])
+        every, kept = _pools(ordered, bootstraps, seed)
+        chosen = kept.freeze()
+        names.append(animal.name)
+        pools.append(kept)
+        targets.append(
+            Target(
+                name=animal.name,
+                chosen=chosen,
+                unfiltered=every.freeze(),
+                reliable=bool(chosen.reliability >= MINIMUM_RELIABILITY),
+                trials=sum(len(s.stimulus) for s in sessions),
+                sha256=_sha256([one for one, _ in ordered]),
+            )
+        )
+        progress(done / len(animals))
+    if not targets:
+        raise ConfigError(f"no animal can be used: {name_some(notes, 1)}")
+    return Benchmark(
+        protocol="strict",
+        targets=tuple(targets),
+        pooled=None,
+        a2a=_consistency(tuple(names), targets, pools),
+        bootstraps=bootstraps,
+        seed=seed,
+        notes=tuple(notes),
+    )
+
+
+def _sha256(sessions: Sequence[NeuralSession]) -> str:
+    arrays = {f"{i} rates": s.rates for i, s in enumerate(sessions)}
+    return rates_sha256(arrays | {f"{i} stimulus": s.stimulus for i, s in enumerate(sessions)})
+
+
+def _pools(
+    sessions: Sequence[tuple[NeuralSession, int]], divisions: int, seed: int
+) -> tuple[_Pool, _Pool]:
+    """All units, and the reliable ones, of an animal's canonical sessions and their keys."""
+    every, kept = [], []
+    for session, key in sessions:
+        made = divided(session, divisions, np.random.default_rng([seed, key]))
+        every.append(_Pool(moments_of(made.halves), moments_of(made.quarters)))
+        chosen = made.reliable[:, ::-1]  # on the other half than is scored
+        kept.append(
+            _Pool(moments_of(made.halves, chosen), moments_of(made.quarters, chosen[:, :, None]))
+        )
+    return _sum(every), _sum(kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Divided:
+    """Random divisions of a session's trials in two, and of each half in two.
+
+    Attributes:
+        halves: (division, 2, 6, unit) The mean responses over each half of the trials.
+        quarters: (division, 2, 2, 6, unit) The mean responses over each half of each half.
+        reliable: (division, 2, unit) Whether the tuning of a unit over that half of the trials has
+            a reliability above `MINIMUM_RELIABILITY`.
+    """
+
+    halves: Floats
+    quarters: Floats
+    reliable: NDArray[np.bool_]
+
+
+def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) -> Divided:
+    """Divide trials within every stimulus at random.
+
+    A unit's reliability is the share of the variance over stimuli of its mean responses that noise,
+    known from the variance within stimuli, does not explain: 1 - 1/F of an analysis of variance. It
+    is what Spearman-Brown makes of the correlation of two halves, without drawing any.
+    """
+    units = session.rates.shape[1]
+    quarters = np.empty((divisions, 4, len(STIMULI), units))
+    halves = np.empty((divisions, 2, len(STIMULI), units))
+    noise = np.zeros((divisions, 2, units))  # variance of a mean response, mean over stimuli
+    for stimulus in range(len(STIMULI)):
+        rates = session.rates[session.stimulus == stimulus]
+        n = len(rates)
+        # Sizes of the quarters differ by one at most, and so do those of the halves.
+        edges = np.array([n // 4, n // 2, n // 2 + (n - n // 2) // 2])
+        place = np.searchsorted(edges, np.arange(n), side="right")
+        drawn = rng.permuted(np.broadcast_to(place, (divisions, n)), axis=1)
+        member = (drawn[:, None, :] == np.arange(4)[:, None]).astype(np.float64)
+        sizes = np.bincount(place, minlength=4)[:, None]
+        sums, squares = member @ rates, member @ rates**2
+        quarters[:, :, stimulus] = sums / sizes
+        sizes = sizes[0::2] + sizes[1::2]
+        mean = (sums[:, 0::2] + sums[:, 1::2]) / sizes
+        spread = np.maximum((squares[:, 0::2] + squares[:, 1::2]) / sizes - mean**2, 0)
+        halves[:, :, stimulus] = mean
+        noise += spread / (sizes - 1) / len(STIMULI)
+    signal = halves.var(axis=2, ddof=1)
+    varies = signal > CONSTANT * (halves**2).mean(axis=2)
+    # Counts of spikes are whole, so that a unit may be just at the limit: rounding must not decide.
+    reliable = varies & (noise < (1 - MINIMUM_RELIABILITY - TIE) * signal)
+    return Divided(halves, quarters.reshape(divisions, 2, 2, len(STIMULI), units), reliable)
+
+
+def _consistency(
+    names: tuple[str, ...], targets: Sequence[Target], pools: Sequence[_Pool]
+) -> Consistency:
+    """Each reliable animal against all other reliable ones pooled, and against each of them."""
+    pooled = np.full(len(names), np.nan)
+    pairwise = np.full((len(names), len(names)), np.nan)
+    usable = [i for i, target in enumerate(targets) if target.reliable]
+    for i in usable:
+        mine = targets[i].chosen
+        others = [j for j in usable if j != i]
+        if not others:
+            break
+        source = _sum([pools[j] for j in others]).freeze()
+        pooled[i] = pearson(source.rdm, mine.rdm) * source.factor * mine.factor
+        for j in others:
+            other = targets[j].chosen
+            pairwise[i, j] = pearson(mine.rdm, other.rdm) * mine.factor * other.factor
+    return Consistency(names, pooled, pairwise)
+
+
+def _sum(pools: Sequence[_Pool]) -> _Pool:
+    total = pools[0]
+    for pool in pools[1:]:
+        total = total + pool
+    return total
+
+
+def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:
+    """Moments of responses (..., 6, unit).
+
+    Args:
+        counted: (..., unit) which units count; default: all.
+    """
+    if counted is None:
+        units = np.full(patterns.shape[:-2], float(patterns.shape[-1]))
+    else:
+        units = counted.sum(axis=-1, dtype=np.float64)
+        patterns = np.where(counted[..., None, :], patterns, 0.0)
+    return Moments(
+        units=units,
+        sums=patterns.sum(axis=-1),
+        products=np.matmul(patterns, np.swapaxes(patterns, -1, -2)),
+    )

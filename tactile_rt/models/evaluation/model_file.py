@@ -1,0 +1,312 @@
+"""What a model file can do on objects that it never saw: the figures of `tactile-rt eval`.
+
+The model runs as on a robot: the ONNX file itself, step by step, from where the contact detector
+finds its onset.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.decision_rules import UNKNOWN
+from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
+from tactile_rt.models.datasets import SweepSet, relabelled
+from tactile_rt.models.disturbances import Disturbance
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.promises import familiarity, named_faults, promises
+from tactile_rt.models.evaluation.records import Record
+from tactile_rt.models.evaluation.robustness import (
+    measure_robustness,
+    rated_amount,
+    robustness_records,
+)
+from tactile_rt.models.evaluation.windows import stepped
+from tactile_rt.sets.manifest import WITHHELD
+
+__all__ = ["evaluate_model"]
+
+# By the number of classes: of the shipped recipes `mouse12` and `default24`.
+BARS = {
+    12: {"top-1": ">= 91", "top-5": ">= 99", "fused": ">= 97"},
+    24: {"top-1": ">= 82", "top-5": ">= 97", "fused": ">= 96", "noise": "<= 4"},
+}
+ECE_BAR = "<= 5"
+# The same sweeps under every condition of a long list: this many of each object are enough.
+ROBUSTNESS_SWEEPS, QUICK_SWEEPS = 4, 2
+
+
+def evaluate_model(
+    model: Path,
+    data: Path,
+    svm: bool = False,
+    pictures: Path | None = None,
+    quick: bool = False,
+) -> list[Record]:
+    """Measure a model on the test split of a sweep set.
+
+    Args:
+        model: the ``.onnx`` file.
+        svm: fit an RBF support vector machine on the same windows to compare with.
+        pictures: folder for ``confusion.png`` and ``accuracy_over_time.png``.
+        quick: take two sweeps of each object: enough to compare by, not to quote.
+
+    Raises:
+        ConfigError: the model was trained on some of the test objects, does not know all of their
+            categories, or another sample period.
+        SpecMismatch: the model was made for another array than a set's.
+        ModelError, RecordingError: a file cannot be read.
+    """
+    session, card = load_model(model)
+    run = stepped(session, card)
+    test = _tested_on(data, card, model, quick)
+    labels, objects = test.sweeps.labels, test.sweeps.objects
+    if _met(card, test):
+        raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+    sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
+
+    clean = measures.predict(test, run)
+    over_time = measures.accuracy_over_time(clean, labels)
+    # of objects of the kind that it was trained on
+    bars = {} if _from_elsewhere(test, card) else BARS.get(len(card.classes), {})
+    records = [
+        _accuracy("top-1", clean[:, -1], labels, objects, bars.get("top-1", ""), sample),
+        _accuracy("top-5", clean[:, -1], labels, objects, bars.get("top-5", ""), sample, top=5),
+        _accuracy("top-1 at step 14 of 22", clean[:, 13], labels, objects, "", sample),
+    ]
+    for sweeps, count, bar in ((2, "two", bars.get("fused", "")), (4, "four", "")):
+        if np.unique(objects, return_counts=True)[1].max() >= sweeps:  # enough of one object
+            fused = measures.fused_accuracy(clean[:, -1], labels, objects, sweeps)
+            records.append(_record(f"{count} sweeps fused", fused, bar, sample))
+    settled = measures.deciding_step(clean, labels)
+    step_ms = card.period_ns * card.substeps * 1e-6
+    if settled.any():
+        median = float(np.median(settled[settled > 0])) * step_ms
+        how = f"from contact onset, where it is right in the end; {sample}"
+        name = "models.time to the final decision"
+        records.append(Record(name, median, "ms", anchor="median", how=how))
+    noisy = measures.predict(test, run, 1.0)
+    rated, period_ms = rated_amount(test), card.period_ns * 1e-6
+    recorded = test.manifest.recorded
+    added = f"white noise {rated} added to every {period_ms:g} ms sample"
+    how = f"{sample}; {'none added to that of the recordings' if recorded else added}, "
+    how += "undetected sweeps count as "
+    records.append(
+        _accuracy("top-1 at rated noise", noisy[:, -1], labels, objects, "", how + "wrong")
+    )
+    lost, bar = records[0].value - records[-1].value, bars.get("noise", "")
+    name = "models.points lost at rated noise"
+    records.append(Record(name, lost, "points", bar, how=how + "wrong"))
+    if test.manifest.sensor is None and not recorded:
+        # The same noise on samples of 1 kHz: the resampler's Hann kernel leaves 0.29.
+        raw = measures.predict(test, run, float(np.sqrt(1.5 / 18)))
+        how = f"{sample}; white noise {rated} on every 1 kHz sample, through the resampler"
+        name = "top-1 at rated noise of 1 kHz samples"
+        records.append(_accuracy(name, raw[:, -1], labels, objects, "", how))
+    few = _first_of_each(test, ROBUSTNESS_SWEEPS)
+    robustness = measure_robustness(few, run, clean[_firsts(objects, ROBUSTNESS_SWEEPS), -1])
+    records += robustness_records(robustness, f"{len(few.sweeps)} of the sweeps")
+    records += _calibration(clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample)
+    undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
+    records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
+    unknown = None
+    if test.manifest.split.get(WITHHELD):
+        unknown = replace(SweepSet.read(data, WITHHELD), window=test.window)
+        if quick:
+            unknown = _first_of_each(unknown, QUICK_SWEEPS)
+        records.append(_open_set(model, unknown, test))
+    records += _refusals_and_candidates(model, test, unknown, sample)
+    if svm:
+        right = measures.hits(clean[:, -1], labels)
+        records += _compare_svm(data, card, test, right)
+    if pictures is not None:
+        from tactile_rt.models.evaluation.pictures import draw_accuracy_over_time, draw_confusion
+
+        table = measures.confusion(clean[:, -1], labels, len(card.classes))
+        draw_confusion(table, card.classes, pictures / "confusion.png")
+        curves = {
+            "as recorded" if recorded else "no sensor noise": over_time,
+            f"rated noise ({rated} per sample)": measures.accuracy_over_time(noisy, labels),
+        }
+        draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
+    return records
+
+
+def _tested_on(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSet:
+    """A set's test split with the labels that the model has for its categories, and its windows."""
+    test, known = SweepSet.read(data, "test"), card.classes
+    differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
+    if differences:
+        raise SpecMismatch(
+            f"{model} was made for another array than {data} is of: " + "; ".join(differences)
+        )
+    if test.manifest.period_ns != card.period_ns:
+        raise ConfigError(
+            f"{model} takes a sample every {card.period_ns} ns, {data} has one every "
+            f"{test.manifest.period_ns} ns"
+        )
+    strange = [name for name in test.manifest.categories if name not in known]
+    if strange:
+        raise ConfigError(
+            f"{model} does not know {name_some(strange)} of {data}: leave them out of "
+            "objects.categories, or name them in objects.withheld"
+        )
+    number = np.array([known.index(name) for name in test.manifest.categories])
+    test = replace(test, sweeps=replace(test.sweeps, labels=number[test.sweeps.labels]))
+    training = card.provenance.get("training")
+    if isinstance(training, dict):
+        test = replace(test, window=training.get("window", "onset"))
+    return _first_of_each(test, QUICK_SWEEPS) if quick else test
+
+
+def _met(card: ModelCard, test: SweepSet) -> bool:
+    """Whether the model was, or may have been, trained on objects of the test."""
+    names = set(test.sweeps.objects.tolist())
+    trained = card.provenance.get("trained_objects")
+    if isinstance(trained, dict):
+        return not names.isdisjoint(trained.get(test.manifest.source, ()))
+    unseen = set(card.provenance.get("unseen_objects", ()))
+    return not _from_elsewhere(test, card) and bool(unseen) and not names <= unseen
+
+
+def _from_elsewhere(test: SweepSet, card: ModelCard) -> bool:
+    """Whether the objects are not of the source that the model was trained on."""
+    trained: Any = card.provenance.get("sweep_set", {})
+    source = trained.get("objects", {}).get("from") if isinstance(trained, dict) else None
+    return source is not None and test.manifest.recipe.get("objects", {}).get("from") != source
+
+
+def _accuracy(
+    name: str,
+    posteriors: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    objects: NDArray[np.str_],
+    bar: str,
+    how: str,
+    top: int = 1,
+) -> Record:
+    correct = measures.hits(posteriors, labels, top)
+    return _record(name, measures.accuracy(correct, objects), bar, how)
+
+
+def _record(
+    name: str, estimate: measures.Interval, bar: str, how: str, unit: str = "%", beside: str = ""
+) -> Record:
+    """Give a share as a figure in percent, with its interval."""
+    interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
+    return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
+
+
+def _calibration(
+    clean: NDArray[np.float32],
+    noisy: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    objects: NDArray[np.str_],
+    temperature: float,
+    sample: str,
+) -> list[Record]:
+    """ECE as shipped, of the logits as they were trained, and at rated noise."""
+    cases = (
+        ("calibration error", clean, ECE_BAR, f"at temperature {temperature:.3g}"),
+        (
+            "calibration error without temperature scaling",
+            measures.at_temperature(clean, 1 / temperature),
+            "",
+            "logits as they were trained",
+        ),
+        ("calibration error at rated noise", noisy, "", f"at temperature {temperature:.3g}"),
+    )
+    records = []
+    for name, posteriors, bar, how in cases:
+
+        def ece(at: NDArray[np.int64], p: NDArray[np.float32] = posteriors) -> float:
+            return measures.expected_calibration_error(p[at], labels[at])
+
+        estimate = measures.bootstrap(ece, objects)
+        records.append(_record(name, estimate, bar, f"15 bins, {how}; {sample}"))
+    return records
+
+
+def _refusals_and_candidates(
+    model: Path, test: SweepSet, unknown: SweepSet | None, sample: str
+) -> list[Record]:
+    """What becomes of a model's promises; nothing of one that makes none."""
+    records, refusals = [], set(load_model(model)[1].refusals)
+    for noise, when in ((0.0, ""), (1.0, " at rated noise")):
+        found = promises(model, test, Disturbance(noise=noise))
+        if found is None:
+            return []
+        if found.coverage == found.coverage:
+            how = f"promised: {100 * found.coverage:g} %; {sample}"
+            records.append(_record(f"truth always among the candidates{when}", found.kept, "", how))
+            size = found.size
+            interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
+            name = f"models.candidates at the last step{when}"
+            records.append(Record(name, size.value, "", "", interval, sample))
+        if UNKNOWN in refusals:
+            records.append(_record(f"known things called unknown{when}", found.unknown, "", sample))
+        if refusals - {UNKNOWN}:
+            records.append(_record(f"sound loads called faulty{when}", found.faulty, "", sample))
+    if unknown is not None and (found := promises(model, unknown)):
+        how = f"{len(unknown.sweeps)} sweeps of withheld kinds"
+        records.append(_record("unknown things called unknown", found.unknown, "", how))
+    for name, share in named_faults(model, test):
+        records.append(_record(f"{name}, named as a fault", share, "", sample))
+    return records
+
+
+def _open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
+    """How well a model tells categories that training never saw from those it did."""
+    there, here = familiarity(model, unknown), familiarity(model, known)
+    scores = np.concatenate([here, there])
+
+    def area(at: NDArray[np.int64]) -> float:
+        mine = at < len(here)
+        return measures.auroc(scores[at[mine]], scores[at[~mine]])
+
+    names = np.concatenate([known.sweeps.objects, unknown.sweeps.objects])
+    estimate = measures.bootstrap(area, names)
+    how = f"{len(here)} sweeps of known and {len(there)} of withheld kinds"
+    name = "known against withheld categories"
+    return _record(name, estimate, "", how, "% AUROC", "; 50: chance")
+
+
+def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
+    """Indices of the first sweeps of every object."""
+    mine = [np.flatnonzero(objects == name)[:sweeps] for name in dict.fromkeys(objects.tolist())]
+    return np.concatenate(mine)
+
+
+def _first_of_each(data: SweepSet, sweeps: int) -> SweepSet:
+    return data[_firsts(data.sweeps.objects, sweeps)]
+
+
+def _compare_svm(
+    data: Path, card: ModelCard, test: SweepSet, network: NDArray[np.bool_]
+) -> list[Record]:
+    """A network (sweep,), right or not, beside an RBF support vector machine on the same windows.
+
+    Raises:
+        RecordingError: the set's training or validation split cannot be read.
+    """
+    from tactile_rt.models.svm import fit_svm  # scikit-learn takes a second to import
+
+    learnt_from = (  # by the labels that the test's have here, the model's
+        replace(relabelled(SweepSet.read(data, split), card.classes), window=test.window)
+        for split in ("train", "validation")
+    )
+    svm = fit_svm(*learnt_from)
+    right, objects = svm.hits(test), test.sweeps.objects
+    own = measures.accuracy(right, objects)
+    above = measures.accuracy(network.astype(np.float64) - right, objects)
+    same = "; the same test sweeps"
+    return [
+        _record("RBF SVM top-1", own, "", svm.how, beside=same),
+        _record("points above the SVM", above, ">= 3", svm.how, "points", same),
+    ]

@@ -1,0 +1,107 @@
+"""A model with a sensor that is not what it was trained on: noisy, drifting, wrong, half dead."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.disturbances import OFFSET, Disturbance
+from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.records import Record
+
+__all__ = [
+    "Robustness",
+    "conditions",
+    "measure_robustness",
+    "rated_amount",
+    "robustness_records",
+]
+
+
+REST = 80  # samples: 0.7 s of a mouse's, which a tare can be taken from
+
+
+def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
+    """The rated noise per sample in words, or a multiple of it, e.g. 10 uN and 0.05 uN m."""
+    largest: dict[str, float] = {}
+    for unit, noise in zip(data.manifest.spec.units, data.noise.tolist(), strict=True):
+        largest[unit] = max(largest.get(unit, 0.0), noise)
+    return " and ".join(f"{1e6 * factor * v:.3g} u{unit}" for unit, v in largest.items())
+
+
+def conditions(data: SweepSet) -> dict[str, Disturbance]:
+    """What is tried, by name: amounts are those of the set's own sensor."""
+    rated, whiskers = rated_amount(data), len(data.manifest.spec.elements)
+    found = {
+        "noise at a quarter of the rated": Disturbance(noise=0.25),
+        "noise at half the rated": Disturbance(noise=0.5),
+        f"rated noise, {rated}": Disturbance(noise=1.0),
+        f"rated noise, after {REST} samples of rest": Disturbance(noise=1.0, rest=REST),
+        "noise at twice the rated": Disturbance(noise=2.0),
+        f"offset of {rated_amount(data, OFFSET / 4)} after the tare": Disturbance(offset=0.25),
+        f"offset of {rated_amount(data, OFFSET)} after the tare": Disturbance(offset=1.0),
+        f"drift of {rated_amount(data, OFFSET)} in a window": Disturbance(drift=1.0),
+        "gain error of 20 % per whisker": Disturbance(gain=0.2),
+    }
+    if whiskers > 1:
+        dead = max(1, whiskers // 5)
+        found[f"{dead} dead whisker{'s' if dead > 1 else ''}"] = Disturbance(dead=dead)
+    if data.manifest.spec.grid_shape[0] > 1:
+        found["a dead row of whiskers"] = Disturbance(rows=1)
+    channels = data.manifest.spec.channels
+    if any(name.endswith("x") and f"{name[:-1]}y" in channels for name in channels):
+        found["x and y connected the wrong way round"] = Disturbance(swapped=True)
+    if data.manifest.recorded:  # with a noise that cannot be taken out of them
+        return {name: d for name, d in found.items() if not 0 < d.noise <= 1}
+    return found
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """Accuracy under one condition, and the points that it costs on the same sweeps."""
+
+    name: str
+    accuracy: measures.Interval
+    lost: measures.Interval
+
+
+def measure_robustness(
+    test: SweepSet, run: measures.Step, clean: NDArray[np.float32]
+) -> list[Robustness]:
+    """Accuracy under every condition, the first without any.
+
+    Args:
+        run: as `measures.predict` takes it.
+        clean: (sweep, class) final posteriors of the same sweeps, undisturbed.
+    """
+    labels, objects = test.sweeps.labels, test.sweeps.objects
+    base = measures.hits(clean, labels)
+    nothing = measures.Interval(0.0, 0.0, 0.0)
+    found = [Robustness("an ideal sensor", measures.accuracy(base, objects), nothing)]
+    for name, disturbance in conditions(test).items():
+        there = measures.predict(test, run, disturbance=disturbance)[:, -1]
+        right = measures.hits(there, labels)
+        lost = measures.accuracy(base.astype(np.float64) - right, objects)
+        found.append(Robustness(name, measures.accuracy(right, objects), lost))
+    return found
+
+
+def robustness_records(found: list[Robustness], how: str) -> list[Record]:
+    """One figure per condition.
+
+    Args:
+        found: as `measure_robustness` gives it.
+    """
+    return [
+        Record(
+            f"models.top-1, {r.name}",
+            100 * r.accuracy.value,
+            "%",
+            "",
+            f"95 % interval {100 * r.accuracy.low:.1f} to {100 * r.accuracy.high:.1f}, by object",
+            f"{100 * r.lost.value:.1f} points lost ({100 * r.lost.low:.1f} to "
+            f"{100 * r.lost.high:.1f}); {how}",
+        )
+        for r in found[1:]
+    ]

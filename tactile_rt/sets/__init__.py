@@ -1,0 +1,1 @@
+"""Sweep sets at rest, which simulation makes, recordings are cut into, and networks learn from."""

@@ -1,0 +1,301 @@
+"""What a sweep set is: its array, period, categories, and which objects are on which side of it.
+
+sets/default24/
+    manifest.json      what the set is: array, period, categories, split by object, recipe
+    mug-17.npz         every sweep of one object
+    skipped.json       objects that could not be made, and why
+    SHA256SUMS         of all these, once the set is finished: `sha256sum -c` reads it too
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tactile_rt.core.errors import ConfigError, RecordingError, name_some
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.sensor_spec import ChannelLimits, SensorSpec, channel_limits
+from tactile_rt.core.stream import ArraySpec
+from tactile_rt.sets.sensor_faults import SensorFaults
+
+__all__ = [
+    "OUTLIERS",
+    "RECORDED_VERSION",
+    "RECORDINGS",
+    "SPLITS",
+    "UNLABELLED",
+    "WITHHELD",
+    "SweepManifest",
+    "check_labelled",
+    "check_split",
+    "has_object",
+    "join_manifests",
+    "object_path",
+    "split_by_object",
+    "trained_objects",
+]
+
+SET_VERSION = 2
+RECORDED_VERSION = 3  # of recordings: who does not know them would add their noise again
+READABLE = (SET_VERSION, RECORDED_VERSION)
+MANIFEST, SKIPPED = "manifest.json", "skipped.json"
+CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
+FAULTS = "faults"  # in the recipe, see `sensor_faults`
+RECORDINGS = "recordings"  # in the recipe of a set that is made of them
+UNLABELLED = "unlabelled"  # the category of touches of which nobody said what was touched
+SPLITS = ("train", "validation", "test")
+# Further splits, of categories that are labelled -1: training never sees the first, and may learn
+# from the second what to refuse.
+WITHHELD, OUTLIERS = "withheld", "outliers"
+
+
+@dataclass(frozen=True)
+class SweepManifest:
+    """What a sweep set is.
+
+    Attributes:
+        period_ns: The sample period of the stored arrays, ns.
+        lead: The number of samples at the start of every sweep before the object can touch.
+        categories: The names of the classes; a label is an index into them.
+        split: The object names of each split, each ``category-index`` unless `category_of` has it.
+        recipe: What made the set (profile, seed, sweeps per object ...), for provenance.
+        withheld: The categories of the splits "withheld" and "outliers".
+        category_of: The category of objects whose name does not tell it.
+        versions: The versions of what made the set (mujoco, numpy, ...).
+        sensor: The description of the array's sensor; None: it has none, and the values are base
+            loads.
+        version: The version of the set's format: 2 of simulated sweeps, 3 of recorded ones.
+    """
+
+    spec: ArraySpec
+    period_ns: int
+    lead: int
+    categories: tuple[str, ...]
+    split: dict[str, tuple[str, ...]]
+    recipe: dict[str, Any] = field(default_factory=dict)
+    version: int = SET_VERSION
+    withheld: tuple[str, ...] = ()
+    category_of: dict[str, str] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, float | str] = field(default_factory=dict)
+    sensor: SensorSpec | None = None
+
+    @property
+    def faults(self) -> SensorFaults:
+        """What training draws to be wrong with the sensor.
+
+        Raises:
+            RecordingError: the recipe says it in a way that cannot be.
+        """
+        try:
+            return msgspec.convert(self.recipe.get(FAULTS, {}), SensorFaults)
+        except (msgspec.ValidationError, ConfigError) as error:
+            raise RecordingError(f"{MANIFEST} is damaged: {error}") from None
+
+    @property
+    def source(self) -> str:
+        """Where the objects come from, as its recipe says it; "" if it does not."""
+        objects = self.recipe.get("objects")
+        return str(objects.get("from", "")) if isinstance(objects, dict) else ""
+
+    @property
+    def recorded(self) -> bool:
+        """Whether its sweeps were recorded, with the noise of their sensor, not simulated."""
+        return RECORDINGS in self.recipe
+
+    @property
+    def limits(self) -> ChannelLimits:
+        """What a network may believe of the channels."""
+        return channel_limits(self.spec, self.sensor, self.period_ns)
+
+    def names(self, splits: Sequence[str] = ()) -> list[str]:
+        """Object names of these splits, or of all.
+
+        Raises:
+            ConfigError: no such split.
+        """
+        for split in splits:
+            if split not in self.split:
+                raise ConfigError(f"no split {split!r}: there are {name_some(self.split)}")
+        return [name for split in dict.fromkeys(splits or self.split) for name in self.split[split]]
+
+    def category(self, name: str) -> str:
+        """The category of an object.
+
+        Raises:
+            RecordingError: it is of none that the set names.
+        """
+        category = self.category_of.get(name) or name.rpartition("-")[0]
+        if category not in self.categories and category not in self.withheld:
+            raise RecordingError(f"{MANIFEST} is damaged: {name} is of no category it names")
+        return category
+
+    def label(self, name: str) -> int:
+        """The label of an object: -1 if its category is withheld from training."""
+        category = self.category(name)
+        return self.categories.index(category) if category in self.categories else -1
+
+    def write(self, folder: Path) -> None:
+        """Write into a folder, or check that the set already there is this very one.
+
+        Raises:
+            ConfigError: the folder holds another set, or things that are none.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / MANIFEST
+        if not path.exists() and not any(has_object(folder, name) for name in self.names()):
+            others = [other.name for other in folder.iterdir() if other.name[0] != "."]
+            if others:
+                raise ConfigError(
+                    f"{folder} holds {min(others)!r} and no sweep set: choose a new or an empty "
+                    "folder"
+                )
+        text = msgspec.json.encode(self)
+        if path.exists():
+            # Compared as JSON, which knows no tuples: a recipe may have been written with some.
+            here = msgspec.json.decode(text)
+            there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
+            differing = _differing(here, there)
+            if differing:
+                raise ConfigError(
+                    f"{folder} holds another sweep set (other {name_some(differing)}): "
+                    "choose another folder, or repeat the options that began it"
+                )
+            return
+        write_whole(path, lambda file: file.write(msgspec.json.format(text, indent=1)))
+
+    @classmethod
+    def read(cls, folder: Path) -> "SweepManifest":
+        """Read a set's manifest.
+
+        Raises:
+            RecordingError: there is none, it is damaged, or of another version.
+        """
+        path = folder / MANIFEST
+        try:
+            raw = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+            if raw.get("version") not in READABLE:
+                raise RecordingError(
+                    f"{path} is of version {raw.get('version')!r}; this release reads "
+                    f"{READABLE[0]} and {READABLE[-1]}"
+                )
+            return msgspec.convert(raw, cls)
+        except OSError:
+            raise RecordingError(
+                f"{folder} is not a sweep set: no {MANIFEST} (make one with `tactile-rt sweep` or "
+                "`tactile-rt label`)"
+            ) from None
+        except (msgspec.MsgspecError, UnicodeDecodeError, ConfigError) as error:
+            raise RecordingError(f"{path} is damaged: {error}") from None
+
+
+def object_path(folder: Path, name: str) -> Path:
+    """The file of one object's sweeps."""
+    return folder / f"{name}.npz"
+
+
+def has_object(folder: Path, name: str) -> bool:
+    """Whether an object's sweeps have been written (whole, by construction)."""
+    return object_path(folder, name).exists()
+
+
+def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
+    """Sets of one array as one, which is the first with the categories and objects of the others.
+
+    Raises:
+        ConfigError: sets of another array or sensor, or of another period.
+    """
+    first = manifests[0]
+    for other in manifests[1:]:
+        differing = first.spec.differences(other.spec, ("name", "rate_hz"))
+        if first.period_ns != other.period_ns:
+            periods = (f"{m.period_ns * 1e-6:g} ms" for m in (first, other))
+            differing = [*differing, f"the period of their samples, {' and '.join(periods)}"]
+        if first.sensor != other.sensor:
+            differing = [*differing, "the sensor: its noise, range or rate"]
+        if differing:
+            names = " and ".join(str(m.recipe.get("name", "?")) for m in (first, other))
+            raise ConfigError(f"the sweep sets {names} cannot be joined: {differing[0]}")
+    split: dict[str, dict[str, None]] = {}  # dictionaries, as sets that keep their order
+    for one in manifests:
+        for side, names_there in one.split.items():
+            split.setdefault(side, {}).update(dict.fromkeys(names_there))
+    return replace(
+        first,
+        lead=max(one.lead for one in manifests),
+        categories=tuple(dict.fromkeys(c for one in manifests for c in one.categories)),
+        withheld=tuple(dict.fromkeys(c for one in manifests for c in one.withheld)),
+        split={side: tuple(names) for side, names in split.items()},
+        category_of={name: kind for m in manifests for name, kind in m.category_of.items()},
+    )
+
+
+def _differing(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
+    """Which keys differ, those of tables by their full name."""
+    found = []
+    for key in dict.fromkeys([*here, *there]):
+        mine, theirs = here.get(key), there.get(key)
+        if isinstance(mine, dict) and isinstance(theirs, dict) and key not in ("spec", "split"):
+            found += _differing(mine, theirs, f"{prefix}{key}.")
+        elif mine != theirs:
+            found.append(f"{prefix}{key}")
+    return found
+
+
+def split_by_object(
+    categories: Sequence[str], objects: int, validation: int, test: int
+) -> dict[str, tuple[str, ...]]:
+    """Split `objects` instances of every category by object: the last ones are the test."""
+    first = {"train": 0, "validation": objects - test - validation, "test": objects - test}
+    stop = {"train": first["validation"], "validation": first["test"], "test": objects}
+    return {
+        # Index first, so that an unfinished set has its objects spread over the categories.
+        split: tuple(f"{c}-{i}" for i in range(first[split], stop[split]) for c in categories)
+        for split in SPLITS
+    }
+
+
+def check_labelled(folder: Path, manifest: SweepManifest) -> None:
+    """What is to be learnt from a set's labels must have some.
+
+    Raises:
+        ConfigError: its touches have none.
+    """
+    if UNLABELLED in manifest.categories:
+        raise ConfigError(
+            f"{folder} holds touches without labels: learn from them by --recipe simclr, or say "
+            "what was touched with `tactile-rt label`"
+        )
+
+
+def check_split(folder: Path, manifest: SweepManifest) -> None:
+    """No object on two sides of the split, every trained object of a category that is trained."""
+    side: dict[str, str] = {}
+    for split, names in manifest.split.items():
+        for name in names:
+            if name in side:
+                where = "twice in" if side[name] == split else f"in {side[name]!r} and in"
+                raise RecordingError(
+                    f"{folder}: the object {name} is {where} {split!r} of the split: an accuracy "
+                    "on it would mean nothing; make the set anew"
+                )
+            side[name] = split
+            if split not in (WITHHELD, OUTLIERS) and manifest.label(name) < 0:
+                raise RecordingError(
+                    f"{folder}: {name} of {split!r} is of the withheld category "
+                    f"{manifest.category(name)!r}, which has no label to train on"
+                )
+
+
+def trained_objects(
+    manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
+) -> dict[str, list[str]]:
+    """The names of the objects that a network has learnt from, by where the objects come from."""
+    before = saved.get("trained_objects", {}) if saved else {}
+    found = {source: dict.fromkeys(names) for source, names in before.items()}
+    for one in manifests:
+        names = (*one.split["train"], *one.split.get(OUTLIERS, ()))
+        found.setdefault(one.source, {}).update(dict.fromkeys(names))
+    return {source: list(names) for source, names in found.items()}

@@ -1,0 +1,211 @@
+"""The sweeps of a set's objects on disk: one file per object, written whole or not at all.
+
+So no half-written one is ever read, and a split can never put one object on two sides. The
+archive's own checksums tell a damaged file at every reading.
+"""
+
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.core.errors import ConfigError, RecordingError, name_some
+from tactile_rt.core.files import write_whole
+from tactile_rt.sets.manifest import CONTACTS, SKIPPED, SweepManifest, has_object, object_path
+
+__all__ = [
+    "Sweeps",
+    "read_object",
+    "read_skipped",
+    "read_sweeps",
+    "write_object",
+    "write_skipped",
+]
+
+
+@dataclass(frozen=True)
+class Sweeps:
+    """Sweeps in memory.
+
+    Attributes:
+        values: The (sweep, sample, element, channel) float32 loads, SI, on the set's period.
+        labels: The (sweep,) int64 index into the manifest's categories; -1: of none of them.
+        objects: The (sweep,) names of the objects; sweeps of one object share the name.
+        contacts: The (sweep, sample, element) float32 arc length (m) from the whisker's base to
+            where it touches, NaN where it does not; None: the set was made without.
+        recorded: The (sweep,) bool whether it was recorded, so that its sensor's noise is in it;
+            None: all were simulated, without any.
+    """
+
+    values: NDArray[np.float32]
+    labels: NDArray[np.int64]
+    objects: NDArray[np.str_]
+    contacts: NDArray[np.float32] | None = None
+    recorded: NDArray[np.bool_] | None = None
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __getitem__(self, at: slice | NDArray[Any]) -> "Sweeps":
+        """Some of the sweeps."""
+        there = ((f.name, getattr(self, f.name)) for f in fields(self))
+        taken: dict[str, Any] = {name: v if v is None else v[at] for name, v in there}
+        return Sweeps(**taken)
+
+
+def write_object(
+    folder: Path,
+    name: str,
+    values: NDArray[np.float32],
+    parameters: dict[str, NDArray[Any]],
+    contacts: NDArray[np.float32] | None = None,
+) -> None:
+    """Write all sweeps of one object, whole or not at all.
+
+    Args:
+        name: ``category-index``.
+        values: (sweep, sample, element, channel) SI.
+        parameters: (sweep,) arrays that describe each sweep, stored beside the values.
+        contacts: (sweep, sample, element), see `Sweeps`; None stores none.
+    """
+    arrays: dict[str, Any] = {"values": values.astype(np.float32), **parameters}
+    if contacts is not None:
+        arrays[CONTACTS] = contacts.astype(np.float32)
+    write_whole(object_path(folder, name), lambda file: np.savez(file, **arrays))
+
+
+def read_sweeps(folder: Path, split: str) -> Sweeps:
+    """Read all sweeps of one split; objects that were skipped are not among them.
+
+    Raises:
+        RecordingError: no such set, an object is missing (the run that makes it was interrupted)
+            or damaged.
+        ConfigError: no such split.
+    """
+    manifest = SweepManifest.read(folder)
+    names = _names_of(folder, manifest, split)
+    labels = [manifest.label(name) for name in names]
+    missing = [name for name in names if not has_object(folder, name)]
+    if missing:
+        raise RecordingError(
+            f"{folder} is unfinished: {len(missing)} of {len(names)} objects of {split!r} are "
+            f"missing ({missing[0]} ...); run the same `tactile-rt sweep` again to finish it"
+        )
+    shapes = [_stored_shape(object_path(folder, name), manifest.spec.shape) for name in names]
+    samples = shapes[0][1]
+    for name, shape in zip(names, shapes, strict=True):
+        if shape[1] != samples:
+            raise RecordingError(
+                f"{object_path(folder, name)} holds sweeps of {shape[1]} samples, "
+                f"not {samples} as {names[0]}"
+            )
+    counts = [shape[0] for shape in shapes]
+    # Filled in place: a large set fits into memory once, not twice.
+    values = np.empty((sum(counts), *shapes[0][1:]), dtype=np.float32)
+    contacts = (
+        np.empty(values.shape[:3], dtype=np.float32) if manifest.recipe.get(CONTACTS) else None
+    )
+    at = 0
+    for name, count in zip(names, counts, strict=True):
+        path = object_path(folder, name)
+        values[at : at + count] = _read_arrays(path, "values")["values"]
+        if contacts is not None:
+            stored = _read_arrays(path, CONTACTS)[CONTACTS]
+            if stored.shape != contacts[at : at + count].shape:
+                raise _damaged(path, ValueError(f"contacts {stored.shape} beside other values"))
+            contacts[at : at + count] = stored
+        at += count
+    return Sweeps(
+        values,
+        np.repeat(np.array(labels), counts),
+        np.repeat(names, counts),
+        contacts,
+        np.full(len(values), True) if manifest.recorded else None,
+    )
+
+
+def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
+    """All sweeps of one object.
+
+    Returns:
+        (sweep, sample, element, channel) values, SI, and the (sweep,) arrays that describe each.
+        Contacts, if any, are `read_sweeps`'s to read.
+
+    Raises:
+        RecordingError: the file is damaged.
+    """
+    path = object_path(folder, name)
+    arrays = _read_arrays(path)
+    arrays.pop(CONTACTS, None)
+    if "values" not in arrays:
+        raise _damaged(path, KeyError("no values"))
+    return arrays.pop("values"), arrays
+
+
+def _names_of(folder: Path, manifest: SweepManifest, split: str) -> list[str]:
+    if split not in manifest.split:
+        raise ConfigError(f"no split {split!r} in {folder}: it has {name_some(manifest.split)}")
+    skipped = read_skipped(folder)
+    names = [name for name in manifest.split[split] if name not in skipped]
+    if not names:
+        raise RecordingError(f"{folder}: {split!r} has no objects")
+    return names
+
+
+def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
+    """The shape of an object's values, without reading them."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("values.npy") as member:
+            version = np.lib.format.read_magic(member)
+            read = {(1, 0): np.lib.format.read_array_header_1_0}[version]
+            stored, _, dtype = read(member)
+        if dtype != np.float32:
+            raise ValueError(f"values of type {dtype}")
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise _damaged(path, error) from None
+    if len(stored) != 4 or stored[2:] != shape:
+        raise RecordingError(f"{path} holds {stored}, not (sweep, sample, *{shape})")
+    return tuple(stored)
+
+
+def _read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
+    try:
+        # Opened here because numpy leaves its own file open when it is damaged.
+        with path.open("rb") as file, np.load(file) as arrays:
+            return {key: arrays[key] for key in keys or arrays.files}
+    except MemoryError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    reason = str(error) or type(error).__name__
+    return RecordingError(f"{path} is damaged ({reason}): delete it and sweep again")
+
+
+def read_skipped(folder: Path) -> dict[str, str]:
+    """Objects that could not be made, and why; none if the set does not list any.
+
+    Raises:
+        RecordingError: the list is damaged.
+    """
+    path = folder / SKIPPED
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, str])
+    except FileNotFoundError:
+        return {}
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} is damaged: {error}") from None
+
+
+def write_skipped(folder: Path, skipped: dict[str, str]) -> None:
+    """Replace the list of objects that could not be made."""
+    text = msgspec.json.format(msgspec.json.encode(dict(sorted(skipped.items()))), indent=1)
+    write_whole(folder / SKIPPED, lambda file: file.write(text))
