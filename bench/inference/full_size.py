@@ -15,8 +15,8 @@ import torch
 from tactile_rt import VERSION, export
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import read_model, shipped_model
-from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.core.stream import MOUSE, ArraySpec
+from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.export.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.export.precision import Precision

@@ -24,8 +24,8 @@ from tactile_rt.alignment.layers import Layers, table
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import ChannelLimits
 from tactile_rt.core.stream import ArraySpec, Timing
+from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
 from tactile_rt.models.attenders.mamba import MambaStack
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, untrained

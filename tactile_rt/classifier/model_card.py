@@ -24,8 +24,8 @@ from tactile_rt.classifier.decision_rules import (
 )
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
 from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch, name_some
-from tactile_rt.core.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream.sensor_spec import SensorSpec, channel_limits
 
 __all__ = [
     "EmbeddingStatistics",

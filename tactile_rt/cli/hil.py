@@ -17,7 +17,7 @@ from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.project.folder import Project
-    from tactile_rt.testing.hil import LoopReport
+    from tactile_rt.sources.hil import LoopReport
 
 SWEEPS = 6  # unless told otherwise
 
@@ -57,7 +57,7 @@ def hil(
     """
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.drivers.emulation.faults import read_faults
-    from tactile_rt.testing.hil import Loop, check_line
+    from tactile_rt.sources.hil import Loop, check_line
 
     fields = codec_options(sets or [])
     if project is not None:

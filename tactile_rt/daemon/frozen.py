@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 
 __all__ = ["FrozenJudge", "frozen_after"]
 

@@ -13,8 +13,8 @@ from tactile_rt.classifier.model_card import sensor_of
 from tactile_rt.classifier.model_file import hash_of
 from tactile_rt.classifier.trial import Trial
 from tactile_rt.core.errors import ConfigError, SpecMismatch, TactileError
-from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.core.stream import NS_PER_S, Chunk, Source, concatenate
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig

@@ -17,8 +17,8 @@ from functools import partial
 from typing import Any
 
 from tactile_rt.classifier.classifier import without_bad_samples
-from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from tactile_rt.core.errors import ConfigError, SpecMismatch
 from tactile_rt.core.files import replaced
-from tactile_rt.core.sensor_spec import ChannelLimits, channel_limits
 from tactile_rt.core.stream import ArraySpec, Timing
+from tactile_rt.core.stream.sensor_spec import ChannelLimits, channel_limits
 from tactile_rt.models.checkpoint_files import describe_checkpoint, no_checkpoint
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.inputs import InputStage, paper_units

@@ -20,8 +20,8 @@ from urllib.parse import quote, urlencode
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
-from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.core.settings import no_such, read_text, split_url
+from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.sets.sensor_faults import LARGEST

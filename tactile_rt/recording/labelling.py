@@ -18,8 +18,8 @@ import msgspec
 from tactile_rt.classifier.model_card import PERIODS_NS
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
-from tactile_rt.core.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.stream.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.recording.labels import LABELS, LabelledInterval, label_of_file, read_labels
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.touches import RecordedTouch, find_touches

@@ -16,8 +16,8 @@ import msgspec
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import write_whole
-from tactile_rt.core.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.sets.sensor_faults import SensorFaults
 
 __all__ = [

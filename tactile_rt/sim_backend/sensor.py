@@ -15,8 +15,8 @@ from dataclasses import fields
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.sensor_model import SensorModel
 
 __all__ = ["Sensor"]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import FIELD, MagnetSpec, SensorSpec
 from tactile_rt.core.stream import ArraySpec, Chunk
+from tactile_rt.core.stream.sensor_spec import FIELD, MagnetSpec, SensorSpec
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.world import SAMPLE_MS, world_spec
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.contact import ContactDetector
-from tactile_rt.core.sensor_spec import CHANNEL_FLOOR
+from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
 
 ELEMENTS, CHANNELS = 30, 6
 FLOOR = np.array([CHANNEL_FLOOR["N"]] * 3 + [CHANNEL_FLOOR["N m"]] * 3, dtype=np.float32)

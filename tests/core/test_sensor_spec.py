@@ -7,14 +7,14 @@ import pytest
 
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import (
+from tactile_rt.core.stream import Chunk
+from tactile_rt.core.stream.sensor_spec import (
     LOADS,
     ChannelSpec,
     MagnetSpec,
     SensorSpec,
     channel_limits,
 )
-from tactile_rt.core.stream import Chunk
 from tactile_rt.testing import small_spec
 
 MZ = ChannelSpec(name="mz", unit="N m", range=1e-3, noise_density=1e-7)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.core.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.core.stream import Chunk
+from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.daemon import troubles as module
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after

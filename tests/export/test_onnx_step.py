@@ -28,8 +28,8 @@ from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
-from tactile_rt.core.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.core.stream import MOUSE, ArraySpec
+from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.export import onnx_step, streaming, streaming_gpt
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,

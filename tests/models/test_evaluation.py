@@ -11,8 +11,8 @@ from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.core.stream import MOUSE, ArraySpec
+from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models import onsets
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import OFFSET, Disturbance

@@ -9,7 +9,7 @@ import torch
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.implausible import IMPLAUSIBLE
 from tactile_rt.models.training.loop import train

@@ -19,7 +19,7 @@ pytest.importorskip("matplotlib")
 
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import SensorSpec
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.project.budget import Budget, described, write_budget
 from tactile_rt.project.folder import KINDS, Project
 from tactile_rt.project.making import make

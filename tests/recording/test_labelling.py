@@ -10,7 +10,7 @@ import pytest
 
 from tactile_rt.classifier.model_file import METADATA_KEY, shipped_model
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
-from tactile_rt.core.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.recording import Recording
 from tactile_rt.recording.labelled_set import write_set
 from tactile_rt.recording.labelling import (

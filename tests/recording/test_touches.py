@@ -7,8 +7,8 @@ import pytest
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.core.sensor_spec import channel_limits
 from tactile_rt.core.stream import NS_PER_S, concatenate
+from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.recording.touches import ENDS, GAP, REST, find_touches
 from tests.helpers.labelled import ARRAY, REST_S, TOUCH_S, chunks_of_touches

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits
 from tactile_rt.core.stream import Chunk, concatenate
+from tactile_rt.core.stream.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel

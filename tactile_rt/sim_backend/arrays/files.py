@@ -38,7 +38,6 @@ import numpy as np
 
 from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, name_some
-from tactile_rt.core.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.core.settings import (
     SettingNode,
     check_columns,
@@ -49,6 +48,7 @@ from tactile_rt.core.settings import (
     read_csv,
     read_toml,
 )
+from tactile_rt.core.stream.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
     Mount,

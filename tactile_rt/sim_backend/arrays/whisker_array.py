@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.sensor_spec import SensorSpec
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
 __all__ = [

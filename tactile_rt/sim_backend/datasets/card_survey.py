@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import RecordingError
-from tactile_rt.core.sensor_spec import ChannelLimits
 from tactile_rt.core.stream import STEP_MS, STEPS
+from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.sets.manifest import SweepManifest, has_object
 from tactile_rt.sets.objects import read_object, read_skipped
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError, SourceError, TactileError
 from tactile_rt.core.packages import VERSION
-from tactile_rt.core.sensor_spec import LOADS
 from tactile_rt.core.settings import no_such
 from tactile_rt.core.stream import Chunk
+from tactile_rt.core.stream.sensor_spec import LOADS
 from tactile_rt.sets.manifest import MANIFEST, SweepManifest, has_object
 from tactile_rt.sets.objects import read_skipped, write_object, write_skipped
 from tactile_rt.sim_backend.arrays.files import load_animals

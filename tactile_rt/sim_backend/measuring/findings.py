@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from tactile_rt.core.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.sim_backend.measuring.resting import FORGETS_S, TO_SIGMA, Rest, drift_likelihood
 from tactile_rt.sim_backend.transducer import FASTEST_HZ
 

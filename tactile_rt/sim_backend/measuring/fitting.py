@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from tactile_rt.core.errors import ConfigError, SpecMismatch
-from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.core.settings import find_lines, parse_toml, read_text, read_toml
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.measuring.findings import (

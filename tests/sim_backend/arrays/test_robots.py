@@ -12,8 +12,8 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.calibration import declared
-from tactile_rt.core.sensor_spec import SensorSpec
 from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
+from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sim_backend.arrays.files import (

@@ -14,8 +14,8 @@ from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.health import Health, State
+from tactile_rt.sources.hil import Loop, LoopReport, named_right, pair
 from tactile_rt.testing import ArraySource, cut, small_spec
-from tactile_rt.testing.hil import Loop, LoopReport, named_right, pair
 from tests.helpers.tiny_model import write_model
 
 SPEC = small_spec()
