@@ -30,8 +30,7 @@ from rich.table import Table
 
 from bench.inference.full_size import random_model
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
-from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.classifier.model_file import file_outputs, load_model, read_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.export import streaming as streaming_module

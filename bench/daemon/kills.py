@@ -19,7 +19,7 @@ from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import Recording, recover
-from tactile_rt.recording.redecoding import compare_decoding
+from tactile_rt.recording.checking import compare_decoding
 
 __all__ = ["Killed", "kill_nine", "killed_once", "records_of"]
 

@@ -16,8 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.model_file import ModelCard, load_model, read_model, shipped_model
-from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.classifier.model_file import (
+    ModelCard,
+    file_outputs,
+    load_model,
+    read_model,
+    shipped_model,
+)
 from tactile_rt.core.packages import install_extra
 from tactile_rt.models.evaluation.records import Record
 

@@ -36,8 +36,7 @@ from bench.models import published_protocol as theirs_by
 from bench.models.protocol import computed, digest, pictures, view
 from bench.models.published import EPSILON, NETWORKS, NetworkPair, in_our_order, open_code
 from bench.models.training_speed import STEPS, training_step
-from tactile_rt.classifier.model_file import load_model
-from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.classifier.model_file import file_outputs, load_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.export.onnx_step import step_graph, write_model
 from tactile_rt.models.ead import count_parameters

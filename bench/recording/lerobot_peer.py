@@ -22,7 +22,7 @@ from tactile_rt.core.stream import concatenate
 from tactile_rt.models.evaluation.records import Record, show
 from tactile_rt.recording import Recording, StreamWriter
 from tactile_rt.recording.as_lerobot import write_dataset
-from tactile_rt.recording.lerobot_film import film_of
+from tactile_rt.recording.lerobot_meta import film_of
 from tactile_rt.sources.opening import open_source
 
 FPS, SIZE = 30, (64, 96)

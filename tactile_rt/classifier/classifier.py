@@ -24,8 +24,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.contact import ContactDetector
-from tactile_rt.classifier.decision_rules import CandidateRule, fitting
-from tactile_rt.classifier.exits import IN_A_ROW, Deadline, EarlyExit, Lanes, Policy
+from tactile_rt.classifier.decision_rules import (
+    IN_A_ROW,
+    CandidateRule,
+    Deadline,
+    EarlyExit,
+    Lanes,
+    Policy,
+    fitting,
+)
 from tactile_rt.classifier.model_card import decided, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
@@ -130,11 +137,11 @@ class Classifier:
         every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
             runs in ceil(steps / every) lanes, and takes up to as many times as long.
         sure: probability of the best class at which an episode ends early, or None: accuracy
-            given for time, see `tactile_rt.classifier.exits`. Of ``episode`` only.
+            given for time, see `tactile_rt.classifier.decision_rules`. Of ``episode`` only.
         in_a_row: steps running in which the same class must be so sure.
         deadline_s: work that may gather, and age of its newest sample, before a step is late, s;
             None is the step's length.
-        late: what becomes of a late decision, see `tactile_rt.classifier.exits.Deadline`.
+        late: what becomes of a late decision, see `tactile_rt.classifier.decision_rules.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
         threads: that may share one operator of the network.
         embedding: whether decisions carry the step's embedding, a copy each.

@@ -152,7 +152,7 @@ MEMORY = 77  # its exit code when there was not enough
 def _run(task: _Task) -> Trial:
     import numpy as np
 
-    from tactile_rt.classifier.exits import Lanes
+    from tactile_rt.classifier.decision_rules import Lanes
     from tactile_rt.classifier.model_file import hash_of, load_model
     from tactile_rt.classifier.stepper import Stepper
 

@@ -106,7 +106,7 @@ def ros2_messages(
     import shutil
 
     from tactile_rt.core.files import whole_folder
-    from tactile_rt.recording.ros2.definitions import PACKAGE
+    from tactile_rt.recording.ros2.cdr import PACKAGE
 
     made = folder / PACKAGE.name
     if not folder.is_dir():

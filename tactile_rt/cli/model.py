@@ -1,4 +1,4 @@
-"""`tactile-rt model show`, `verify` and `bench`: what is in a file, is it whole, is it fast."""
+"""`tactile-rt model show`, `verify`, `bench` and `tactile-rt eval`: what is in a file, is it good."""
 
 import math
 from pathlib import Path
@@ -9,11 +9,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app, check_output
-from tactile_rt.cli.options import STDOUT, Json
+from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.options import STDOUT, Json, Quick
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
 from tactile_rt.core.errors import ModelError
+
+__all__ = []
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
 app.add_typer(model, name="model")
@@ -87,8 +89,7 @@ def verify(file: File, json: Json = None) -> None:
     """
     import hashlib
 
-    from tactile_rt.classifier.model_file import load_model, read_model
-    from tactile_rt.classifier.model_runs import verify_model
+    from tactile_rt.classifier.model_file import load_model, read_model, verify_model
     from tactile_rt.classifier.trial import try_model
 
     check_output(json)
@@ -160,3 +161,28 @@ def _pairs(values: dict[str, Any]) -> str:
         return f"{value:.4g}" if isinstance(value, float) else str(value)
 
     return "\n".join(f"{key}: {said(value)}" for key, value in values.items())
+
+
+@app.command(name="eval")
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="An .onnx model.")],
+    data: Annotated[Path, typer.Argument(help="A sweep set.")],
+    svm: Annotated[
+        bool, typer.Option("--svm", help="Fit an RBF SVM on the same windows too.")
+    ] = False,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for confusion and accuracy over time.")
+    ] = None,
+    quick: Quick = False,
+    json: Json = None,
+) -> None:
+    """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
+    and what else goes wrong with a sensor."""
+    from tactile_rt.sets.manifest import SweepManifest
+
+    SweepManifest.read(data)
+    with needing("train"):
+        from tactile_rt.models.evaluation.model_file import evaluate_model
+    with progress_bar(Console(stderr=True), "evaluating"):
+        records = evaluate_model(model, data, svm, pictures, quick)
+    show_records(records, json)

@@ -207,8 +207,8 @@ def _as_folder(
     """Write a bag or a dataset; what to say of it."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording.as_lerobot import write_dataset
-    from tactile_rt.recording.as_ros2 import write_bag
-    from tactile_rt.recording.lerobot_film import film_of
+    from tactile_rt.recording.conversion import write_bag
+    from tactile_rt.recording.lerobot_meta import film_of
 
     if to not in MARKS:
         raise ConfigError(no_such("form", to, sorted(MARKS)))

@@ -259,7 +259,7 @@ def _source_of(recording: "Recording") -> str:
 
 
 def _compare(files: "list[Recording]", options: dict[str, str]) -> None:
-    from tactile_rt.recording.redecoding import compare_decoding
+    from tactile_rt.recording.checking import compare_decoding
 
     if len(files) > 1:
         raise ConfigError("packets are decoded again from one file at a time")

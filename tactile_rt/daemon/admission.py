@@ -14,7 +14,7 @@ from tactile_rt.classifier.trial import Trial, TrialLimits, try_model
 from tactile_rt.core.errors import ModelError, TactileError
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
-from tactile_rt.daemon.threads import ADMISSION
+from tactile_rt.daemon.part import ADMISSION
 
 __all__ = ["Admission", "file_stamp", "model_path"]
 

@@ -17,8 +17,8 @@ from tactile_rt.core.locks import device_keys
 from tactile_rt.core.settings import no_such
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
-from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
+from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.service import MADE
 from tactile_rt.sources.opening import check_source
 

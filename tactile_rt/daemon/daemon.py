@@ -14,13 +14,13 @@ from tactile_rt.daemon.admission import file_stamp, model_path
 from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
-from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
+from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
 from tactile_rt.daemon.troubles import troubles
 

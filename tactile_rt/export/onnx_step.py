@@ -22,8 +22,14 @@ from torch import Tensor, nn
 
 from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
 from tactile_rt.classifier.model_card import CARD_VERSION, EmbeddingStatistics, Kind
-from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
-from tactile_rt.classifier.model_runs import file_outputs, probe_logits
+from tactile_rt.classifier.model_file import (
+    METADATA_KEY,
+    ModelCard,
+    StateTensor,
+    file_outputs,
+    load_model,
+    probe_logits,
+)
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.files import write_whole

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import EmbeddingStatistics, Kind
-from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, load_model
-from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, file_outputs, load_model
 from tactile_rt.core.files import write_whole
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision

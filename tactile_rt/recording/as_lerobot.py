@@ -26,13 +26,14 @@ from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.core.files import whole_folder
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.recording.conversion import about_text
-from tactile_rt.recording.lerobot_film import CameraFilm, write_film
 from tactile_rt.recording.lerobot_meta import (
     DATA,
     FRAME,
+    CameraFilm,
     Episode,
     Statistics,
     need_pyarrow,
+    write_film,
     write_meta,
 )
 from tactile_rt.recording.reader import Recording

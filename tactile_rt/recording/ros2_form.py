@@ -15,8 +15,7 @@ from tactile_rt.recording.layout import (
     last_ns,
 )
 from tactile_rt.recording.ros2 import messages
-from tactile_rt.recording.ros2.cdr import CDR
-from tactile_rt.recording.ros2.definitions import token
+from tactile_rt.recording.ros2.cdr import CDR, token
 
 __all__ = [
     "ARRAY",

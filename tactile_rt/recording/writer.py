@@ -48,7 +48,7 @@ from tactile_rt.recording.layout import (
     encode_packet,
     samples_in,
 )
-from tactile_rt.recording.ros2.definitions import schema_text
+from tactile_rt.recording.ros2.cdr import schema_text
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer
 

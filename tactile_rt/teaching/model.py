@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, UnknownRule
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
-from tactile_rt.classifier.model_file import METADATA_KEY, load_model, read_model
-from tactile_rt.classifier.model_runs import probe_logits
+from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_logits, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.classifier.exits import Lanes
+from tactile_rt.classifier.decision_rules import Lanes
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, Chunk

@@ -17,7 +17,7 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier import runtime, stepper
 from tactile_rt.classifier.classifier import Classification, Classifier, without_bad_samples
-from tactile_rt.classifier.exits import Deadline
+from tactile_rt.classifier.decision_rules import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate

@@ -16,10 +16,10 @@ from tactile_rt.classifier.model_file import (
     StateTensor,
     element_order,
     load_model,
+    probe_logits,
     read_model,
     shipped_model,
 )
-from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model

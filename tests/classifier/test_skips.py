@@ -13,7 +13,7 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier import classifier as classifier_module
 from tactile_rt.classifier.classifier import BEHIND_S, Classification, Classifier
-from tactile_rt.classifier.exits import Deadline
+from tactile_rt.classifier.decision_rules import Deadline
 from tactile_rt.classifier.skips import Skip, Skips
 from tactile_rt.core.errors import ConfigError
 from tests.helpers.tiny_model import PERIOD_NS, STEPS, SUBSTEPS, write_model

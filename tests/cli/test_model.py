@@ -7,10 +7,10 @@ import pytest
 from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
 from tactile_rt.classifier.model_file import (
     load_model,
+    probe_logits,
     read_model,
     shipped_model,
 )
-from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
 
 pytest.importorskip("onnx")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from bench.daemon.process import free_port
-from tactile_rt.daemon.publishers.connections import ConnectionLimit
+from tactile_rt.daemon.publishers.sending import ConnectionLimit
 from tactile_rt.recording import Recording
 from tests.helpers.waiting import PATIENCE_S, until
 

@@ -23,8 +23,7 @@ import tactile_rt
 from bench.inference.full_size import random_model
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
-from tactile_rt.classifier.model_file import ModelCard, load_model
-from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.classifier.model_file import ModelCard, file_outputs, load_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError

@@ -15,8 +15,13 @@ import torch
 from onnx import numpy_helper
 
 from bench.inference.full_size import random_model
-from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
-from tactile_rt.classifier.model_runs import file_outputs, verify_model
+from tactile_rt.classifier.model_file import (
+    file_outputs,
+    load_model,
+    read_model,
+    shipped_model,
+    verify_model,
+)
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.export.onnx_step import PARITY_BAR, parity, step_graph, write_model
 from tactile_rt.export.precision import CONTRIB, PRECISIONS, in_precision

@@ -14,8 +14,7 @@ from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_lerobot import write_dataset
-from tactile_rt.recording.lerobot_film import film_of
-from tactile_rt.recording.lerobot_meta import Statistics
+from tactile_rt.recording.lerobot_meta import Statistics, film_of
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.recordings import noise, write_as_daemon
 

@@ -10,7 +10,7 @@ import pytest
 from tactile_rt.calibration import Calibration
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.recording import Description, Recording
-from tactile_rt.recording.as_ros2 import write_bag
+from tactile_rt.recording.conversion import write_bag
 from tactile_rt.recording.replay import DEMO
 from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import (

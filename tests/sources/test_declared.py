@@ -13,7 +13,7 @@ from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.codecs.native_common import MessageType
 from tactile_rt.drivers.device_source import device_of
 from tactile_rt.recording import Recording
-from tactile_rt.recording.redecoding import compare_decoding
+from tactile_rt.recording.checking import compare_decoding
 from tactile_rt.sources.opening import check_model, check_source, open_source
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import record_device

@@ -8,8 +8,7 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_card import EmbeddingStatistics
-from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.classifier.model_runs import file_outputs, verify_model
+from tactile_rt.classifier.model_file import file_outputs, load_model, shipped_model, verify_model
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.teaching.further import (
     EARLY,

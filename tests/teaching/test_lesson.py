@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.model_file import load_model
-from tactile_rt.classifier.model_runs import verify_model
+from tactile_rt.classifier.model_file import load_model, verify_model
 from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS

@@ -1,14 +1,22 @@
-"""Publishers: consumers that send `messages` to others, each imported when it is asked for."""
+"""The consumers that a configuration asks for; publishers are imported when they are asked for."""
 
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import lacking
-from tactile_rt.core.settings import no_such
+from tactile_rt.core.settings import convert, make_node, no_such
+from tactile_rt.daemon.config import Config, PublisherConfig
+from tactile_rt.daemon.consumer import Consumer
+from tactile_rt.daemon.loading import Loaded
 
-__all__ = ["PUBLISHERS", "load_class", "publisher_class"]
+__all__ = ["PUBLISHERS", "Wanted", "load_class", "publisher_class", "wanted_consumers"]
 
 # kind: (where the class is, extra that it needs)
 PUBLISHERS = {
@@ -45,3 +53,68 @@ def load_class(where: str, what: str, extra: str) -> Any:
         if error.name == module:
             raise ConfigError(f"{what} is not in this release") from None
         raise lacking(f"{what} needs", extra, error) from None
+
+
+_HERE = "tactile_rt.daemon"
+
+TABLES = ("log", "recorder", "page", "metrics")  # each a class of its own module
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A consumer that a configuration asks for.
+
+    Attributes:
+        name: The name of the part that runs the consumer, e.g. ``publisher.zmq``.
+        key: Equal for two consumers that are configured alike: the running one need not restart.
+        make: Makes the consumer; may raise `ConfigError`.
+        options: The table of the configuration; of a publisher that of its ``options``.
+    """
+
+    name: str
+    kind: str
+    key: Any
+    make: Callable[[], Consumer]
+    options: Any = None
+
+
+def wanted_consumers(loaded: Loaded) -> list[Wanted]:
+    """All of them; nothing is made yet.
+
+    Raises:
+        ConfigError: no such kind of publisher, or a wrong option.
+    """
+    config, limits = loaded.config, loaded.config.limits
+    wanted = [_publisher(loaded, i, publisher) for i, publisher in enumerate(config.publisher)]
+    for table in TABLES:
+        if (options := getattr(config, table)) is not None:
+            cls = load_class(f"{_HERE}.{table}:{table.title()}", table, "")
+            make = partial(cls, table, options)
+            wanted.append(Wanted(table, table, (options, limits), make, options))
+    wanted.sort(key=lambda one: one.kind != "log")  # it is to hear of all others
+    if os.environ.get("NOTIFY_SOCKET"):
+        cls = load_class(f"{_HERE}.systemd:Systemd", "systemd", "")
+        wanted.append(Wanted("systemd", "systemd", limits, partial(cls, "systemd", None)))
+    return wanted
+
+
+def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
+    try:
+        cls = publisher_class(config.kind)
+    except ConfigError as error:
+        loaded.refuse(["publisher", i, "kind"], str(error))
+    path: list[str | int] = ["publisher", i, "options"]
+    options: Any = None
+    kind = getattr(cls, "Options", None)
+    if kind is None and config.options:
+        loaded.refuse(path, f"publisher {config.kind} takes no options")
+    if kind is not None and config.options:
+        options = convert(loaded.nodes, kind, path, top=Config)
+    elif kind is not None:
+        try:
+            options = convert(make_node({}, "options", 0, Path()), kind)
+        except ConfigError as error:  # it needs some
+            loaded.refuse(["publisher", i], str(error))
+    key = (config.kind, config.name, options, loaded.config.limits)
+    name = f"publisher.{config.name}"
+    return Wanted(name, config.kind, key, partial(cls, name, options), options)

@@ -38,9 +38,14 @@ from tactile_rt.daemon.messages import (
     shortest,
     topic_of,
 )
-from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.scene import Scene
-from tactile_rt.daemon.publishers.sending import Connections, Prefix, Repeated, tell_exposed
+from tactile_rt.daemon.publishers.sending import (
+    ConnectionLimit,
+    Connections,
+    Prefix,
+    Repeated,
+    tell_exposed,
+)
 
 __all__ = ["FoxgloveOptions", "FoxglovePublisher", "schema_of"]
 

@@ -44,7 +44,7 @@ from tactile_rt.daemon.messages import (
 from tactile_rt.daemon.publishers.sending import Due, SenderOptions, tell_exposed
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
-from tactile_rt.recording.ros2.definitions import SIMPLE, dds_type, fields_of, token
+from tactile_rt.recording.ros2.cdr import SIMPLE, dds_type, fields_of, token
 
 __all__ = ["Ros2Options", "Ros2Publisher"]
 

@@ -1,8 +1,21 @@
-"""What publishers over a network share: which messages go out, and how often."""
+"""What publishers over a network share: which messages go out, how often, to how many.
+
+ZeroMQ, Zenoh and Foxglove's server accept whoever comes until the process has no descriptor left,
+and then the recorder cannot open its next file. None of them can be told a limit that holds before
+a peer has said who it is; so connections are counted here, and those beyond the limit closed.
+"""
 
 import abc
+import ctypes
+import os
+import resource
+import socket
+import stat
+import threading
 import time
-from typing import Annotated
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Annotated, Final
 
 import msgspec
 
@@ -10,9 +23,9 @@ from tactile_rt.daemon.config import is_loopback
 from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
-from tactile_rt.daemon.publishers.connections import ConnectionLimit
 
 __all__ = [
+    "ConnectionLimit",
     "Connections",
     "Due",
     "ListenerOptions",
@@ -23,6 +36,141 @@ __all__ = [
     "is_port",
     "tell_exposed",
 ]
+
+LOOK_S: Final = 0.1  # on loopback, some thousand may come meanwhile
+BYE_S: Final = 0.2
+AGAIN_S: Final = 0.002  # while they come
+CALM: Final = 20  # looks without anyone to shut down, after which they have gone
+Key = tuple[int, int]  # descriptor and inode: a socket, as long as it is open
+
+
+class ConnectionLimit:
+    """Shuts connections down that are too many, from now on until it is closed.
+
+    Args:
+        addresses: The TCP ports and the paths of Unix sockets that are listened at.
+        most: The number of connections that may stay, all addresses together.
+
+    Attributes:
+        dropped: The number of connections so far that were shut down.
+    """
+
+    def __init__(self, name: str, addresses: set[int | str], most: int) -> None:
+        self.dropped = 0
+        self._addresses, self._most = addresses, most
+        self._numbers: list[int] = []  # of descriptors, at the last look
+        self._kept: set[Key] = set()
+        self._others: set[Key] = set()  # sockets that are none of ours, or shut down
+        self._spare = os.open(os.devnull, os.O_RDWR)  # a descriptor's number, whatever comes
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def connections(self) -> int:
+        """How many there were at the last look."""
+        return len(self._kept)
+
+    @property
+    def full(self) -> bool:
+        """Whether whoever comes now is shut down."""
+        return len(self._kept) >= self._most
+
+    def close(self, stop: Callable[[], object] | None = None) -> None:
+        """Look no more.
+
+        Args:
+            stop: What ends the listening, before that. Who is connected may take `BYE_S` to say
+                goodbye and is then shut down: for one that never said a word, Foxglove's server
+                and Zenoh wait for ever.
+        """
+        if stop is not None:
+            stopping = threading.Thread(target=stop, name=f"{self._thread.name} stop", daemon=True)
+            stopping.start()
+            stopping.join(BYE_S)
+            self._most = 0
+            stopping.join()
+        self._over.set()
+        self._thread.join()
+        os.close(self._spare)
+
+    def _run(self) -> None:
+        empty = os.open(os.devnull, os.O_RDWR)
+        pause, calm = LOOK_S, CALM
+        while not self._over.wait(pause):
+            flooded = self._look(empty) > 0
+            pause = AGAIN_S if flooded else LOOK_S
+            calm = 0 if flooded else calm + 1
+            if calm == CALM:
+                _give_back()
+        os.close(empty)
+
+    def _look(self, empty: int) -> int:
+        """Shut down who is too many; how many that were."""
+        numbers = _descriptors()
+        # What has changed all the same is noticed at the next change.
+        if numbers == self._numbers and len(self._kept) <= self._most:
+            return 0
+        self._numbers = numbers
+        new, open_now = [], set()
+        for number in numbers:
+            with suppress(OSError):  # closed by now
+                found = os.fstat(number)
+                if stat.S_ISSOCK(found.st_mode):
+                    key = (number, found.st_ino)
+                    open_now.add(key)
+                    if key not in self._kept and key not in self._others:
+                        new.append(key)
+        self._kept &= open_now
+        self._others &= open_now
+        new += [self._kept.pop() for _ in range(len(self._kept) - self._most)]
+        dropped = 0
+        for key in new:
+            with suppress(OSError):
+                # Held by a number of our own: meanwhile it may be closed, and its number another's.
+                os.dup2(key[0], self._spare)
+                if os.fstat(self._spare).st_ino != key[1]:
+                    continue
+                connection = socket.socket(fileno=self._spare)
+                try:
+                    if not self._is_ours(connection):
+                        self._others.add(key)
+                    elif len(self._kept) < self._most:
+                        self._kept.add(key)
+                    else:
+                        self._others.add(key)
+                        dropped += 1
+                        connection.shutdown(socket.SHUT_RDWR)
+                finally:
+                    connection.detach()
+        os.dup2(empty, self._spare)
+        self.dropped += dropped
+        return dropped
+
+    def _is_ours(self, connection: socket.socket) -> bool:
+        """Whether it is connected to one of the addresses, and does not listen there."""
+        if connection.type != socket.SOCK_STREAM or connection.getsockopt(
+            socket.SOL_SOCKET, socket.SO_ACCEPTCONN
+        ):
+            return False
+        local = connection.getsockname()
+        if connection.family in (socket.AF_INET, socket.AF_INET6):
+            return local[1] in self._addresses
+        return connection.family == socket.AF_UNIX and local in self._addresses
+
+
+def _give_back() -> None:
+    """Memory that was for those who have gone, which the C library would keep."""
+    with suppress(AttributeError, OSError):  # musl has no such call, and keeps less
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _descriptors() -> list[int]:
+    try:
+        return [int(number) for number in os.listdir("/proc/self/fd")]
+    except OSError:  # none is left to look with
+        return list(range(min(resource.getrlimit(resource.RLIMIT_NOFILE)[0], 1 << 20)))
+
 
 Prefix = Annotated[
     str,

@@ -12,8 +12,8 @@ import zenoh
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
-from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.sending import (
+    ConnectionLimit,
     ListenerOptions,
     Sender,
     is_port,

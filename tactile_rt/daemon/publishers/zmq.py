@@ -10,8 +10,8 @@ import zmq
 from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
-from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.sending import (
+    ConnectionLimit,
     ListenerOptions,
     Sender,
     is_port,

@@ -5,7 +5,7 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
-from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.classifier.model_file import file_outputs
 from tactile_rt.models.evaluation.measures import Step
 
 __all__ = ["stepped"]

@@ -23,8 +23,7 @@ from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
-from tactile_rt.recording.importing.mending import mend_bag
+from tactile_rt.recording.importing.mending import Import, clock_of, mend_bag, write_chunks
 from tactile_rt.recording.importing.table import Table, import_table, shown_names
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording

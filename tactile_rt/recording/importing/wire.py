@@ -22,7 +22,7 @@ from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
 from tactile_rt.drivers.logs import LineLog
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.description import SUMMARY, Description
-from tactile_rt.recording.importing.account import Import, clock_of
+from tactile_rt.recording.importing.mending import Import, clock_of
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
 

@@ -11,7 +11,7 @@ from tactile_rt.recording import Recording
 from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
-from tactile_rt.recording.ros2.definitions import schema_text
+from tactile_rt.recording.ros2.cdr import schema_text
 from tactile_rt.testing import cut, small_spec
 
 rosbags = pytest.importorskip("rosbags")

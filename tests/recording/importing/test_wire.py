@@ -12,8 +12,8 @@ from tactile_rt.core.stream import concatenate
 from tactile_rt.drivers.logs import read_log
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording import Recording
+from tactile_rt.recording.checking import compare_decoding
 from tactile_rt.recording.importing.wire import import_wire
-from tactile_rt.recording.redecoding import compare_decoding
 
 
 def imported(path, output, force=True, rate_hz=0.0, **fields):

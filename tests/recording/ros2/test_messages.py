@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import cdr, messages
-from tactile_rt.recording.ros2.definitions import (
+from tactile_rt.recording.ros2.cdr import (
     PACKAGE,
     SIMPLE,
     STANDARD,
