@@ -1,9 +1,12 @@
 """What becomes of a step's answer: when it is a decision, when unknown, what else it may be.
 
-Rules that a model file may carry beside its network are fitted on sweeps of objects that the network was not trained on, and stored in the
-`ModelCard`. A score is a number that is larger the less a step looks like what was learnt; it is
-stored by name, and whoever finds a name that they do not know cannot apply the rule. Early exits, overlapping windows and deadlines say which steps decide; the
-network takes every step, and nothing here knows it.
+The network takes every step. Early exits, overlapping windows and deadlines say which of them give
+a decision, and nothing here knows the network.
+
+Rules that a model file may carry beside its network are fitted on sweeps of objects that it was not
+trained on, and stored in the `ModelCard`. A score is a number that is larger the less a step looks
+like what was learnt; it is stored by name, and whoever finds a name that they do not know cannot
+apply the rule.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""`tactile-rt model show`, `verify`, `bench` and `tactile-rt eval`: what is in a file, is it good."""
+"""`tactile-rt model` and `tactile-rt eval`: what is in a file, is it whole, fast and good."""
 
 import math
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A recording as arrays (.npz, .h5), as text (.csv) or as a ROS 2 bag, for programs that read those.
+"""A recording as arrays (.npz, .h5), text (.csv) or a ROS 2 bag, for programs that read those.
 
     seq, t_ns, values, valid       the samples, as in `Chunk`
     decisions, events, health      messages, JSON, each with its time in ..._log_ns

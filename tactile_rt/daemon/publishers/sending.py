@@ -2,7 +2,12 @@
 
 ZeroMQ, Zenoh and Foxglove's server accept whoever comes until the process has no descriptor left,
 and then the recorder cannot open its next file. None of them can be told a limit that holds before
-a peer has said who it is; so connections are counted here, and those beyond the limit closed.
+a peer has said who it is.
+
+The kernel knows which connections a port has. A thread looks at the descriptors of the process some
+times a second; of those that are connected to the port, it lets the first few be and shuts down the
+rest, whereupon the library closes them. A look is made without a descriptor being opened, since
+there may be none left.
 """
 
 import abc
