@@ -30,8 +30,8 @@ HEAVY = (
 )
 ONBOARD = (
     "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session",
-    "cli", "daemon.daemon", "drivers.opening", "recording", "settings", "sources.combined",
-    "sources.opening", "stream", "sweep_set", "testing",
+    "cli", "daemon.daemon", "drivers.opening", "recording", "core.settings", "sources.combined",
+    "sources.opening", "core.stream", "sets.objects", "testing",
 )  # fmt: skip
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "tactile_rt."))

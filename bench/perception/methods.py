@@ -23,8 +23,8 @@ from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.promises import familiarity
+from tactile_rt.models.evaluation.svm import PENALTIES, fit, window_features
 from tactile_rt.models.evaluation.windows import stepped
-from tactile_rt.models.svm import PENALTIES, fit, window_features
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import train
 from tactile_rt.sets.objects import Sweeps

@@ -109,7 +109,7 @@ def _write_card(folder: Path) -> None:
     with needing("train"):
         import matplotlib  # noqa: F401
         import sklearn  # noqa: F401
-    from tactile_rt.models.svm import fit
+    from tactile_rt.models.evaluation.svm import fit
     from tactile_rt.sim_backend.datasets.card import write_card
 
     write_card(folder, fit)

@@ -12,9 +12,8 @@ from tactile_rt.classifier.classifier import EVERY, Classifier
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.classifier.trial import Trial, TrialLimits, try_model
 from tactile_rt.core.errors import ModelError, TactileError
-from tactile_rt.daemon.config import LimitsConfig, ModelConfig
+from tactile_rt.daemon.config import ADMISSION, LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
-from tactile_rt.daemon.part import ADMISSION
 
 __all__ = ["Admission", "file_stamp", "model_path"]
 

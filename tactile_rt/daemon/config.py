@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 __all__ = [
+    "ADMISSION",
     "CONFIG_VERSION",
     "EXAMPLE",
     "Config",
@@ -28,6 +29,7 @@ __all__ = [
     "is_loopback",
 ]
 
+ADMISSION = "tactile-rt admission"  # the thread that loads a model, not to be torn out of that
 CONFIG_VERSION = 1
 
 NAME = "name: letters, digits, - and _, 64 at most"

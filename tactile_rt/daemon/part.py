@@ -15,7 +15,7 @@ from tactile_rt.core.errors import SpecMismatch, TactileError
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import PartState
 
-__all__ = ["ADMISSION", "Part", "Report", "reason_of"]
+__all__ = ["Part", "Report", "reason_of"]
 
 STEADY_S = 10.0  # whoever has worked so long begins with the shortest pause again
 
@@ -155,6 +155,3 @@ def reason_of(error: BaseException) -> str:
     if frames:
         where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})"
     return f"{type(error).__name__}: {text}{where}" if text else f"{type(error).__name__}{where}"
-
-
-ADMISSION = "tactile-rt admission"  # it loads a model, and is not to be torn out of that

@@ -19,7 +19,7 @@ from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from tactile_rt.daemon.part import ADMISSION
+from tactile_rt.daemon.config import ADMISSION
 
 if TYPE_CHECKING:
     from tactile_rt.daemon.daemon import Daemon

@@ -8,7 +8,7 @@ A .csv has the samples alone. In an .npz, texts are JSON lines in arrays of byte
 text each takes the room of the longest. HDF5 is written piece by piece, and needs the extra
 ``hdf5``.
 
-    bag/metadata.yaml    what is in it; `ros2 bag info` and `play` take the folder
+    bag/metadata.yaml    what is in it; ``ros2 bag info`` and ``ros2 bag play`` take the folder
     bag/bag_0.mcap       a recording, which `Recording` reads, too; more of them are bag_1.mcap, ...
 
 A recording is a file of a bag as it is; here it is written anew, so that an array of one element

@@ -9,7 +9,7 @@ pytest.importorskip("sklearn")
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.svm import fit, fit_svm
+from tactile_rt.models.evaluation.svm import fit, fit_svm
 from tests.helpers.tiny_sweeps import write_tiny_set
 
 

@@ -295,7 +295,7 @@ def _compare_svm(
     Raises:
         RecordingError: the set's training or validation split cannot be read.
     """
-    from tactile_rt.models.svm import fit_svm  # scikit-learn takes a second to import
+    from tactile_rt.models.evaluation.svm import fit_svm  # scikit-learn takes a second to import
 
     learnt_from = (  # by the labels that the test's have here, the model's
         replace(relabelled(SweepSet.read(data, split), card.classes), window=test.window)

@@ -22,6 +22,7 @@ from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation.measures import CutWindows, among, cut_windows, hits, posteriors
+from tactile_rt.models.evaluation.svm import fit_svm
 from tactile_rt.models.grid.outcomes import (
     POINT,
     SUBSET,
@@ -35,7 +36,6 @@ from tactile_rt.models.grid.outcomes import (
     training_settings,
 )
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
-from tactile_rt.models.svm import fit_svm
 from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
 from tactile_rt.models.training.devices import launched

@@ -11,7 +11,7 @@ from matplotlib.image import imread
 
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream.sensor_spec import channel_limits
-from tactile_rt.models.svm import fit
+from tactile_rt.models.evaluation.svm import fit
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object, write_skipped
 from tactile_rt.sim_backend.datasets.card import write_card
