@@ -9,6 +9,7 @@ to point upward and do not count.
 import ast
 import builtins
 import re
+import tomllib
 from collections import defaultdict
 from functools import cache
 from importlib import import_module
@@ -16,6 +17,7 @@ from importlib.util import find_spec
 
 import pytest
 
+from bench.checks.house import LIMITS, measure
 from tests.helpers.source_tree import (
     FUNCTIONS,
     ROOT,
@@ -192,3 +194,8 @@ def test_every_test_lies_where_its_subject_does() -> None:
         if path.parent.relative_to(tests) not in mirrored
     }
     assert astray == set()
+
+
+def test_the_package_is_within_its_limits() -> None:
+    limits = tomllib.loads(LIMITS.read_text("utf-8"))
+    assert {name: n for name, n in measure().items() if n > limits[name]} == {}

@@ -94,7 +94,7 @@ def draw() -> str:
     """The picture, as SVG."""
     every = imports()
     arrows, light = reduced(every), robot(every)
-    place, ground = places(arrows), set(floors()[-2])
+    place, ground = places(arrows), set(floors()[-1])
     height = MARGIN * 2 + FLOOR * len(floors())
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}">',
