@@ -19,7 +19,7 @@ from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
 
 __all__ = ["SHIPPED", "STEPS", "SUBSTEPS", "StimuliInput", "read_stimuli"]
 
-SHIPPED = Path(__file__).parents[2] / "assets" / "six_stimuli.npz"
+SHIPPED = Path(__file__).parents[1] / "assets" / "six_stimuli.npz"
 STEPS, SUBSTEPS, PERIOD_MS = 22, 5, 9
 
 

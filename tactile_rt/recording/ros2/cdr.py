@@ -27,7 +27,7 @@ __all__ = [
     "token",
 ]
 
-PACKAGE = Path(__file__).parents[1] / "assets" / "tactile_rt_msgs"
+PACKAGE = Path(__file__).parents[2] / "assets" / "tactile_rt_msgs"
 # Of a definition's words, those that are no other message: bytes of each; a string has none.
 SIMPLE = {
     "bool": 1, "uint8": 1, "int32": 4, "uint32": 4, "int64": 8, "float32": 4, "float64": 8,
