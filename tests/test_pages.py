@@ -129,6 +129,20 @@ def test_every_page_is_in_the_site_s_navigation() -> None:
     assert {p for p in there if not p.startswith("decisions/")} == listed
 
 
+def test_every_decision_is_in_the_index_by_its_number_and_title() -> None:
+    index = (DECIDED / "README.md").read_text("utf-8")
+    listed = re.findall(r"^\| (\d+) \| \[(.+?)\]\((\S+)\) \| \S", index, re.M)
+    pages = sorted(DECIDED.glob("0*.md"))
+    titles = [page.read_text("utf-8").partition("\n")[0].removeprefix("# ") for page in pages]
+    assert sorted(listed, key=lambda line: int(line[0])) == [
+        (str(number), title, page.name)
+        for number, (title, page) in enumerate(zip(titles, pages, strict=True), 1)
+    ]
+    for number, (title, page) in enumerate(zip(titles, pages, strict=True), 1):
+        words = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+        assert page.name == f"{number:04d}-{words}.md"
+
+
 def test_the_face_is_told_whole() -> None:
     page = (DOCS / "reference" / "api" / "face.md").read_text("utf-8")
     told = {name.rpartition(".")[2] for name in re.findall(r"^::: (\S+)$", page, re.M)}

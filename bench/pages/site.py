@@ -2,7 +2,7 @@
 
 Pages are read in two places. In the repository a link may lead to any file of the tree; on the site
 it leads there, too, by the repository's address in pyproject.toml. The decisions are listed by
-their titles as they are in their folder, so that a new one needs no line anywhere. And a table
+their titles as they are in their folder, after their index and before the experiments. And a table
 without a heading has no band where it would be.
 """
 
@@ -24,7 +24,8 @@ def on_config(config: Any) -> Any:
     config.repo_url = repository()
     config.repo_name = "/".join(config.repo_url.split("/")[-2:])
     docs = Path(config.docs_dir)
-    pages = sorted(docs.glob("decisions/*.md"))
+    decided = docs / "decisions"
+    pages = [decided / "README.md", *sorted(decided.glob("0*.md")), decided / "experiments.md"]
     listed = [{title(page): page.relative_to(docs).as_posix()} for page in pages]
     config.nav = [*config.nav, {"Decisions": listed}]
     return config

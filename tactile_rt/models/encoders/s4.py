@@ -11,7 +11,7 @@ arithmetic: at 22 steps the paper's generating function at roots of unity saves 
 
 Training: nothing bounds the last two linear layers (`out` and a decoder), so at width 1 plain SGD
 at 0.1 and AdamW at 1e-2 diverge within ten updates. It takes a clipped gradient norm with SGD, and
-at most 1e-3 with AdamW (docs/explain/experiments.md).
+at most 1e-3 with AdamW (docs/decisions/experiments.md).
 """
 
 from __future__ import annotations

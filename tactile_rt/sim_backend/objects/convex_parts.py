@@ -8,7 +8,7 @@ neighbours are joined as long as no point of the surface lies deeper in their co
 than the tolerance. So a convex solid becomes one piece, an L two boxes, and a smooth hollow facets
 as wide as the tolerance allows. What is still empty in the middle is filled at last; no whisker
 gets there. Decompositions that cut a whole in two (CoACD, Wei et al. 2022) cost more; see
-docs/decisions/0025.
+docs/decisions/0023.
 
 The faces of a sheet are joined to flat patches of convex outline. Each becomes a plate that reaches
 equally far to both sides of the sheet; plates of neighbours share their corners, so that nothing
