@@ -12,9 +12,10 @@ from pathlib import Path
 
 import torch
 
-from tactile_rt import VERSION, export
+from tactile_rt import export
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import read_model, shipped_model
+from tactile_rt.core.packages import VERSION
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.export.model_steps import Subject

@@ -157,7 +157,7 @@ class SweepManifest:
             # Compared as JSON, which knows no tuples: a recipe may have been written with some.
             here = msgspec.json.decode(text)
             there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
-            differing = _differing(here, there)
+            differing = _compare_recipes(here, there)
             if differing:
                 raise ConfigError(
                     f"{folder} holds another sweep set (other {name_some(differing)}): "
@@ -197,12 +197,12 @@ def object_path(folder: Path, name: str) -> Path:
 
 
 def has_object(folder: Path, name: str) -> bool:
-    """Whether an object's sweeps have been written (whole, by construction)."""
+    """Return True if an object's sweeps are there, which are written whole."""
     return object_path(folder, name).exists()
 
 
 def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
-    """Sets of one array as one, which is the first with the categories and objects of the others.
+    """Join sets of one array: the first, with categories and objects of all.
 
     Raises:
         ConfigError: sets of another array or sensor, or of another period.
@@ -232,13 +232,13 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
     )
 
 
-def _differing(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
-    """Which keys differ, those of tables by their full name."""
+def _compare_recipes(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
+    """List the keys that differ, those of tables by their full name."""
     found = []
     for key in dict.fromkeys([*here, *there]):
         mine, theirs = here.get(key), there.get(key)
         if isinstance(mine, dict) and isinstance(theirs, dict) and key not in ("spec", "split"):
-            found += _differing(mine, theirs, f"{prefix}{key}.")
+            found += _compare_recipes(mine, theirs, f"{prefix}{key}.")
         elif mine != theirs:
             found.append(f"{prefix}{key}")
     return found
@@ -258,7 +258,7 @@ def split_by_object(
 
 
 def check_labelled(folder: Path, manifest: SweepManifest) -> None:
-    """What is to be learnt from a set's labels must have some.
+    """Check that a set which is to teach its labels has some.
 
     Raises:
         ConfigError: its touches have none.
@@ -271,7 +271,7 @@ def check_labelled(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """No object on two sides of the split, every trained object of a category that is trained."""
+    """Check that no object is on two sides, and every trained one has a label."""
     side: dict[str, str] = {}
     for split, names in manifest.split.items():
         for name in names:
@@ -292,7 +292,7 @@ def check_split(folder: Path, manifest: SweepManifest) -> None:
 def trained_objects(
     manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
 ) -> dict[str, list[str]]:
-    """The names of the objects that a network has learnt from, by where the objects come from."""
+    """List the objects that a network has learnt from, by their source."""
     before = saved.get("trained_objects", {}) if saved else {}
     found = {source: dict.fromkeys(names) for source, names in before.items()}
     for one in manifests:

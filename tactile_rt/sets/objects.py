@@ -116,7 +116,9 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
         if contacts is not None:
             stored = _read_arrays(path, CONTACTS)[CONTACTS]
             if stored.shape != contacts[at : at + count].shape:
-                raise _damaged(path, ValueError(f"contacts {stored.shape} beside other values"))
+                raise _damage_error(
+                    path, ValueError(f"contacts {stored.shape} beside other values")
+                )
             contacts[at : at + count] = stored
         at += count
     return Sweeps(
@@ -142,7 +144,7 @@ def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str,
     arrays = _read_arrays(path)
     arrays.pop(CONTACTS, None)
     if "values" not in arrays:
-        raise _damaged(path, KeyError("no values"))
+        raise _damage_error(path, KeyError("no values"))
     return arrays.pop("values"), arrays
 
 
@@ -168,7 +170,7 @@ def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
     except MemoryError:
         raise
     except Exception as error:
-        raise _damaged(path, error) from None
+        raise _damage_error(path, error) from None
     if len(stored) != 4 or stored[2:] != shape:
         raise RecordingError(f"{path} holds {stored}, not (sweep, sample, *{shape})")
     return tuple(stored)
@@ -182,16 +184,16 @@ def _read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
     except MemoryError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
-        raise _damaged(path, error) from None
+        raise _damage_error(path, error) from None
 
 
-def _damaged(path: Path, error: Exception) -> RecordingError:
+def _damage_error(path: Path, error: Exception) -> RecordingError:
     reason = str(error) or type(error).__name__
     return RecordingError(f"{path} is damaged ({reason}): delete it and sweep again")
 
 
 def read_skipped(folder: Path) -> dict[str, str]:
-    """Objects that could not be made, and why; none if the set does not list any.
+    """Read which objects could not be made, and why; empty without a list.
 
     Raises:
         RecordingError: the list is damaged.

@@ -292,7 +292,7 @@ class Timing:
 
     @classmethod
     def of(cls, period_ns: int) -> "Timing":
-        """For samples so far apart: steps as near to the paper's 45 ms as whole samples come."""
+        """Return steps as near to 45 ms as whole samples of this period come."""
         return cls(substeps=max(1, round(STEP_MS * 1e6 / period_ns)))
 
     @property
