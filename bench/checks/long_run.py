@@ -23,7 +23,7 @@ from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.core.stream import NS_PER_S, Chunk
 
 STEPS, WARM_UP, REPORTS = 1_000_000, 20_000, 10
-GROWTH, DIFFERENCE = 2e6, 1e-4  # bytes; of a posterior, from the tare's sums in another order
+GROWTH, DIFFERENCE = 2e6, 1e-4  # bytes; of a posterior, from the baseline's sums in another order
 BLOCK, QUIET = 2000, 200  # samples
 BAD = np.array([np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e9], dtype=np.float32)
 CARD = read_model(shipped_model())[0]

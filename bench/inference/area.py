@@ -22,7 +22,7 @@ __all__ = ["Pulses", "run"]
 
 RATE_HZ = 1000
 PERIOD_NS = NS_PER_S // RATE_HZ
-QUIET, TOUCH = 500, 1100  # samples: time for release and tare, then more than one episode
+QUIET, TOUCH = 500, 1100  # samples: time for release and baseline, then more than one episode
 NOISE, FORCE = 2e-6, 1e-4  # N, and a thousandth of it in N m: what whiskers feel
 CHUNK = 9
 CONSUMER_SLEEP_S = 0.05  # per chunk of 9 ms: a consumer five times too slow

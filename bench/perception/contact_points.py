@@ -36,8 +36,8 @@ def main(folder: Path) -> None:
     rng = np.random.default_rng(7)
     noise = manifest.limits.noise * rng.standard_normal(sweeps.values.shape, dtype=np.float32)
     for name, values in (("clean", sweeps.values), ("noisy", sweeps.values + noise)):
-        tared = values - values[:, : manifest.lead].mean(axis=1, keepdims=True)
-        loads = tared[touching].astype(np.float64)
+        rested = values - values[:, : manifest.lead].mean(axis=1, keepdims=True)
+        loads = rested[touching].astype(np.float64)
         for who, estimate in ESTIMATES.items():
             error = 100 * np.abs(estimate(loads, element, shapes) - wanted)
             error /= shapes.length[element]

@@ -49,7 +49,7 @@ SENSORS = {
     "twice the rated noise": Disturbance(noise=2),
     "six dead whiskers": Disturbance(dead=6),
     "gain error of 20 %": Disturbance(gain=0.2),
-    "offset of 5 uN since the tare": Disturbance(offset=0.25),
+    "offset of 5 uN since the baseline": Disturbance(offset=0.25),
     "the same, and rated noise": Disturbance(offset=0.25, noise=1),
     "offset of 20 uN": Disturbance(offset=1),
     "drift of 10 uN/s": Disturbance(drift=0.5),

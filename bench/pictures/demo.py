@@ -19,7 +19,7 @@ OBJECTS, STEP, WHISKERS, FELT_N = 12, 8, 6, 1e-5
 
 def felt(demo: Demonstration) -> int:
     """Whiskers that feel a force worth showing."""
-    forces = demo.classifier.tared[:, :3]  # (element, xyz) N
+    forces = demo.classifier.deviation[:, :3]  # (element, xyz) N
     return int((np.linalg.norm(forces, axis=1) > FELT_N).sum())
 
 

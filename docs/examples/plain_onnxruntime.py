@@ -13,7 +13,7 @@ session = ort.InferenceSession(file, providers=["CPUExecutionProvider"])
 card = json.loads(session.get_modelmeta().custom_metadata_map["tactile_rt"])
 elements, channels = len((spec := json.loads(card["spec"]))["elements"]), len(spec["channels"])
 names = [output.name for output in session.get_outputs()]
-# The tare: mean and noise of each element while nothing is touched, here made up. SI units.
+# The baseline: mean and noise of each element while nothing is touched, here made up. SI units.
 floor = np.array(card["floor"], dtype=np.float32)
 rng = np.random.default_rng(0)
 quiet = rng.normal(size=(50, elements, channels)).astype(np.float32) * floor

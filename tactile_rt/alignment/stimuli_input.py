@@ -31,7 +31,7 @@ class StimuliInput:
         samples: (6, step, sub-step, element, channel) The loads while the array whisks each
             stimulus, float32, N and N m.
         sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
-            assumed of a sensor. The tare is zero, for the whiskers rest before they whisk.
+            assumed of a sensor. The baseline is zero, for the whiskers rest before they whisk.
         elements, channels, units: Names along the last two axes, and the unit of each channel.
         sha256: The SHA-256 sum of the samples, hex.
     """
@@ -46,7 +46,7 @@ class StimuliInput:
 
     @property
     def offset(self) -> NDArray[np.float32]:
-        """(6, element, channel) float32: the tare."""
+        """(6, element, channel) float32: the baseline."""
         return np.zeros_like(self.sigma)
 
     def check(

@@ -152,9 +152,9 @@ class Classifier:
             three steps, or 0.15 s if that is more.
 
     Attributes:
-        detector: The contact detector, which holds the stream's contact state and tare.
-        tared: (element, channel) The last resampled sample less the tare, SI; zeros before the
-            tare. The next `push` overwrites it.
+        detector: The contact detector, which holds the stream's contact state and baseline.
+        deviation: (element, channel) The last resampled sample less the baseline, SI; zeros before
+            there is one. The next `push` overwrites it.
         touches: The newest 256 changes of contact, as stream time (ns) and whether it began;
             whoever reads them takes them out.
         stats: The counters of steps, late steps and bad samples.
@@ -196,7 +196,7 @@ class Classifier:
         self.providers = tuple(session.get_providers())
         order = fit_source(model, self.card, spec)
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
-        self.tared = np.zeros(spec.shape, dtype=np.float32)
+        self.deviation = np.zeros(spec.shape, dtype=np.float32)
         self.touches: deque[tuple[int, bool]] = deque(maxlen=TOUCHES)
         self.stats = ClassifierStats()
         self._sliding = mode == "sliding"
@@ -281,10 +281,10 @@ class Classifier:
         begins = self.detector.update(sample, valid)
         if self.detector.contact != touched:
             self.touches.append((t_ns, not touched))
-        # An element without a trustworthy value, or without a tare, reads as untouched.
-        untouched = ~(valid & self.detector.tared)
-        np.subtract(sample, self.detector.offset, out=self.tared)
-        self.tared[untouched] = 0
+        # An element without a trustworthy value, or without a baseline, reads as untouched.
+        untouched = ~(valid & self.detector.has_baseline)
+        np.subtract(sample, self.detector.offset, out=self.deviation)
+        self.deviation[untouched] = 0
         before = self._skipping
         if self.skips.covers(t_ns):
             self._skip()
@@ -326,8 +326,8 @@ class Classifier:
         self._sigma = self.detector.sigma
         self._stepper.begin(self._offset[self._order], self._sigma[self._order])
         self._deadline.begin()
-        # Of an element without a tare the noise is not known.
-        known = self._sigma[self.detector.tared] / self._rated
+        # Of an element without a baseline the noise is not known.
+        known = self._sigma[self.detector.has_baseline] / self._rated
         noise = float(np.median(known)) if known.size else np.inf
         self._promise = fitting(self.card.candidates, noise)
 

@@ -1,4 +1,4 @@
-"""Tare and contact onset: from a resampled stream to episodes.
+"""Baseline and contact onset: from a resampled stream to episodes.
 
 Training windows and the live classifier start where this detector says that contact began, on a
 baseline (offset and noise) that it measured while nothing was touched.
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 __all__ = ["ContactDetector"]
 
-TARE_SAMPLES = 20  # quiet samples before the first decision: 180 ms at 9 ms
+MIN_BASELINE_SAMPLES = 20  # quiet samples before the first decision: 180 ms at 9 ms
 BASELINE_SAMPLES = 100  # the baseline is the mean of at most this many of the last quiet samples
 # The latest quiet samples may already hold a faint onset: they wait outside until it would have
-# been found. The first tare waits for fewer, or a robot would be numb for longer.
+# been found. The first baseline waits for fewer, or a robot would be numb for longer.
 GUARD_SAMPLES = 15
 FIRST_GUARD_SAMPLES = 5
 RELEASE_SAMPLES = 20
-# A level to which the signal returns so often within one contact is that of rest: the tare was
-# taken while something was touched.
+# A level to which the signal returns so often within one contact is that of rest: the baseline
+# was taken while something was touched.
 RETURNS = 3
 LEVELS = 8  # that are remembered
 STRETCH_SAMPLES = 20
@@ -39,12 +39,13 @@ LIMIT = np.array([np.inf, 3.0, 3.0], dtype=np.float32)[:, None, None]
 
 
 def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Thresholds of the squared means, (mean, element) sigma^2, with a tare of `quiet` (element,).
+    """Compute the thresholds of the squared means, (mean, element) sigma^2.
 
-    The offset is itself a mean, of variance 1 / n; and sigma is an estimate of n - 1 degrees of
-    freedom, by which a square is too large by (n - 1) / (n - 3) in the mean, as F has it.
+    `quiet` (element,) samples make the baseline. The offset is itself a mean, of variance 1 / n;
+    and sigma is an estimate of n - 1 degrees of freedom, by which a square is too large by (n - 1)
+    / (n - 3) in the mean, as F has it.
     """
-    n = np.maximum(quiet, TARE_SAMPLES)
+    n = np.maximum(quiet, MIN_BASELINE_SAMPLES)
     variance = (MEAN_VARIANCE[:, None] + 1 / n) * (n - 1) / (n - 3)
     threshold: NDArray[np.float64] = ONSET_Z2[:, None] * variance
     return threshold
@@ -55,10 +56,10 @@ class ContactDetector:
 
     The statistic of an element is z^2 = sum over its channels of (m / sigma)^2 / v, where m is a
     mean of (x - offset) over the last samples, and v the variance of m in units of sigma^2: that
-    of an exponential mean of rate r, r / (2 - r), and that of the tare. While nothing is touched
-    it is chi-square distributed with as many degrees of freedom as channels. An exponential mean
-    whose length suits the size of a step finds it in white noise nearly as soon as any test can
-    (Roberts 1959, Technometrics 1:239; of several channels together: Lowry et al. 1992,
+    of an exponential mean of rate r, r / (2 - r), and that of the baseline. While nothing is
+    touched it is chi-square distributed with as many degrees of freedom as channels. An exponential
+    mean whose length suits the size of a step finds it in white noise nearly as soon as any test
+    can (Roberts 1959, Technometrics 1:239; of several channels together: Lowry et al. 1992,
     Technometrics 34:46, eq. 2.2 and 2.3). Touches are of every size, so three lengths stand side
     by side: the sample itself, about 7 and about 19.
 
@@ -71,23 +72,24 @@ class ContactDetector:
         shape: (element, channel).
         floor: (channel,) smallest sigma assumed, SI.
 
-    A tare that was taken while something was touched, as by an array that is plugged in again in
-    the middle of a touch, would be a contact without end. So within a contact still stretches of 20
-    samples are looked for. Once the signal has come back to the level of one of them three times,
-    and was there for longer than it was ever quiet on the tare, that level is the new tare.
+    A baseline that was taken while something was touched, as by an array that is plugged in again
+    in the middle of a touch, would be a contact without end. So within a contact still stretches of
+    20 samples are looked for. Once the signal has come back to the level of one of them three
+    times, and was there for longer than it was ever quiet on the baseline, that level is the new
+    baseline.
 
-    An element that is not trusted neither touches nor tares: its baseline is that of its own
-    trusted samples, and it is left out until it has enough of them.
+    An element that is not trusted neither touches nor counts as rest: its baseline is that of its
+    own trusted samples, and it is left out until it has enough of them.
 
     Attributes:
-        ready: Whether enough quiet samples have been seen for a tare; no contact is reported
+        ready: Whether enough quiet samples have been seen for a baseline; no contact is reported
             before.
-        offset: (element, channel) The tare, which is the mean of the quiet samples, SI.
+        offset: (element, channel) The baseline, which is the mean of the quiet samples, SI.
         sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
             below `floor`.
-        tared: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
-        doubted: The number of samples before the latest onset that the tare leaves out, as they
-            may be of the touch already.
+        has_baseline: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
+        doubted: The number of samples before the latest onset that the baseline leaves out, as
+            they may be of the touch already.
     """
 
     def __init__(self, shape: tuple[int, int], floor: NDArray[np.float32]) -> None:
@@ -95,7 +97,7 @@ class ContactDetector:
         self.contact = False
         self.offset = np.zeros(shape, dtype=np.float32)
         self.sigma = np.broadcast_to(self.floor, shape).astype(np.float32)
-        self.tared: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
+        self.has_baseline: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
         self.doubted = 0
         # Quiet samples with their validity; an invalid one counts as nothing in every sum.
         self._pending: deque[tuple[NDArray[np.float64], NDArray[np.bool_]]] = deque()
@@ -114,8 +116,8 @@ class ContactDetector:
 
     @property
     def ready(self) -> bool:
-        """Whether the tare is complete."""
-        return len(self._baseline) >= TARE_SAMPLES
+        """Whether the baseline is complete."""
+        return len(self._baseline) >= MIN_BASELINE_SAMPLES
 
     def update(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> bool:
         """Take one sample; return True when contact begins with it.
@@ -146,8 +148,8 @@ class ContactDetector:
             self._quiet_for = 0 if (excess > RELEASE).any() else self._quiet_for + 1
             if self._quiet_for >= RELEASE_SAMPLES:
                 self.contact = False
-            elif self._rest.found(sample, valid & self.tared, self._pooled, self._quiet):
-                self._tare_anew()
+            elif self._rest.found(sample, valid & self.has_baseline, self._pooled, self._quiet):
+                self._restart_baseline()
         elif not above.any():
             self._wait(sample, valid)
             self._learn(GUARD_SAMPLES)
@@ -155,7 +157,7 @@ class ContactDetector:
 
     def _excess(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(element,) largest statistic, each in units of its threshold."""
-        trusted = (valid & self.tared)[:, None]
+        trusted = (valid & self.has_baseline)[:, None]
         z = np.where(trusted, sample - self.offset, np.float32(0)) / self._pooled
         self._means += RATES[:, None, None] * (
             np.minimum(np.maximum(z, -LIMIT), LIMIT) - self._means
@@ -171,8 +173,8 @@ class ContactDetector:
         quiet = np.where(valid[:, None], sample, 0.0).astype(np.float64)
         self._pending.append((quiet, valid.copy()))
 
-    def _tare_anew(self) -> None:
-        """What was taken for a touch since long is rest."""
+    def _restart_baseline(self) -> None:
+        """Measure the baseline anew: what was taken for a touch since long is rest."""
         self.contact = False
         self._above = np.zeros_like(self._above)
         self._suspicious_for = np.zeros_like(self._suspicious_for)
@@ -201,21 +203,21 @@ class ContactDetector:
             self._count += is_valid
             self._sum += newest
             self._sum_of_squares += newest**2
-        self.tared = self._count >= TARE_SAMPLES
+        self.has_baseline = self._count >= MIN_BASELINE_SAMPLES
         self._onset_z2 = onset_z2(self._count)
-        if not self.tared.any():
+        if not self.has_baseline.any():
             return
         n = np.maximum(self._count, 2)[:, None]
         mean = self._sum / n
         variance = np.maximum(self._sum_of_squares - n * mean**2, 0.0) / (n - 1)
         # An element with too few samples keeps what was last known of it.
-        known = self.tared[:, None]
+        known = self.has_baseline[:, None]
         self.offset = np.where(known, mean.astype(np.float32), self.offset)
         sigma = np.maximum(np.sqrt(variance).astype(np.float32), self.floor)
         self.sigma = np.where(known, sigma, self.sigma)
         # Twenty samples underestimate an element's own noise often enough to raise false onsets:
         # for detection no element counts as quieter than the typical one.
-        self._pooled = np.maximum(self.sigma, np.median(self.sigma[self.tared], axis=0))
+        self._pooled = np.maximum(self.sigma, np.median(self.sigma[self.has_baseline], axis=0))
 
 
 class _Rest:
@@ -243,7 +245,7 @@ class _Rest:
             sample: (element, channel) SI.
             known: (element,) elements to trust.
             sigma: (element, channel) the noise per sample, SI.
-            quiet: samples that were ever quiet on the tare.
+            quiet: samples that were ever quiet on the baseline.
         """
         if len(self.block) == STRETCH_SAMPLES:
             self.block = []

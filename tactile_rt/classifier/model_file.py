@@ -3,8 +3,8 @@
 Inputs of the graph, one step of a stream, for a batch of independent streams:
 
     samples  (batch, sub-step, element, channel) float32, SI, as the array delivers them
-    offset   (batch, element, channel) float32, SI: the tare
-    sigma    (batch, element, channel) float32, SI: noise per sample, measured with the tare
+    offset   (batch, element, channel) float32, SI: the baseline
+    sigma    (batch, element, channel) float32, SI: noise per sample, measured with the baseline
     <state>  every tensor of `ModelCard.state`, all zeros when an episode begins
 
 Outputs: ``logits (batch, class)``, ``embedding (batch, unit)`` (what the network's last linear

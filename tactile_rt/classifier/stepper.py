@@ -96,7 +96,7 @@ class Stepper:
         self.begin(self._offset.array[0], self._sigma.array[0])
 
     def begin(self, offset: NDArray[np.float32], sigma: NDArray[np.float32]) -> None:
-        """Zero the state of every lane, and take a tare (element, channel), SI."""
+        """Zero the state of every lane, and take on a baseline (element, channel), SI."""
         self._offset.array[:] = offset
         self._sigma.array[:] = sigma
         self._offset.send()

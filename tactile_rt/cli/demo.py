@@ -335,7 +335,7 @@ def _draw_forces(demo: Demonstration) -> Text:
 
     spec = demo.classifier.card.array
     newtons = [i for i, unit in enumerate(spec.units) if unit == "N"]
-    force_un = 1e6 * np.linalg.norm(demo.classifier.tared[:, newtons], axis=1)  # (element,)
+    force_un = 1e6 * np.linalg.norm(demo.classifier.deviation[:, newtons], axis=1)  # (element,)
     at = dict(zip(spec.grid, zip(spec.elements, force_un.tolist(), strict=True), strict=True))
     rows, columns = spec.grid_shape
     text = Text(no_wrap=True)

@@ -1,7 +1,7 @@
 """Stored sweeps in memory, and the windows of them: onsets as the robot will find them.
 
 A window is what the classifier would feed the network: it starts where `ContactDetector` reports
-onset on the noisy signal, and carries the tare that the detector had measured by then.
+onset on the noisy signal, and carries the baseline that the detector had measured by then.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class SweepSet:
         noise: (channel,) The rated noise per sample, SI.
         floor: (channel,) The smallest sigma of the detector, SI.
         window: The first sample of a sweep's window: "onset", where the detector hears the touch,
-            or "sweep", where the object sets out, tared by what was measured until then.
+            or "sweep", where the object sets out, on the baseline that was measured until then.
     """
 
     manifest: SweepManifest
@@ -70,7 +70,7 @@ class SweepSet:
         return cls(manifest, read_sweeps(folder, split), limits.noise, limits.floor)
 
     def onsets(self, values: NDArray[np.float32]) -> Onsets:
-        """Where the windows of sweeps (sweep, sample, element, channel) begin, and their tares."""
+        """Find where windows of (sweep, sample, element, channel) begin, and their baselines."""
         if self.window == "onset":
             return find_onsets(values, self.floor)
         n, shape = len(values), self.manifest.spec.shape
@@ -132,7 +132,7 @@ class SweepSet:
         return np.concatenate(starts, axis=1)
 
     @cached_property
-    def tares(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def baselines(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Offset and sigma (sweep, element, channel), SI, as the detector has measured them by the
         onset, of recorded sweeps; 0 of others, of which training draws them."""
         offset, sigma = np.zeros((2, len(self.sweeps), *self.manifest.spec.shape), dtype=np.float32)

@@ -14,7 +14,7 @@ from tactile_rt.models.datasets import SweepSet
 
 __all__ = ["CLEAN", "OFFSET", "RATED", "Disturbance"]
 
-OFFSET = 2.0  # a unit of offset that appears after the tare, in units of the rated noise
+OFFSET = 2.0  # a unit of offset that appears after the baseline, in units of the rated noise
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Disturbance:
         gain: The standard deviation of every whisker's relative gain error.
         dead: The number of whiskers, drawn at random, that read zero throughout.
         rows: The number of rows of the grid, drawn at random, whose whiskers all do.
-        offset: The size of a constant that appears with the contact, after the tare, in units of
-            `OFFSET`; a sign is drawn for every whisker and channel.
+        offset: The size of a constant that appears with the contact, after the baseline, in units
+            of `OFFSET`; a sign is drawn for every whisker and channel.
         drift: The size that a linear drift from the contact on has reached at the window's end, in
             units of `OFFSET`; a sign is drawn as for the offset.
         swapped: Whether the channels of x and of y are connected the wrong way round.
-        rest: The number of stored samples of silence before each sweep, for the tare; a robot has
-            them, simulated sweeps have only a short lead.
+        rest: The number of stored samples of silence before each sweep, for the baseline; a robot
+            has them, simulated sweeps have only a short lead.
 
     Raises:
         ConfigError: a negative amount.

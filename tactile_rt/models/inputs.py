@@ -5,7 +5,7 @@ sign(v) log(1 + |v| / s). The scale s never falls below the noise measured at re
 logarithm would magnify silent channels into signals.
 
 A recurrent network would never forget a number that is none. So a sample that is NaN or infinite
-counts as no load, and so does a channel whose tare or noise is: also in a file that others run.
+counts as no load, and so does a channel whose baseline or noise is: also in a file that others run.
 
 The paper's own preprocessing ("paper") has no logarithm: forces in mN and moments in uN m as they
 are, limited to 1000 of either (Chung et al. 2025, and its code).

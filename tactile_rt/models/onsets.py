@@ -14,9 +14,9 @@ from tactile_rt.classifier.contact import (
     FIRST_GUARD_SAMPLES,
     GUARD_SAMPLES,
     LIMIT,
+    MIN_BASELINE_SAMPLES,
     RATES,
     SUSPICION,
-    TARE_SAMPLES,
     onset_z2,
 )
 
@@ -31,7 +31,7 @@ class Onsets:
 
     Attributes:
         start: (sweep,) sample of onset; -1 where none was found.
-        offset, sigma: (sweep, element, channel) tare and noise, SI.
+        offset, sigma: (sweep, element, channel) baseline and noise, SI.
     """
 
     start: NDArray[np.int64]
@@ -67,7 +67,7 @@ def _batch(
     start = np.full(n, -1, dtype=np.int64)
     active = np.arange(n)
     for k in range(samples):
-        ready = baseline.count[active] >= TARE_SAMPLES
+        ready = baseline.count[active] >= MIN_BASELINE_SAMPLES
         first = active[~ready]
         baseline.wait(first, k)
         baseline.learn(first, np.full(len(first), FIRST_GUARD_SAMPLES))
@@ -101,7 +101,7 @@ def _batch(
 
 
 class _Baseline:
-    """The tare of every sweep, and the samples that wait to enter it."""
+    """The baseline of every sweep, and the samples that wait to enter it."""
 
     def __init__(self, values: NDArray[np.float32], floor: NDArray[np.float32]) -> None:
         n, samples, *rest = values.shape
@@ -133,7 +133,7 @@ class _Baseline:
             self.total[of] += newest
             self.squares[of] += newest**2
             self.count[of] += 1
-        of = changed[self.count[changed] >= TARE_SAMPLES]
+        of = changed[self.count[changed] >= MIN_BASELINE_SAMPLES]
         if not len(of):
             return
         size = np.minimum(self.count[of], BASELINE_SAMPLES)[:, None, None]

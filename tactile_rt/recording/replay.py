@@ -329,7 +329,7 @@ class SweepOptions:
         speed: The pace as a multiple of real time; 0: as fast as it is read.
         sweep: The number of the only sweep to stream, from 0; None: all, one after another.
         rest_s: The rest before each sweep, s, besides the lead that is stored with it: so that a
-            contact ends, and a tare is taken, before the next.
+            contact ends, and a baseline is taken, before the next.
         loop: Whether the recording begins again at its end; numbers and times of samples go on.
     """
 

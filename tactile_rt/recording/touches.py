@@ -3,13 +3,13 @@
     chunks -> Resampler -> ContactDetector -> RecordedTouch: rest, then a window from the onset on
 
 Goals: a network that learns from a touch gets the very numbers that a running `Classifier` would
-have fed it: the same resampled samples, the same onset, the same tare.
+have fed it: the same resampled samples, the same onset, the same baseline.
 
 Plan: the stream goes through the resampler and the detector that a classifier has. An onset begins
 a touch, as long as an episode; while it lasts no other begins. With a touch goes the rest before
-it: the latest samples that a tare may be made of, whatever lies between them; enough of them that
-the detector, run on a touch alone, has forgotten how it began when the onset comes, and finds it
-where it found it in the stream. A touch that a classifier would have had no samples for, as the
+it: the latest samples that a baseline may be made of, whatever lies between them; enough of them
+that the detector, run on a touch alone, has forgotten how it began when the onset comes, and finds
+it where it found it in the stream. A touch that a classifier would have had no samples for, as the
 stream ended or had a gap, is given with the reason why it is none to learn from.
 """
 
@@ -24,7 +24,7 @@ from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.classifier.contact import (
     BASELINE_SAMPLES,
     FIRST_GUARD_SAMPLES,
-    TARE_SAMPLES,
+    MIN_BASELINE_SAMPLES,
     ContactDetector,
 )
 from tactile_rt.classifier.timebase import Resampler
@@ -48,7 +48,7 @@ class RecordedTouch:
         onset_ns: The stream time of the onset, ns.
         end_ns: The stream time of the window's last sample, ns.
         values: (sample, element, channel) float32: `REST` samples of rest, then the window, SI;
-            where a classifier takes an element for untouched, its tare.
+            where a classifier takes an element for untouched, its baseline.
         flaw: The reason why nothing can be learnt from the touch; empty: there is none.
     """
 
@@ -93,14 +93,14 @@ class _Cutter:
                 yield from self.broken(GAP)
             self._next_seq = seq + 1
             detector = self._detector
-            quiet = not detector.contact  # the sample at which a contact ends is in no tare
+            quiet = not detector.contact  # the sample at which a contact ends is in no baseline
             begins = detector.update(values, valid)
             if begins and self._touch is None:
                 self._touch = _Growing(
-                    t_ns, list(self._rest), detector.doubted, detector.offset, detector.tared,
-                    detector.floor,
+                    t_ns, list(self._rest), detector.doubted, detector.offset,
+                    detector.has_baseline, detector.floor,
                 )  # fmt: skip
-            if begins:  # what was doubted is in no later tare, either
+            if begins:  # what was doubted is in no later baseline, either
                 for _ in range(min(detector.doubted, len(self._rest))):
                     self._rest.pop()
             if quiet and not begins:
@@ -122,25 +122,25 @@ class _Cutter:
 
 @dataclass
 class _Growing:
-    """A touch under way: what came before it, its tare, and what has come."""
+    """A touch under way: what came before it, its baseline, and what has come."""
 
     onset_ns: int
     rest: list[tuple[NDArray[np.float32], NDArray[np.bool_]]]
     doubted: int  # of the rest, the last samples
     offset: NDArray[np.float32]  # (element, channel)
-    tared: NDArray[np.bool_]  # (element,)
+    has_baseline: NDArray[np.bool_]  # (element,)
     floor: NDArray[np.float32]  # (channel,)
     values: list[NDArray[np.float32]] = field(default_factory=list)
     valid: list[NDArray[np.bool_]] = field(default_factory=list)
 
     def done(self, end_ns: int) -> RecordedTouch:
         window, valid = np.stack(self.values), np.stack(self.valid)
-        there = valid.any(axis=0) & self.tared  # elements that measure anything
+        there = valid.any(axis=0) & self.has_baseline  # elements that measure anything
         quiet = [values for values, trusted in self.rest if trusted[there].all()]
-        gap = not valid[:, there].all() or len(quiet) - self.doubted < TARE_SAMPLES
+        gap = not valid[:, there].all() or len(quiet) - self.doubted < MIN_BASELINE_SAMPLES
         if gap or not there.any():
             return RecordedTouch(self.onset_ns, end_ns, window[:0], GAP)
-        # Where there was less rest, what the tare rests on is there again and again.
+        # Where there was less rest, what the baseline rests on is there again and again.
         sure = np.arange(len(quiet) - REST, 0) % (len(quiet) - self.doubted)
         rest = np.stack(quiet)
         whole = np.concatenate([rest[sure], rest, window])
@@ -150,6 +150,6 @@ class _Growing:
     def _found_in(self, whole: NDArray[np.float32]) -> bool:
         """Whether the onset is found in the touch alone, too."""
         detector = ContactDetector(self.offset.shape, self.floor)
-        trusted = np.ones(len(self.tared), np.bool_)
+        trusted = np.ones(len(self.has_baseline), np.bool_)
         onsets = (k for k, sample in enumerate(whole) if detector.update(sample, trusted))
         return abs(next(onsets, -1) - REST) <= SURE

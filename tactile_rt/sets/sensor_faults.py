@@ -23,9 +23,9 @@ class SensorFaults:
         gain: The standard deviation of every whisker's relative gain error.
         dead: The probability of each whisker to read nothing.
         dead_row: The probability of each row of whiskers to read nothing.
-        offset: The standard deviation of the constant that every channel has got since its tare, in
-            units of its rated noise: at most, as half of the sweeps have none, and the others draw
-            a share of it evenly.
+        offset: The standard deviation of the constant that every channel has got since its
+            baseline, in units of its rated noise: at most, as half of the sweeps have none, and the
+            others draw a share of it evenly.
         drift: The same of what has come to it by the end of a window, growing evenly.
         implausible: The probability of loads that no touch makes, which a network learns to name:
             channels swapped or turned, a gain that is wrong by far, half of the elements gone.

@@ -57,7 +57,7 @@ CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
 DRAGGED_SAMPLES = 300  # more, while an object that has passed by still drags a whisker along
 LATEST_NS = 100_000_000  # how far a live simulation may be behind real time
-REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
+REST_SAMPLES = 600  # after an object its episode ends, contact is released; before one, a baseline
 
 
 @dataclass(frozen=True)

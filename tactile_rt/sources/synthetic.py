@@ -24,7 +24,7 @@ COLUMNS = 7  # of the grid that the whiskers stand on
 PITCH_M = 0.002
 CHUNK_S = 0.009
 BUMP_S, EVERY_S = 0.3, 1.5  # a bump's length, and from one to the next
-REST_S = 0.6  # before the first, for a tare
+REST_S = 0.6  # before the first, for a baseline
 PEAK = {"N": 2e-3, "N m": 2e-5}
 # of what a device measures, that can be bought
 LOADS = {"N": 5.0, "N m": 0.1, "T": 1e-3, "Pa": 1e4, "V": 5e-3, "m/s2": 5.0, "F": 1e-12, "1": 1e3}

@@ -68,8 +68,8 @@ class Listener:
     def _listen(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         decisions = self.classifier.push(chunk)
         detector = self.classifier.detector
-        if detector.ready and detector.tared.any():
-            now = np.abs(self.classifier.tared / detector.sigma)
+        if detector.ready and detector.has_baseline.any():
+            now = np.abs(self.classifier.deviation / detector.sigma)
             element, channel = np.unravel_index(now.argmax(), now.shape)
             if now[element, channel] > self._strongest:
                 self._strongest = float(now[element, channel])

@@ -122,7 +122,7 @@ def test_without_contact_there_is_no_decision(model: Path) -> None:
     assert push_all(Classifier(model, SAME_RATE), stream(signal([], 600))) == []
 
 
-def test_state_is_zeroed_at_the_next_onset_and_the_tare_is_the_new_one(model: Path) -> None:
+def test_state_is_zeroed_at_the_next_onset_and_the_baseline_is_the_new_one(model: Path) -> None:
     values = signal([(QUIET, QUIET + 40, 0.1), (500, 600, 0.2)], 600)
     decisions = push_all(Classifier(model, SAME_RATE), stream(values))
     assert {d.onset_ns // PERIOD_NS for d in decisions} == {QUIET + 1, 501}
@@ -282,11 +282,11 @@ def test_an_untrustworthy_element_reads_as_untouched(model: Path) -> None:
     for d in decisions:
         _, _, total, last, _ = logits_of(d.probabilities)
         assert (total, last) == (pytest.approx(0, abs=1e-6), pytest.approx(0, abs=1e-6))
-    assert (classifier.tared[0] == 0).all()
-    assert classifier.tared[1] == pytest.approx(0.1, abs=6 * SIGMA)
+    assert (classifier.deviation[0] == 0).all()
+    assert classifier.deviation[1] == pytest.approx(0.1, abs=6 * SIGMA)
 
 
-def test_an_element_without_a_tare_reads_as_untouched(model: Path) -> None:
+def test_an_element_without_a_baseline_reads_as_untouched(model: Path) -> None:
     """It came to life a moment ago: its offset is not a load."""
     values = signal([], 300)
     values[:, 0] += 0.3
@@ -298,17 +298,17 @@ def test_an_element_without_a_tare_reads_as_untouched(model: Path) -> None:
     decisions = push_all(classifier, chunks)
     assert len(decisions) == STEPS
     assert logits_of(decisions[-1].probabilities)[2] == pytest.approx(0, abs=1e-6)
-    assert (classifier.tared[0] == 0).all()
+    assert (classifier.deviation[0] == 0).all()
 
 
-def test_the_tared_sample_is_the_last_one_less_its_offset(model: Path) -> None:
+def test_the_deviation_is_the_last_sample_less_its_offset(model: Path) -> None:
     classifier = Classifier(model, SAME_RATE)
-    assert (classifier.tared == 0).all()
+    assert (classifier.deviation == 0).all()
     values = signal([(QUIET, 200, 0.1)], 200)
     push_all(classifier, stream(values[:QUIET]))
-    assert abs(classifier.tared).max() < 6 * SIGMA
+    assert abs(classifier.deviation).max() < 6 * SIGMA
     push_all(classifier, [concatenate(stream(values)[QUIET // 7 + 1 :])])
-    assert classifier.tared[0] == pytest.approx(0.1, abs=6 * SIGMA)
+    assert classifier.deviation[0] == pytest.approx(0.1, abs=6 * SIGMA)
 
 
 # Which array

@@ -206,7 +206,7 @@ def test_no_decision_is_ever_no_number(rate_hz: float) -> None:
     for d in decisions:
         assert np.isfinite(d.probabilities).all()
         assert d.probabilities.sum() == pytest.approx(1, abs=1e-5)
-    assert np.isfinite(classifier.tared).all()
+    assert np.isfinite(classifier.deviation).all()
 
 
 # inf - inf for a last sample of more than 3.4

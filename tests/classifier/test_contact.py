@@ -52,7 +52,7 @@ def test_a_minute_of_white_noise_is_no_contact(level: float) -> None:
     assert not detector.contact
 
 
-def test_the_first_seconds_after_the_tare_are_no_contact_either() -> None:
+def test_the_first_seconds_after_the_baseline_are_no_contact_either() -> None:
     """With twenty samples the noise itself is known least."""
     for seed in range(60):
         assert feed(new(), noise(100, seed)) == [], seed
@@ -86,7 +86,7 @@ def test_a_touch_is_found_without_noise_too() -> None:
     assert feed(new(), samples) == []
 
 
-def test_the_tare_removes_a_constant_offset() -> None:
+def test_the_baseline_removes_a_constant_offset() -> None:
     offset = np.random.default_rng(1).normal(size=(ELEMENTS, CHANNELS)) * RATED * 1e4
     samples = (noise(600).astype(np.float64) + offset).astype(np.float32)
     detector = new()
@@ -97,7 +97,7 @@ def test_the_tare_removes_a_constant_offset() -> None:
     assert feed(detector, samples[:2]) == [1]
 
 
-def test_the_tare_follows_drift_before_contact() -> None:
+def test_the_baseline_follows_drift_before_contact() -> None:
     n = 4000
     drift = 0.003 * RATED * np.arange(n)[:, None, None]  # 12 sigma in 36 s
     samples = (noise(n) + drift).astype(np.float32)
@@ -143,7 +143,7 @@ def test_release_needs_twenty_quiet_samples_in_a_row() -> None:
 def test_a_load_between_release_and_onset_keeps_a_contact_but_begins_none() -> None:
     samples = np.zeros((100, ELEMENTS, CHANNELS), dtype=np.float32)
     # In one channel of one element, in units of the assumed sigma; at the slowest statistic's
-    # threshold: 40 (33) times 1/19, the variance of its mean, and 1/100 of the tare.
+    # threshold: 40 (33) times 1/19, the variance of its mean, and 1/100 of the baseline.
     between = np.sqrt(36.5 * (1 / 19 + 1 / 100))
     samples[:, 2, 1] = between * FLOOR[1]
     silent = np.zeros((QUIET, ELEMENTS, CHANNELS), dtype=np.float32)
@@ -234,7 +234,7 @@ def test_what_came_just_before_a_contact_is_not_learnt_after_it() -> None:
     assert (detector.offset == 0).all()
 
 
-def test_a_young_tare_is_trusted_less() -> None:
+def test_a_young_baseline_is_trusted_less() -> None:
     """Of 20 samples the mean is off by a fifth of sigma, of 100 by a tenth; and so is sigma."""
     pulse = np.zeros((2, ELEMENTS, CHANNELS), dtype=np.float32)
     pulse[:, 3, 0] = np.sqrt(28.5) * FLOOR[0]
@@ -245,7 +245,7 @@ def test_a_young_tare_is_trusted_less() -> None:
         assert feed(detector, pulse) == onsets
 
 
-def test_nothing_is_reported_before_the_tare_is_complete() -> None:
+def test_nothing_is_reported_before_the_baseline_is_complete() -> None:
     samples = noise(25)
     samples[10:24:3] += np.float32(1e-2)
     detector = new()
@@ -288,7 +288,7 @@ def test_an_element_that_dies_during_contact_does_not_hold_it() -> None:
 
 
 @pytest.mark.parametrize("period", [2, 3, 10])
-def test_an_element_with_gaps_is_tared_on_its_valid_samples_alone(period: int) -> None:
+def test_the_baseline_of_an_element_with_gaps_is_that_of_its_valid_samples(period: int) -> None:
     """A loose connector on a whisker with an offset: zeros in its gaps are not its baseline."""
     n = 300
     samples = bounded(n)
@@ -306,7 +306,7 @@ def test_an_element_with_gaps_is_tared_on_its_valid_samples_alone(period: int) -
         assert detector.sigma[11] == pytest.approx(sigma, rel=1e-5)
 
 
-def test_an_element_that_comes_late_is_tared_before_it_can_touch() -> None:
+def test_an_element_that_comes_late_has_a_baseline_before_it_can_touch() -> None:
     n = QUIET + 200
     samples = noise(n)
     samples[:, 11] += np.float32(1e-3)
@@ -361,7 +361,7 @@ def touches(how_many: int, size: float = 100.0, seed: int = 0) -> np.ndarray:
     return (clean + noise(len(clean), seed + 1)).astype(np.float32)
 
 
-def test_a_tare_that_was_taken_in_a_touch_is_found_out_wherever_it_was_taken() -> None:
+def test_a_baseline_that_was_taken_in_a_touch_is_found_out_wherever_it_was_taken() -> None:
     samples = touches(7)
     touch = REST + TOUCH + 2 * MOVE
     for start in range(0, touch, 3):

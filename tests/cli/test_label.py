@@ -171,11 +171,11 @@ def test_a_simulated_and_a_recorded_set_train_together_each_in_its_way(here, nig
     assert np.array_equal(
         both.sweeps.values[simulated][:, 200 : 200 + SAMPLES - LEAD], own[:, LEAD:]
     )
-    # a sample sooner, as the tare of a lead of 24 samples is ready only after it
+    # a sample sooner, as the baseline of a lead of 24 samples is ready only after it
     assert (both.noisy_starts[0][simulated] == 201).all()
     assert (sets[0].noisy_starts[0] == LEAD + 2).all()
     assert np.array_equal(both.sweeps.values[both.recorded][:, :310], sets[1].sweeps.values)
-    for mixed, alone in zip(both.tares, sets[1].tares, strict=True):
+    for mixed, alone in zip(both.baselines, sets[1].baselines, strict=True):
         assert np.array_equal(mixed[both.recorded], alone)
         assert not mixed[simulated].any()
 

@@ -130,7 +130,7 @@ def metadata(path: Path) -> dict:
 
 
 def episodes(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, step, sub-step, element, channel) loads from faint to beyond belief, tare and noise."""
+    """(n, step, sub-step, element, channel) loads, faint to beyond belief, baseline and noise."""
     rng = np.random.default_rng(seed)
     size = 10 ** rng.uniform(-2, 3, size=(n, 1, 1, 30, 1))
     samples = rng.normal(size=(n, STEPS, SUBSTEPS, 30, 6)) * TYPICAL * size
@@ -265,7 +265,7 @@ def test_only_the_file_is_left_and_others_may_read_it(exported: SimpleNamespace)
 
 
 def test_the_robot_decides_as_training_saw_it(exported: SimpleNamespace) -> None:
-    """The live path (resampler, onset, tare, steps) against windows cut from the whole signal."""
+    """The live path (resampler, onset, baseline, steps) against windows cut from the signal."""
     rng = np.random.default_rng(3)
     n = 60 + STEPS * SUBSTEPS + 20
     values = rng.normal(size=(n, 30, 6)) * TYPICAL * 0.05

@@ -38,6 +38,6 @@ def expected_logits(values: np.ndarray, onset: int, step: int) -> np.ndarray:
     """
     window = values[onset : onset + step * SUBSTEPS, 0, 0].astype(np.float64)
     baseline = values[onset - 1 - 5 - 100 : onset - 1 - 5, 0, 0].astype(np.float64)
-    tared = window - baseline.mean()
+    deviation = window - baseline.mean()
     sigma = max(baseline.std(ddof=1), CARD.floor[0])
-    return np.array([0, step, tared.sum(), tared[-1], sigma])
+    return np.array([0, step, deviation.sum(), deviation[-1], sigma])

@@ -164,15 +164,15 @@ def test_draws_are_the_windows_own():
     assert torch.equal(augmented, again)
 
 
-def test_the_tare_goes_with_the_samples():
+def test_the_baseline_goes_with_the_samples():
     """What is subtracted is transformed as what it is subtracted from."""
     samples, offset, sigma = loads()
     tactile, which = Tactile(SPEC), torch.arange(8)
     reverse = torch.arange(8) % 2 == 0
     a, b, c = tactile.transform((samples, offset, sigma), which, reverse)
-    tared = samples - offset[:, None, None]
+    deviation = samples - offset[:, None, None]
     nothing = torch.zeros_like(offset)
-    expected, _, _ = tactile.transform((tared, nothing, sigma), which, reverse)
+    expected, _, _ = tactile.transform((deviation, nothing, sigma), which, reverse)
     torch.testing.assert_close(a - b[:, None, None], expected, atol=1e-5, rtol=1e-5)
     # An orthogonal matrix keeps the sum of the variances of a vector's components.
     for part in (slice(0, 3), slice(3, 6)):
@@ -183,10 +183,10 @@ def test_the_tare_goes_with_the_samples():
 def test_time_reversal_is_that_of_every_sample_and_of_the_sign():
     samples, offset, sigma = loads()
     which, yes = torch.zeros(8, dtype=torch.int64), torch.ones(8, dtype=torch.bool)
-    turned_back, tare, _ = Tactile(SPEC).transform((samples, offset, sigma), which, yes)
+    turned_back, baseline, _ = Tactile(SPEC).transform((samples, offset, sigma), which, yes)
     expected = -samples.flatten(1, 2).flip(1).view(samples.shape)
     torch.testing.assert_close(turned_back, expected)
-    torch.testing.assert_close(tare, -offset)
+    torch.testing.assert_close(baseline, -offset)
 
 
 # The others

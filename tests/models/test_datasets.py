@@ -126,7 +126,7 @@ def test_a_third_is_clean_a_third_rated_and_a_third_between() -> None:
     assert between.max() < 1 and np.mean(between < 0.47) == pytest.approx(0.5, abs=0.08)
 
 
-def test_the_tare_is_as_wrong_as_one_of_few_noisy_samples() -> None:
+def test_the_baseline_is_as_wrong_as_one_of_few_noisy_samples() -> None:
     samples, offset, sigma, _ = drawn(TrainingBatches(sweeps(touches(60)), 20, seed=0), epochs=20)
     level = noise_level(samples)
     clean, rated = level < 1e-9, abs(level - 1) < 0.06
@@ -173,7 +173,7 @@ def test_a_row_of_whiskers_dies_as_a_whole_and_as_often_as_said() -> None:
     assert not np.array_equal(dead[:, 0], dead[:, 2])
 
 
-def test_what_has_come_since_the_tare_is_constant_or_grows_and_is_not_tared_away() -> None:
+def test_what_has_come_since_the_baseline_is_constant_or_grows_and_stays_in_the_samples() -> None:
     values = touches(60)
     still, grown = (
         drawn(TrainingBatches(with_faults(values, **{name: 3.0}), 20, seed=0), epochs=8)
@@ -181,7 +181,7 @@ def test_what_has_come_since_the_tare_is_constant_or_grows_and_is_not_tared_away
     )
     for samples, offset, _, labels in (still, grown):
         clean = (offset == 0).all(axis=(1, 2))
-        assert clean.mean() == pytest.approx(1 / 3, abs=0.05), "the tare knows nothing of it"
+        assert clean.mean() == pytest.approx(1 / 3, abs=0.05), "the baseline knows nothing of it"
         true = 100.0 * RATED * (1 + labels[clean, None, None])  # of `touches`
         late = samples[clean].reshape(clean.sum(), -1, ELEMENTS, CHANNELS)[:, 60:100]
         error = (late - true[:, None]) / RATED
@@ -270,7 +270,7 @@ def test_windows_may_begin_with_the_sweep_and_have_nothing_drawn():
     np.testing.assert_array_equal(sigma, np.broadcast_to(FLOOR, sigma.shape))
 
 
-def test_windows_that_begin_with_the_sweep_are_tared_alike_in_training_and_in_validation():
+def test_windows_that_begin_with_the_sweep_have_a_baseline_alike_in_training_and_in_validation():
     """A magnetometer reads its magnet's field at rest."""
     values = touches(40) + np.float32(3e-3)
     data = drawn_as(sweeps(values), {"window": "sweep", "faults": SOUND})

@@ -174,7 +174,7 @@ def seen_by(
     return tuple(np.concatenate(part) for part in zip(*seen, strict=True))
 
 
-def test_an_offset_after_the_tare_is_in_the_windows_and_not_in_the_baseline() -> None:
+def test_an_offset_after_the_baseline_is_in_the_windows_and_not_in_it() -> None:
     values = sweeps(70)
     clean, there = seen_by(Disturbance(), values), seen_by(Disturbance(offset=0.5), values)
     added = (there[0] - clean[0]).astype(np.float64)
@@ -186,7 +186,7 @@ def test_an_offset_after_the_tare_is_in_the_windows_and_not_in_the_baseline() ->
     assert np.array_equal(there[2], clean[2])
 
 
-def test_rest_before_a_sweep_tares_it_and_is_not_its_window() -> None:
+def test_rest_before_a_sweep_is_its_baseline_and_not_its_window() -> None:
     data = replace(a_set(sweeps(30)), window="sweep")
     plain, rested = (
         next(measures.cut_windows(data, disturbance=Disturbance(rest=rest))) for rest in (0, 80)

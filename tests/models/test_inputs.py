@@ -89,7 +89,7 @@ def test_a_sample_that_is_no_number_is_no_load_and_changes_nothing_else(bad):
 
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("which", [1, 2])
-def test_a_channel_whose_tare_or_noise_is_no_number_is_silent(bad, which):
+def test_a_channel_whose_baseline_or_noise_is_no_number_is_silent(bad, which):
     stage = InputStage(POSITIONS, (5, 7), CLIP, SCALE)
     arrays = loads()
     whole = stage(*arrays)
@@ -143,7 +143,7 @@ def test_the_papers_units_without_a_logarithm():
     frame = stage(samples, offset, torch.full((1, 30, 6), 1e-3))  # whatever the noise was
     found = frame[0, 12:18, *spec.grid[7]]
     torch.testing.assert_close(found, torch.tensor([0.6, -2.5, 1000.0, 1.0, -1000.0, 0.0]))
-    assert frame.count_nonzero() == 5 + 4  # and the tare in the other sub-steps
+    assert frame.count_nonzero() == 5 + 4  # and the baseline in the other sub-steps
 
 
 def test_the_papers_units_are_of_forces_and_moments():

@@ -98,7 +98,7 @@ def test_the_report_tells_what_it_promises(folder: Path) -> None:
         "support vector machine on the same windows",
         "the noise that the sensor is rated at",
         "What it cannot tell apart",
-        "after the tare",
+        "after the baseline",
         "12 objects, 24 sweeps",
     ):
         assert said in page

@@ -67,7 +67,7 @@ def test_lost_samples_within_a_touch_are_a_gap_and_a_dead_element_is_none():
 
     touches = found(without(2))
     assert [t.flaw for t in touches] == ["", ""]
-    assert not touches[0].values[:, 2].any(), "as it has no tare, it reads nothing"
+    assert not touches[0].values[:, 2].any(), "as it has no baseline, it reads nothing"
     assert touches[0].values[:, 1].any()
 
 
@@ -91,12 +91,12 @@ def test_a_short_rest_is_there_again_and_again():
     assert min(again[:-16]) > 2
 
 
-def test_the_tare_is_that_of_the_stream_also_after_short_rests():
+def test_the_baseline_is_that_of_the_stream_also_after_short_rests():
     """It rests on quiet samples of before the last touches, too, and on none that was doubted."""
     detector = ContactDetector(ARRAY.shape, LIMITS.floor)
     chunks = chunks_of_touches(["mug", "cup"] * 3, rest_s=0.7)
     stream = Resampler(PERIOD_NS, ARRAY.rate_hz).push(concatenate(chunks))
-    tares = [
+    baselines = [
         (detector.offset, detector.sigma)
         for values, valid in zip(stream.values, stream.valid, strict=True)
         if detector.update(values, valid)
@@ -104,6 +104,6 @@ def test_the_tare_is_that_of_the_stream_also_after_short_rests():
     touches = found(chunks)
     onsets = find_onsets(np.stack([t.values for t in touches]), LIMITS.floor)
     assert onsets.start.tolist() == [REST] * 6
-    for k, (offset, sigma) in enumerate(tares):
+    for k, (offset, sigma) in enumerate(baselines):
         error = np.abs(onsets.offset[k] - offset) / sigma
         assert error.max() < (1e-6 if k > 1 else 0.2)

@@ -95,7 +95,7 @@ def test_where_a_sensor_rests_and_in_which_units_it_tells_does_not_matter(run, l
 def test_silence_and_the_largest_numbers_stay_numbers(run, loads):
     for extreme in (0 * loads, 1e9 * np.sign(loads), 1e-12 * loads):
         assert np.isfinite(run(extreme)).all()
-    assert np.isfinite(run(loads, sigma=np.inf)).all(), "an element without a tare"
+    assert np.isfinite(run(loads, sigma=np.inf)).all(), "an element without a baseline"
 
 
 def test_every_sensor_of_a_kind_is_looked_at_alike(run):

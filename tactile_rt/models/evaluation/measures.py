@@ -51,7 +51,7 @@ LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
 
 @dataclass(frozen=True)
 class CutWindows:
-    """Windows of some sweeps, and the tare that the detector had by then.
+    """Windows of some sweeps, and the baseline that the detector had by then.
 
     Attributes:
         samples: The (sweep, step, sub-step, element, channel) samples of the windows, SI.

@@ -19,7 +19,7 @@ __all__ = [
 ]
 
 
-REST = 80  # samples: 0.7 s of a mouse's, which a tare can be taken from
+REST = 80  # samples: 0.7 s of a mouse's, which a baseline can be taken from
 
 
 def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
@@ -39,8 +39,8 @@ def conditions(data: SweepSet) -> dict[str, Disturbance]:
         f"rated noise, {rated}": Disturbance(noise=1.0),
         f"rated noise, after {REST} samples of rest": Disturbance(noise=1.0, rest=REST),
         "noise at twice the rated": Disturbance(noise=2.0),
-        f"offset of {rated_amount(data, OFFSET / 4)} after the tare": Disturbance(offset=0.25),
-        f"offset of {rated_amount(data, OFFSET)} after the tare": Disturbance(offset=1.0),
+        f"offset of {rated_amount(data, OFFSET / 4)} after the baseline": Disturbance(offset=0.25),
+        f"offset of {rated_amount(data, OFFSET)} after the baseline": Disturbance(offset=1.0),
         f"drift of {rated_amount(data, OFFSET)} in a window": Disturbance(drift=1.0),
         "gain error of 20 % per whisker": Disturbance(gain=0.2),
     }

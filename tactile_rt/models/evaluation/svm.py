@@ -1,7 +1,8 @@
 """RBF support vector machines: the one place where one is fitted.
 
 Two questions want one. Does a network beat it on the very windows that it sees? `fit_svm` answers
-that: the machine takes the same onsets, tare and compression, and validation chooses its penalty.
+that: the machine takes the same onsets, baseline and compression, and validation chooses its
+penalty.
 And can a set be learnt from at all? The card of a sweep set asks that with features and a penalty
 of its own (`tactile_rt.sim_backend.datasets.card_survey`), and is handed `fit` by the command:
 simulation and networks do not know of each other.
@@ -97,7 +98,8 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
             x[usable],
             train.sweeps.labels[usable],
             c,
-            f"same onsets, tare, clipping and signed log; {train.timing.steps} steps of mean load; "
+            "same onsets, baseline, clipping and signed log; "
+            f"{train.timing.steps} steps of mean load; "
             f"C = {c:g} of {', '.join(f'{p:g}' for p in PENALTIES)} by validation",
         )
         for c in PENALTIES

@@ -70,9 +70,9 @@ class TrainingBatches:
 
     A third of the windows are clean, a third carry the rated sensor noise, and a third any level;
     what else is wrong with the sensor is drawn as the set's recipe says, or else as `SensorFaults`
-    does. A recorded sweep has the noise that it was recorded with and no other, and its own tare,
-    as when a classifier meets it. Labels beyond the categories are those of the set's `refusals`,
-    in their order.
+    does. A recorded sweep has the noise that it was recorded with and no other, and its own
+    baseline, as when a classifier meets it. Labels beyond the categories are those of the set's
+    `refusals`, in their order.
 
     Args:
         jitter: samples by which a window may begin earlier or later.
@@ -144,8 +144,8 @@ class TrainingBatches:
         rest = np.zeros((n, elements, channels), dtype=np.float32)
         if data.manifest.lead:
             rest = values[:, : data.manifest.lead].mean(axis=1)
-        tare = data.tares[0][at], data.tares[1][at]
-        rest = np.where(recorded[:, None, None], tare[0], rest)
+        baseline = data.baselines[0][at], data.baselines[1][at]
+        rest = np.where(recorded[:, None, None], baseline[0], rest)
         shape = (n, 1, 1, elements, 1)
         gain = 1 + np.float32(faults.gain) * rng.standard_normal(shape, dtype=np.float32)
         alive = rng.random(shape) >= faults.dead
@@ -161,13 +161,13 @@ class TrainingBatches:
             self._wander(samples, rng, severity)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
         samples.addcmul_(self._normal(samples.shape, rng), self._there(noise)[:, None, None])
-        # The tare: a mean and a spread over the quiet samples that happened to come before.
+        # The baseline: a mean and a spread over the quiet samples that happened to come before.
         quiet = rng.integers(20, 60, (n, 1, 1))
         per_channel = (n, elements, channels)
         offset = noise * rng.normal(size=per_channel) / np.sqrt(quiet)
         spread = 1 + rng.normal(size=per_channel) / np.sqrt(2 * (quiet - 1))
         sigma = np.maximum(noise * np.abs(spread), data.floor)
-        sigma = np.where(recorded[:, None, None], tare[1], sigma)
+        sigma = np.where(recorded[:, None, None], baseline[1], sigma)
         return samples, self._there(offset), self._there(sigma), torch.from_numpy(labels)
 
     def _there(self, array: NDArray[Any]) -> Tensor:
@@ -206,7 +206,7 @@ class TrainingBatches:
         return labels
 
     def _wander(self, samples: Tensor, rng: np.random.Generator, severity: float) -> None:
-        """Add, in place, what has come to the readings since their tare."""
+        """Add, in place, what has come to the readings since their baseline."""
         data, timing, n = self._data, self._data.timing, len(samples)
         course = np.arange(1, timing.samples + 1) / timing.samples
         for most, over in (

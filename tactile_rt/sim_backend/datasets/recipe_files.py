@@ -132,8 +132,8 @@ def _node(nodes: SettingNode, value: Any) -> SettingNode:
 
 
 def _usual_lengths(period_ms: float) -> tuple[float, float]:
-    """Lead and length of a sweep whose samples are so far apart, ms, enough for tare and window."""
-    # A tare takes so many samples, however long they last; a window so many steps, and some spare.
+    """Lead and length of a sweep of that sample time, ms, enough for baseline and window."""
+    # A baseline takes so many samples, however long they last; a window so many steps, and spare.
     lead_ms = max(SweepRecipe.lead_ms, SweepRecipe.lead_ms / SweepRecipe.period_ms * period_ms)
     after_ms = SweepRecipe.length_ms - SweepRecipe.lead_ms
     step_ms = Timing.of(round(period_ms * 1e6)).substeps * period_ms

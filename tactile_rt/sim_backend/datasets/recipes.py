@@ -305,7 +305,7 @@ class SweepRecipe:
         profile: The name of the simulation profile, one of `world.PROFILES`.
         seed: The seed of the drawn parameters, 0 or more.
         period_ms: The period of the stored samples, ms.
-        lead_ms: The time at rest before the simulation starts, ms: enough for a tare.
+        lead_ms: The time at rest before the simulation starts, ms: enough for a baseline.
         length_ms: The length of one sweep with its lead, ms.
         contacts: Whether to store where along each whisker it touches, beside the loads.
         every_nth: Whether to store every n-th of the simulator's samples as it is, with what that
