@@ -33,7 +33,7 @@ SCALE, FLOOR = np.array(CARD.scale, np.float32), np.array(CARD.floor, np.float32
 
 
 class Weather:
-    """Blocks of a stream, each of other troubles, and chunks of them."""
+    """Blocks of a stream, each of other faults, and chunks of them."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)

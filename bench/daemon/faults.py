@@ -4,8 +4,8 @@ tactile-rt bench faults [--resume faults.json]
 python -m bench.daemon.faults [--times 40] [--only NAME ...] [--resume faults.json]
 
 Each fault is caused by real means in a daemon under way with two arrays. Another thread asks
-`/health` and `/metrics` all the while. Of each repetition it is measured when the right trouble was
-told, what else was, and when nothing was told any more.
+`/health` and `/metrics` all the while. Of each repetition it is measured when the right diagnostic
+was told, what else was, and when nothing was told any more.
 """
 
 import argparse
@@ -39,7 +39,7 @@ PATIENCE_S = 12.0
 BUSY_S, WAITED_S, TURN_NS = 0.25, 0.15, 150_000
 RETRIES = 3
 DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
-TROUBLE = re.compile(rb"^tactile_trouble\{.*\} 1$", re.M)
+DIAGNOSTIC = re.compile(rb"^tactile_diagnostic\{.*\} 1$", re.M)
 BATCH = 8  # of each fault, in one daemon
 
 
@@ -65,7 +65,7 @@ class Repetition:
 @dataclass(frozen=True)
 class _Look:
     at: float
-    troubles: dict[Named, str]
+    diagnostics: dict[Named, str]
     lines: tuple[str, ...]
 
 
@@ -111,14 +111,14 @@ class _Watcher:
             except (OSError, http.client.HTTPException, ValueError):
                 time.sleep(ASK_S)
                 continue
-            named = {(t["part"], t["what"]): t["why"] for t in health["troubles"]}
+            named = {(t["part"], t["what"]): t["why"] for t in health["diagnostics"]}
             at = time.monotonic()
             self.looks.append(_Look(at, named, tuple(health["degraded"])))
             found = DEGRADED.search(metrics)
             if found is not None:
                 # Before, after, and what changes between is between.
-                both = len(named), len(json.loads(self._ask("/health"))["troubles"])
-                listed = len(TROUBLE.findall(metrics))
+                both = len(named), len(json.loads(self._ask("/health"))["diagnostics"])
+                listed = len(DIAGNOSTIC.findall(metrics))
                 # A daemon that is kept short answers seconds later.
                 slow = time.monotonic() - began > BUSY_S
                 right = slow or min(both) <= int(found[1]) <= max(both)
@@ -150,21 +150,21 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     waited = _waited(scene.daemon.process.pid)
     with contextmanager(kind.cause)(scene) as effect:  # type: ignore[arg-type]
         if named:
-            seen = watcher.wait(lambda look: named <= look.troubles.keys(), began, PATIENCE_S)
+            seen = watcher.wait(lambda look: named <= look.diagnostics.keys(), began, PATIENCE_S)
         else:
             seen = effect
         if kind.lasts:
             time.sleep(HOLD_S)
     moment = max(effect, seen) if np.isfinite(seen) else effect
     ended = time.monotonic() if kind.lasts else moment
-    gone = watcher.wait(lambda look: not look.troubles, max(ended, effect), PATIENCE_S)
+    gone = watcher.wait(lambda look: not look.diagnostics, max(ended, effect), PATIENCE_S)
     time.sleep(0.3)
     looks = watcher.since(began)
     wrong = sorted(
         {
             f"{part}: {what}: {why}"
             for look in looks
-            for (part, what), why in look.troubles.items()
+            for (part, what), why in look.diagnostics.items()
             if (part, what) not in allowed
         }
     )

@@ -228,7 +228,7 @@ def _draw_consumers(now: "Snapshot") -> Table:
             c.part.name.removeprefix("publisher."), _draw_state(c.part), f"{c.part.starts}",
             f"{sum(c.queue.waiting.values())}", f"{sum(c.queue.taken.values())}",
             _draw_loss(sum(c.queue.dropped.values())), *_format_latency(c.latency),
-            _draw_line(tells, c.part.reason or c.trouble),
+            _draw_line(tells, c.part.reason or c.diagnostic),
         )  # fmt: skip
     return table
 
@@ -252,7 +252,7 @@ def _short_name(part: "PartState") -> str:
     return part.name.partition(".")[2]
 
 
-def _draw_line(text: str, trouble: str = "") -> Text:
-    """Draw a text, or in red the trouble that takes its place."""
-    style = "red" if trouble else ""
-    return Text(trouble or text, style=style, no_wrap=True, overflow="ellipsis")
+def _draw_line(text: str, diagnostic: str = "") -> Text:
+    """Draw a text, or in red the diagnostic that takes its place."""
+    style = "red" if diagnostic else ""
+    return Text(diagnostic or text, style=style, no_wrap=True, overflow="ellipsis")

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from tactile_rt.daemon.troubles import LossWindow
+from tactile_rt.daemon.diagnostics import LossWindow
 
 __all__ = ["Clock", "Turns"]
 

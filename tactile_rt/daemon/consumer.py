@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
+from tactile_rt.daemon.diagnostics import LossWindow
 from tactile_rt.daemon.health import ConsumerState, LatencyMeter, OnDisk, Snapshot
 from tactile_rt.daemon.items import (
     Closed,
@@ -20,7 +21,6 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.daemon.troubles import LossWindow
 
 __all__ = ["Consumer", "ConsumerPart", "View"]
 
@@ -96,9 +96,11 @@ class Consumer(abc.ABC):
         """What to tell in the snapshot; called from any thread, must be quick."""
         return {}
 
-    def trouble(self) -> str:
-        """What keeps it from its work now, in words that hold no number that counts on; empty:
-        nothing. Called from any thread, must be quick."""
+    def diagnose(self) -> str:
+        """Say what keeps it from its work now; empty: nothing.
+
+        In words that hold no number that counts on. Called from any thread, must be quick.
+        """
         return ""
 
     def on_disk(self) -> Mapping[str, OnDisk]:
@@ -132,16 +134,16 @@ class ConsumerPart(Part):
     def consumer_state(self) -> ConsumerState:
         """For the snapshot."""
         try:
-            details, trouble = self.consumer.details(), self.consumer.trouble()
+            details, diagnostic = self.consumer.details(), self.consumer.diagnose()
             on_disk = self.consumer.on_disk()
         except Exception as error:  # telling of itself must not break the snapshot of all others
-            trouble, on_disk = f"cannot tell how it is: {type(error).__name__}: {error}", {}
+            diagnostic, on_disk = f"cannot tell how it is: {type(error).__name__}: {error}", {}
             details = {}
         queue = self.box.state
         return ConsumerState(
             self.state, self.kind, queue, self._latency.state, details, 1e3 * self._age_s,
             max(queue.oldest_s, self.silent_s), self._losses.add(sum(queue.dropped.values())),
-            trouble, dict(on_disk),
+            diagnostic, dict(on_disk),
         )  # fmt: skip
 
     def stop(self) -> None:

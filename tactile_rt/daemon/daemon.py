@@ -14,6 +14,7 @@ from tactile_rt.daemon.admission import file_stamp, model_path
 from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
+from tactile_rt.daemon.diagnostics import diagnose
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
@@ -22,7 +23,6 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
-from tactile_rt.daemon.troubles import troubles
 
 __all__ = ["Daemon"]
 
@@ -168,7 +168,7 @@ class Daemon:
         consumers = tuple(p.consumer_state for _, p in self._consumers.copy().values())
         now = self._clock.monotonic_ns()
         starved_s = 0.0 if self._stopping else self._turns.starved_s(self._watcher.native_id)
-        found = troubles(
+        found = diagnose(
             sources, models, consumers, self._loaded.config.limits, now, starved_s,
             bool(self._stepped_ns) and now - self._stepped_ns < LATELY_NS, self._refused,
         )  # fmt: skip
@@ -177,7 +177,7 @@ class Daemon:
         return Snapshot(
             VERSION, os.getpid(), str(self._loaded.path), now,
             self._clock.utc_ns(), self._started_ns, self._reloads, state,
-            tuple(trouble.line for trouble in found), self._clock_steps, sources, models, consumers,
+            tuple(one.line for one in found), self._clock_steps, sources, models, consumers,
             found,
         )  # fmt: skip
 

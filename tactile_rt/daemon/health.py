@@ -2,7 +2,7 @@
 
 A `Snapshot` is frozen, and `msgspec.json.encode` takes it as it is: the page, the metrics and the
 ``state`` message all tell it. Its counts only ever grow while the daemon runs, also over restarts
-of a part. What does not work follows from it, see `tactile_rt.daemon.troubles`; `LatencyMeter`
+of a part. What does not work follows from it, see `tactile_rt.daemon.diagnostics`; `LatencyMeter`
 measures what takes time.
 """
 
@@ -17,6 +17,7 @@ from tactile_rt.drivers.health import Health
 
 __all__ = [
     "ConsumerState",
+    "Diagnostic",
     "Latency",
     "LatencyMeter",
     "Losses",
@@ -26,7 +27,6 @@ __all__ = [
     "QueueState",
     "Snapshot",
     "SourceState",
-    "Trouble",
 ]
 
 EDGES_S = (
@@ -165,13 +165,13 @@ class ConsumerState:
     decision_age_ms: float = 0.0  # of the newest decision's newest sample when it was published
     behind_s: float = 0.0  # how long the oldest item waits to be handled
     losses: Losses = field(default_factory=Losses)  # items dropped from its mailbox, or by itself
-    trouble: str = ""  # what keeps it from its work now, in words
+    diagnostic: str = ""  # what keeps it from its work now, in words
     on_disk: dict[str, OnDisk] = field(default_factory=dict)  # of the recorder alone, by source
 
 
 @dataclass(frozen=True)
-class Trouble:
-    """A thing that does not work.
+class Diagnostic:
+    """One diagnostic: a thing that does not work.
 
     Attributes:
         part: The name of the part that does not do its work: ``source.NAME``, ``model.NAME``,
@@ -205,12 +205,12 @@ class Snapshot:
     started_ns: int
     reloads: int
     state: str  # starting, running, degraded or stopping
-    degraded: tuple[str, ...] = ()  # the lines of `troubles`
+    degraded: tuple[str, ...] = ()  # the lines of `diagnostics`
     clock_steps: int = 0  # times that the wall clock jumped
     sources: tuple[SourceState, ...] = ()
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
-    troubles: tuple[Trouble, ...] = ()
+    diagnostics: tuple[Diagnostic, ...] = ()
 
 
 class LatencyMeter:

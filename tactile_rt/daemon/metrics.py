@@ -68,7 +68,7 @@ class Metrics(Consumer):
         if self._server is not None:
             self._server.close()
 
-    def trouble(self) -> str:
+    def diagnose(self) -> str:
         server = self._server
         return TAKEN if server is not None and server.full else ""
 
@@ -96,7 +96,7 @@ class Metrics(Consumer):
             body = {
                 "state": snapshot.state,
                 "degraded": snapshot.degraded,
-                "troubles": snapshot.troubles,
+                "diagnostics": snapshot.diagnostics,
                 "version": snapshot.version,
                 "uptime_s": (snapshot.t_ns - snapshot.started_ns) / 1e9,
             }
@@ -142,7 +142,7 @@ def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labe
     """Yield each table of metrics, with the things that it is about and their labels."""
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]
-    yield TROUBLE, [({"part": t.part, "what": t.what}, t) for t in s.troubles]
+    yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
     yield SOURCE, [({"source": _short(x)}, x) for x in s.sources]
     yield MODEL, [({"model": _short(x), "source": x.source}, x) for x in s.models]
@@ -196,8 +196,8 @@ DAEMON: tuple[Row, ...] = (
     ("cpu_seconds_total", "", "Processor time of the daemon.", lambda s, _: _read_cpu_s()),
     ("resident_memory_bytes", "", "Memory of the daemon.", lambda s, _: _read_resident_bytes()),
 )  # fmt: skip
-TROUBLE: tuple[Row, ...] = (
-    ("trouble", "", "1 for each thing that does not work.", lambda t, _: 1),
+DIAGNOSTIC: tuple[Row, ...] = (
+    ("diagnostic", "", "1 for each thing that does not work.", lambda t, _: 1),
 )
 PART: tuple[Row, ...] = (
     ("part_state", "state", "1 for the state a part is in.",

@@ -74,7 +74,7 @@ class _Track:
         self.until_ns = 0  # of a trigger; 0: none
         self.closed_ns = 0  # when its source ended; 0: it has not
         self.lost = (0, 0)  # samples and packets since the last file was begun
-        self.trouble = ""  # why there is no file, or was none before this one
+        self.diagnostic = ""  # why there is no file, or was none before this one
 
     def keep(self, message: Raw, before_ns: int) -> list[Raw]:
         """Into the ring, from which the oldest goes: these."""
@@ -185,7 +185,7 @@ class Recorder(Consumer):
             "newest": self._newest,
         }
 
-    def trouble(self) -> str:
+    def diagnose(self) -> str:
         folder = self._folder
         if folder.full:
             return f"less than min_free_mb = {self._config.min_free_mb:g} MB free: {folder.path}"
@@ -193,8 +193,8 @@ class Recorder(Consumer):
             return folder.why
         for name, track in list(self._tracks.items()):
             disk = self._on_disk(name, track.ledger)
-            if track.trouble and disk.meant_ns:
-                return track.trouble
+            if track.diagnostic and disk.meant_ns:
+                return track.diagnostic
         return ""
 
     def _take(self, item: Item) -> None:
@@ -270,7 +270,7 @@ class Recorder(Consumer):
         self._count_lost(
             track, sum(samples_in(m.data) for m in messages if m.topic == SAMPLES),
             sum(m.topic == WIRE for m in messages),
-            self._folder.why or track.trouble,
+            self._folder.why or track.diagnostic,
         )  # fmt: skip
 
     def _count_lost(self, track: _Track, samples: int, packets: int, why: str) -> None:
@@ -352,7 +352,7 @@ class Recorder(Consumer):
         self._newest = track.file.path.name
         # At once: so a power cut hardly ever leaves a name without what the file is of.
         if self._config.sync_s == 0 or self._sync(track):
-            track.trouble = ""
+            track.diagnostic = ""
 
     def _finish_file(self, track: _Track, finish: bool = True, told: bool = False) -> None:
         file, track.file = track.file, None
@@ -446,9 +446,9 @@ class Recorder(Consumer):
         """The file cannot be written: it is left as it is, and tried anew at the next look."""
         file = track.file
         why = words(file.path if file is not None else self._folder.path, error)
-        if file is not None or why != track.trouble:
+        if file is not None or why != track.diagnostic:
             self._warn(f"{why}: not recording" if file is None else f"{why}; {KEEPS}")
-        track.trouble = why
+        track.diagnostic = why
         if file is not None:
             kept = file.flushed if file.failed is None else file.synced
             self._count_lost(track, *file.disown(kept), why)

@@ -21,12 +21,12 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Sour
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
+from tactile_rt.daemon.diagnostics import LossWindow, oldest_s
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
 from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.daemon.troubles import LossWindow, oldest_s
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.reader import Reader

@@ -96,7 +96,7 @@ def test_a_hostile_model_is_refused_and_the_one_before_goes_on(daemon, tmp_path,
     put(tmp_path, hostile(tmp_path, burden))
     daemon.reload()
     found = daemon.await_state(
-        lambda s: "old model" in [t["what"] for t in s["troubles"]], every_s=0.02
+        lambda s: "old model" in [t["what"] for t in s["diagnostics"]], every_s=0.02
     )
     assert found["state"] == "degraded"  # on a busy machine for another reason, too
     daemon.await_state(
@@ -121,8 +121,8 @@ def test_a_signal_is_obeyed_while_a_model_is_on_trial(tmp_path):
         state = process.await_state(lambda s: any(x["samples"] > 100 for x in s["sources"]))
         assert state["models"][0]["part"]["state"] == "starting"
         # samples come, and what is missing is told
-        degraded = process.await_state(lambda s: s["troubles"])
-        assert degraded["troubles"][0]["what"] == "no decisions"
+        degraded = process.await_state(lambda s: s["diagnostics"])
+        assert degraded["diagnostics"][0]["what"] == "no decisions"
         code, took = process.stop()
         assert code == 0 and took < TERM_S
 

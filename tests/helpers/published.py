@@ -8,6 +8,7 @@ from tactile_rt.classifier.classifier import Classification
 from tactile_rt.core.stream import ArraySpec, Chunk, SourceStats
 from tactile_rt.daemon.health import (
     ConsumerState,
+    Diagnostic,
     Latency,
     ModelState,
     OnDisk,
@@ -15,7 +16,6 @@ from tactile_rt.daemon.health import (
     QueueState,
     Snapshot,
     SourceState,
-    Trouble,
 )
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
 from tactile_rt.drivers.health import Health, State
@@ -126,7 +126,7 @@ def busy_snapshot(seconds=0, state="degraded"):
                 on_disk={"whiskers": OnDisk(at - 400_000_000, at - 900_000_000, 4000, meant_ns=at)},
             ),
         ),
-        troubles=(Trouble("source.finger", "no samples", "the device is lost"),),
+        diagnostics=(Diagnostic("source.finger", "no samples", "the device is lost"),),
     )  # fmt: skip
 
 

@@ -86,7 +86,7 @@ class Sensor:
         if self._error is not None:
             raise DeviceNotConnectedError(f"{self.name}: {self._error}")
 
-    def trouble(self) -> str:
+    def diagnose(self) -> str:
         """Say why the sensor cannot be relied on now; empty if it can."""
         if self._error is not None:
             return f"{self.name}: {self._error}"
@@ -173,7 +173,7 @@ class Tactile(Robot):
         if config.robot is not None:
             self.robot = make_robot_from_config(config.robot)
         self.sensors: list[Sensor] = []
-        self._troubled: set[str] = set()  # sensors of which that has been logged
+        self._diagnosed: set[str] = set()  # sensors of which that has been logged
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -204,7 +204,7 @@ class Tactile(Robot):
 
         With ``on_stale=nan`` a sensor that measures nothing counts as connected.
         """
-        if not self.sensors or (self.config.on_stale == "error" and self._troubles()):
+        if not self.sensors or (self.config.on_stale == "error" and self._diagnose()):
             return False
         return self.robot is None or self.robot.is_connected
 
@@ -248,17 +248,17 @@ class Tactile(Robot):
         """
         if not self.sensors:
             raise DeviceNotConnectedError(f"{self} is not connected")
-        troubles = self._troubles()
-        if troubles and self.config.on_stale == "error":
-            said = DeviceNotConnectedError("; ".join(troubles.values()))
+        diagnostics = self._diagnose()
+        if diagnostics and self.config.on_stale == "error":
+            said = DeviceNotConnectedError("; ".join(diagnostics.values()))
             try:
                 self.disconnect()  # as LeRobot does after an error, but only of what is connected
             except Exception as error:
                 raise said from error
             raise said
-        for name in troubles.keys() ^ self._troubled:
-            logging.warning(troubles.get(name, f"{name} measures again"))
-        self._troubled = set(troubles)
+        for name in diagnostics.keys() ^ self._diagnosed:
+            logging.warning(diagnostics.get(name, f"{name} measures again"))
+        self._diagnosed = set(diagnostics)
         found = self.robot.get_observation() if self.robot else {}
         for sensor in self.sensors:
             found.update(zip(sensor.names, sensor.read(), strict=True))
@@ -281,9 +281,9 @@ class Tactile(Robot):
         if getattr(self, "sensors", None):
             self.disconnect()
 
-    def _troubles(self) -> dict[str, str]:
+    def _diagnose(self) -> dict[str, str]:
         """Say why, of each sensor that cannot be relied on."""
-        return {s.name: trouble for s in self.sensors if (trouble := s.trouble())}
+        return {s.name: diagnostic for s in self.sensors if (diagnostic := s.diagnose())}
 
     def _open(self, record: str) -> list[Sensor]:
         if record:

@@ -95,7 +95,7 @@ class Page(Consumer):
         if self._server is not None:
             self._server.close()
 
-    def trouble(self) -> str:
+    def diagnose(self) -> str:
         server = self._server
         return TAKEN if server is not None and server.full else ""
 

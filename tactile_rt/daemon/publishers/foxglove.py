@@ -146,7 +146,7 @@ class FoxglovePublisher(Consumer):
         elif server is not None:
             server.stop()
 
-    def trouble(self) -> str:
+    def diagnose(self) -> str:
         limit = self._limit
         return TAKEN if limit is not None and limit.full else ""
 

@@ -261,7 +261,7 @@ class Sender(Consumer):
             self._bytes += self._send(message)
             self._messages += 1
 
-    def trouble(self) -> str:
+    def diagnose(self) -> str:
         limit = self._limit
         return TAKEN if limit is not None and limit.full else ""
 

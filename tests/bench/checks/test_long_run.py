@@ -1,4 +1,4 @@
-"""The short form of `bench/checks/long_run.py`: the shipped model through every kind of trouble.
+"""The short form of `bench/checks/long_run.py`: the shipped model through every kind of fault.
 
 Each run has a process of its own: in one whose heap is full of holes left by other tests, nothing
 that is kept shows in resident memory.
@@ -63,14 +63,14 @@ def run(steps: int, warm_up: int, fault: str = "") -> tuple[int, str]:
     return done.returncode, done.stdout
 
 
-def test_after_troubles_of_every_kind_decisions_are_as_in_a_fresh_classifier() -> None:
+def test_after_faults_of_every_kind_decisions_are_as_in_a_fresh_classifier() -> None:
     status, said = run(steps=1500, warm_up=1000)
     assert status == 0, said
     assert " 0 bad steps" in said
     assert "as in a fresh classifier, posteriors within 0.0e+00" in said
 
 
-def test_the_troubles_are_there() -> None:
+def test_the_faults_are_there() -> None:
     """Or the test above would say nothing."""
     spec = importlib.util.spec_from_file_location("long_run", SCRIPT)
     assert spec is not None

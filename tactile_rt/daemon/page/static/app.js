@@ -317,7 +317,7 @@ function figures(s, now) {
       `missing ${missing}, corrupt ${corrupt}, dropped ${dropped}, duplicates ${duplicates}`]);
     tiles.push(["Newest sample", here.newest_ns
       ? `${((s.t_ns - here.newest_ns) / 1e6).toFixed(0)} ms ago` : "none yet",
-    s.troubles.some((t) => t.part === here.part.name && t.what !== "lost samples"), "since it was taken"]);
+    s.diagnostics.some((t) => t.part === here.part.name && t.what !== "lost samples"), "since it was taken"]);
   }
   if (now) {
     const { p50_ms, p99_ms, count } = now.latency;
@@ -358,12 +358,12 @@ function parts(s) {
     lines.push([c.part, [...gone, ...about].join(", ")]);
   }
   $("parts").replaceChildren(...lines.map(([part, about, worry]) => {
-    const trouble = s.troubles.find((t) => t.part === part.name);
-    const row = make("tr"), state = make("td", trouble && part.state === "running" ? trouble.what : part.state);
-    const good = part.state === "running" && !worry && !trouble;
+    const diagnostic = s.diagnostics.find((t) => t.part === part.name);
+    const row = make("tr"), state = make("td", diagnostic && part.state === "running" ? diagnostic.what : part.state);
+    const good = part.state === "running" && !worry && !diagnostic;
     state.className = "dot " + (good ? "good" : ["waiting", "stalled", "failed"].includes(part.state) ? "bad" : "warn");
     const again = part.failures ? `broke ${part.failures} ×` : "";
-    const why = part.state === "running" ? trouble && trouble.why : part.reason;
+    const why = part.state === "running" ? diagnostic && diagnostic.why : part.reason;
     row.append(make("td", part.name.replace(".", " ")), state,
       make("td", [why, again, about].filter(Boolean).join("; ")));
     return row;
@@ -374,7 +374,7 @@ function recording(recorder) {
   $("recording").hidden = $("recorder-chip").hidden = !recorder;
   if (!recorder) return;
   const d = recorder.details;
-  const on = recorder.part.state === "running" && d.recording > 0 && !recorder.trouble;
+  const on = recorder.part.state === "running" && d.recording > 0 && !recorder.diagnostic;
   $("recorder-chip").textContent = on ? "recording" : d.state === "on" ? "recorder waits" : `recorder ${d.state || recorder.part.state}`;
   $("recorder-chip").className = "chip " + (on ? "bad" : ["disk full", "no folder"].includes(d.state) ? "warn" : "");
   $("recording-state").textContent = `${on ? "Recording" : "Not recording"} (mode ${d.mode}), ${d.megabytes} MB in ${d.files} ${d.files === 1 ? "file" : "files"}, ${d.lost_samples} samples lost. ${d.newest ? "Newest: " + d.newest : ""}`;

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from tactile_rt.core.stream import Chunk
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
-from tactile_rt.daemon import troubles as module
+from tactile_rt.daemon import diagnostics as module
 from tactile_rt.daemon.config import LimitsConfig
+from tactile_rt.daemon.diagnostics import LossWindow, diagnose
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
 from tactile_rt.daemon.health import (
     ConsumerState,
@@ -21,7 +22,6 @@ from tactile_rt.daemon.health import (
     PartState,
     SourceState,
 )
-from tactile_rt.daemon.troubles import LossWindow, troubles
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.testing import cut, small_spec
 
@@ -45,7 +45,7 @@ ZMQ = ConsumerState(part("publisher.zmq"), "zmq")
 
 
 def told(sources=(SOURCE,), models=(MODEL,), consumers=(RECORDER, ZMQ), **more):
-    return [t.line for t in troubles(sources, models, consumers, LIMITS, NOW, **more)]
+    return [t.line for t in diagnose(sources, models, consumers, LIMITS, NOW, **more)]
 
 
 def test_who_does_what_it_should_is_not_named():
@@ -128,7 +128,7 @@ def test_a_model_is_named_by_what_it_did_not_decide(changes, words):
     [
         ({"behind_s": 0.76}, "not published: publisher.zmq: it is more than 0.75 s behind"),
         ({"losses": Losses(1, 1)}, "not published: publisher.zmq: it was too slow"),
-        ({"trouble": "all 64 are taken"}, "not published: publisher.zmq: all 64 are taken"),
+        ({"diagnostic": "all 64 are taken"}, "not published: publisher.zmq: all 64 are taken"),
         ({"part": part("publisher.zmq", "stalled")}, "not published: publisher.zmq stalls"),
         ({"part": part("publisher.zmq", "starting", "no port", 3)},
          "not published: publisher.zmq fails: no port"),

@@ -1,14 +1,15 @@
-"""What the daemon does not do as it should, said from facts at the end of each promise.
+"""Diagnostics: what the daemon does not do as it should, said from facts at the end of each
+promise.
 
 That a thread runs says nothing of whether its work is done. So what counts is how old the newest
 sample is, whether it is on the disk, how long what is to be published has waited, and what was lost
-within the newest second; each against a limit of the configuration. `troubles` names them.
+within the newest second; each against a limit of the configuration. `diagnose` names them.
 
 What is the consequence of something else is not told besides it: with no samples there are no
 decisions, and while the whole process had no turn none of its parts is to blame.
 
-A trouble is one line that stays the same as long as what it says is true: it holds no number that
-counts on. The numbers are in the snapshot.
+A diagnostic is one line that stays the same as long as what it says is true: it holds no number
+that counts on. The numbers are in the snapshot.
 """
 
 import math
@@ -22,15 +23,15 @@ from msgspec import structs
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import (
     ConsumerState,
+    Diagnostic,
     Losses,
     ModelState,
     PartState,
     SourceState,
-    Trouble,
 )
 from tactile_rt.drivers.health import State
 
-__all__ = ["LossWindow", "oldest_s", "troubles"]
+__all__ = ["LossWindow", "diagnose", "oldest_s"]
 
 NS = 1e9
 MINUTE_S, SECOND_S, LOOK_S = 60.0, 1.0, 0.05
@@ -65,7 +66,7 @@ def oldest_s(limits: LimitsConfig, rate_hz: float) -> float:
     return max(limits.sample_age_s, PERIODS / rate_hz)
 
 
-def troubles(
+def diagnose(
     sources: Sequence[SourceState],
     models: Sequence[ModelState],
     consumers: Sequence[ConsumerState],
@@ -74,7 +75,7 @@ def troubles(
     starved_s: float = 0.0,
     clock_stepped: bool = False,
     refused: str = "",
-) -> tuple[Trouble, ...]:
+) -> tuple[Diagnostic, ...]:
     """Name all that do not do what they promise, in the order of the stream.
 
     Args:
@@ -86,14 +87,14 @@ def troubles(
     found = []
     if starved_s:
         why = "it had no turn: it was stopped, or another program took the processor"
-        found.append(Trouble("daemon", "late", why))
+        found.append(Diagnostic("daemon", "late", why))
         # none of its parts is to blame for what came late meanwhile; but what is lost is lost
         limits = structs.replace(limits, sample_age_s=math.inf, behind_s=math.inf)
     if clock_stepped:
-        found.append(Trouble("daemon", "UTC has jumped", "the wall clock was set"))
+        found.append(Diagnostic("daemon", "UTC has jumped", "the wall clock was set"))
     if refused:
         why = f"the new one is refused: {refused}"
-        found.append(Trouble("daemon", "old configuration", why, "the one before is in force"))
+        found.append(Diagnostic("daemon", "old configuration", why, "the one before is in force"))
     for source in sources:
         found += _of_source(source, limits, now_ns, bool(starved_s))
     recording = any(c.kind == "recorder" and c.part.state == "running" for c in consumers)
@@ -107,57 +108,58 @@ def troubles(
 
 def _of_source(
     source: SourceState, limits: LimitsConfig, now_ns: int, starved: bool
-) -> list[Trouble]:
+) -> list[Diagnostic]:
     part, device = source.part, source.device
     name = part.name
     if _broken(part, starved):
-        return [Trouble(name, "no samples", _why(part))]
+        return [Diagnostic(name, "no samples", _why(part))]
     if part.state != "running":
         return []
     away = (State.LOST,) if starved else (State.STALE, State.LOST)
     if device is not None and device.state in away:
-        return [Trouble(name, "no samples", f"the device is {device.state}")]
+        return [Diagnostic(name, "no samples", f"the device is {device.state}")]
     found = []
     if source.live and source.newest_ns:
         most = oldest_s(limits, source.rate_hz)
         read_s, taken_s = (now_ns - source.read_ns) / NS, (now_ns - source.newest_ns) / NS
         if read_s > most:
-            found.append(Trouble(name, "no samples", f"none has come for {most:g} s"))
+            found.append(Diagnostic(name, "no samples", f"none has come for {most:g} s"))
         elif taken_s > most:
             why = f"when they come they are older than {most:g} s"
-            found.append(Trouble(name, "late samples", why))
+            found.append(Diagnostic(name, "late samples", why))
     if source.frozen_s:
         why = "the values do not change at all, as no sensor's do: the device hangs"
-        found.append(Trouble(name, "frozen samples", why))
+        found.append(Diagnostic(name, "frozen samples", why))
     if source.losses.second:
-        found.append(Trouble(name, "lost samples", "some did not come, or came damaged"))
+        found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))
     if source.bad.second:
         why = "some values are no numbers, or absurd, or none is valid"
-        found.append(Trouble(name, "bad samples", why))
+        found.append(Diagnostic(name, "bad samples", why))
     return found
 
 
 def _of_model(
     model: ModelState, limits: LimitsConfig, now_ns: int, still: str, starved: bool
-) -> list[Trouble]:
+) -> list[Diagnostic]:
     part = model.part
     if _broken(part, starved):
-        return [Trouble(part.name, "no decisions", _why(part), still)]
+        return [Diagnostic(part.name, "no decisions", _why(part), still)]
     if part.state == "starting" and now_ns - part.since_ns > limits.behind_s * NS:
-        return [Trouble(part.name, "no decisions", "it is still being tried and loaded", still)]
+        return [Diagnostic(part.name, "no decisions", "it is still being tried and loaded", still)]
     if part.state != "running":
         return []
     if model.behind_s > limits.behind_s:
         why = f"it is more than {limits.behind_s:g} s behind"
-        return [Trouble(part.name, "late decisions", why, still)]
+        return [Diagnostic(part.name, "late decisions", why, still)]
     if model.skips.second:
         why = "it cannot keep up, and skips to the newest sample"
-        return [Trouble(part.name, "missing decisions", why, still)]
+        return [Diagnostic(part.name, "missing decisions", why, still)]
     if model.lost.second:
-        return [Trouble(part.name, "missing decisions", "it was too slow for its samples", still)]
+        why = "it was too slow for its samples"
+        return [Diagnostic(part.name, "missing decisions", why, still)]
     if model.refused:
         why = f"the new one is refused: {model.refused}"
-        return [Trouble(part.name, "old model", why, "the one before decides")]
+        return [Diagnostic(part.name, "old model", why, "the one before decides")]
     return []
 
 
@@ -167,24 +169,24 @@ def _of_consumer(
     limits: LimitsConfig,
     now_ns: int,
     starved: bool,
-) -> list[Trouble]:
+) -> list[Diagnostic]:
     part, still = consumer.part, "acquisition goes on"
     missing = "not published"
     if not part.name.startswith("publisher."):
         missing = "no recording" if consumer.kind == "recorder" else f"no {consumer.kind}"
     if _broken(part, starved):
-        return [Trouble(part.name, missing, _why(part), still)]
+        return [Diagnostic(part.name, missing, _why(part), still)]
     if part.state not in ("running", "starting"):
         return []
     if consumer.behind_s > limits.behind_s:
         why = f"it is more than {limits.behind_s:g} s behind"
-    elif consumer.trouble:
-        why = consumer.trouble
+    elif consumer.diagnostic:
+        why = consumer.diagnostic
     elif consumer.losses.second:
         why = "it was too slow, and some of it was dropped"
     else:
         why = "" if starved else _unrecorded(consumer, sources, limits, now_ns)
-    return [Trouble(part.name, missing, why, still)] if why else []
+    return [Diagnostic(part.name, missing, why, still)] if why else []
 
 
 def _unrecorded(
