@@ -85,13 +85,15 @@ class Daemon:
         with self._changing:
             for wanted, consumer in ready:
                 self._add_consumer(wanted, consumer)
-            self._match()
+            self._reconcile()
         self.report("daemon", "starting", f"{self._loaded.path}")
         self._watcher.start()
 
     def reload(self, loaded: Loaded) -> None:
-        """Change to another configuration: what is the same in it goes on undisturbed, and a model
-        goes on until the one that takes its place is admitted.
+        """Reconcile the parts with another configuration.
+
+        What is the same in it goes on undisturbed, and a model goes on until the one that takes its
+        place is admitted.
 
         Raises:
             ConfigError: a consumer cannot be made; nothing has changed.
@@ -114,7 +116,7 @@ class Daemon:
             self._end(old)
             for name, consumer in new.items():
                 self._add_consumer(wanted[name], consumer)
-            self._match()
+            self._reconcile()
         parts = ", ".join(sorted(new)) if new else "no consumer"
         self.report("daemon", "reloaded", f"{loaded.path}: {parts} new or changed")
 
@@ -228,8 +230,8 @@ class Daemon:
         self._hub.join(wanted.name, part.box)
         part.start()
 
-    def _match(self) -> None:
-        """Let sources and models be those of the configuration."""
+    def _reconcile(self) -> None:
+        """Reconcile sources and models with the configuration."""
         config = self._loaded.config
         limits = config.limits
         models = {m.name: ((m, limits, file_stamp(model_path(m))), m) for m in config.model}
