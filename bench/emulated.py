@@ -211,7 +211,7 @@ class EmulatedArray(EmulatedDevice):
         signal: (n, element, channel) SI, in place of the script's signal.
 
     Attributes:
-        mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``frozen``: the
+        mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
             same values again and again; ``no_number``: NaN; ``gaps``, ``corrupt``: every twentieth
             sample is missing, or damaged.
     """
@@ -255,7 +255,7 @@ class EmulatedArray(EmulatedDevice):
     def _felt(self, chunk: Chunk) -> Chunk:
         """What the array's mood makes of what it feels."""
         values = chunk.values
-        if self.mood == "frozen":
+        if self.mood == "stuck":
             values = np.broadcast_to(self._last, values.shape).copy()
         elif self.mood == "no_number":
             values = np.full_like(values, np.nan)

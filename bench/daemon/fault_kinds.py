@@ -20,7 +20,7 @@ from tests.helpers.hostile_models import GREEDY, write_burdened
 
 __all__ = ["CONFIGURATION", "KINDS", "FaultKind", "FaultScene", "may_mount"]
 
-FROZEN_S = 0.3
+STUCK_AT_S = 0.3
 DISK_MB, SPARE_MB = 96, 24  # of the recordings' file system; that must be free
 STEP_S = 3600.0
 STOPPED_S, STARVED_S = 3.0, 10.0
@@ -30,7 +30,7 @@ CONFIGURATION = f"""version = 1
 [[source]]
 name = "whiskers"
 url = "{{whiskers}}"
-frozen_s = {FROZEN_S}
+stuck_at_s = {STUCK_AT_S}
 [[source]]
 name = "finger"
 url = "{{finger}}"
@@ -416,10 +416,10 @@ KINDS: dict[str, FaultKind] = {
         _mood("finger", "silent"), (("source.finger", "no samples"),),
         (("source.finger", "lost samples"),),
     ),
-    "device_frozen": FaultKind(
-        _mood("whiskers", "frozen", FROZEN_S + 0.064), (("source.whiskers", "frozen samples"),)
+    "device_stuck": FaultKind(
+        _mood("whiskers", "stuck", STUCK_AT_S + 0.064), (("source.whiskers", "stuck-at fault"),)
     ),
-    "coarse_sensor_at_rest": FaultKind(_mood("finger", "frozen")),
+    "coarse_sensor_at_rest": FaultKind(_mood("finger", "stuck")),
     "no_numbers": FaultKind(
         _mood("whiskers", "no_number", 0.064), (("source.whiskers", "bad samples"),)
     ),

@@ -51,16 +51,16 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
     Attributes:
         array: A file of the array that the source is, as `tactile-rt describe` writes it, or an
             ``.onnx`` model, whose array it then is; empty if it is what the URL says.
-        frozen_s: Time without any change of any value from which the device is taken to hang, s; 0
-            for what follows from the sensor's noise, where a model on the source tells it, else
-            for ever: a coarse sensor at rest does not change either.
+        stuck_at_s: Time without any change of any value that is a stuck-at fault: the device hangs,
+            s; 0 for what follows from the sensor's noise, where a model on the source tells it,
+            else for ever: a coarse sensor at rest does not change either.
     """
 
     name: Name
     url: str
     calibration: str = ""
     array: str = ""
-    frozen_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
+    stuck_at_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
 
 
 class ModelConfig(_Table, frozen=True, kw_only=True):
@@ -196,7 +196,7 @@ name = "whiskers"
 url = "replay:demo?loop=true"  # six recorded objects; a device: serial:///dev/ttyACM0?codec=native
                                # "synthetic:mouse" is made up: what is decided on it means nothing
 # calibration = "cell-3"       # file, or id of a device: tactile-rt calibrate
-# frozen_s = 0                 # no change for so long: the device hangs; 0: if its noise is known
+# stuck_at_s = 0                 # no change for so long: stuck-at fault; 0: if its noise is known
 # array = "array.json"         # what the device is, if its codec cannot know; or a model's .onnx
 
 [[model]]                      # none: nothing is classified

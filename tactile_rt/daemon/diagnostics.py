@@ -127,9 +127,9 @@ def _of_source(
         elif taken_s > most:
             why = f"when they come they are older than {most:g} s"
             found.append(Diagnostic(name, "late samples", why))
-    if source.frozen_s:
+    if source.stuck_at_s:
         why = "the values do not change at all, as no sensor's do: the device hangs"
-        found.append(Diagnostic(name, "frozen samples", why))
+        found.append(Diagnostic(name, "stuck-at fault", why))
     if source.losses.second:
         found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))
     if source.bad.second:

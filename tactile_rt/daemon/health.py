@@ -105,9 +105,7 @@ class SourceState:
     losses: Losses = field(default_factory=Losses)  # corrupt, missing or dropped
     bad_samples: int = 0  # of one element, no number or an absurd one, though not marked invalid
     bad: Losses = field(default_factory=Losses)
-    frozen_s: float = (
-        0.0  # no value has changed, though the sensor's noise should change some; or 0
-    )
+    stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some
 
 
 @dataclass(frozen=True)

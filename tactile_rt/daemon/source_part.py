@@ -22,11 +22,11 @@ from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.diagnostics import LossWindow, oldest_s
-from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
 from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.reader import Reader
@@ -126,7 +126,7 @@ class SourcePart(Part):
         self._spec: ArraySpec | None = None
         self._before = SourceStats()  # of all streams before this one
         self._samples = self._newest_ns = self._read_ns = self._flowing_ns = self._bad = 0
-        self._frozen = FrozenJudge()
+        self._stuck_at = StuckAtDetector()
         self._losses, self._bads = LossWindow(), LossWindow()
         self._offset_ns = 0
         self._look_ns = self._pause_ns = 0
@@ -146,7 +146,7 @@ class SourcePart(Part):
             flowing_ns=self._flowing_ns,
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
-            bad_samples=self._bad, bad=self._bads.add(self._bad), frozen_s=self._frozen.seconds,
+            bad_samples=self._bad, bad=self._bads.add(self._bad), stuck_at_s=self._stuck_at.seconds,
         )  # fmt: skip
         if spec is None:
             return about
@@ -163,10 +163,10 @@ class SourcePart(Part):
     def judge(self, sensor: SensorSpec | None) -> None:
         """Say what the sensor of a model on this source is, if there is one that tells."""
         spec, device = self._spec, self._device
-        after_s = self.config.frozen_s
+        after_s = self.config.stuck_at_s
         if not after_s and spec is not None and device is not None and sensor is not None:
-            after_s = frozen_after(spec, sensor)
-        self._frozen.after_s = after_s or math.inf
+            after_s = derive_stuck_at_s(spec, sensor)
+        self._stuck_at.after_s = after_s or math.inf
 
     def stop(self) -> None:
         self._stopped_s = self._stopped_s or time.monotonic()
@@ -231,7 +231,7 @@ class SourcePart(Part):
         good, bad = without_bad_samples(chunk)
         useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
-        self._frozen.add(good)
+        self._stuck_at.add(good)
         self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
         if not stream.live:
             self._await_room()

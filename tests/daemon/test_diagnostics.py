@@ -13,7 +13,6 @@ from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.daemon import diagnostics as module
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.diagnostics import LossWindow, diagnose
-from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
 from tactile_rt.daemon.health import (
     ConsumerState,
     Losses,
@@ -22,6 +21,7 @@ from tactile_rt.daemon.health import (
     PartState,
     SourceState,
 )
+from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.testing import cut, small_spec
 
@@ -75,9 +75,9 @@ def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
     assert told([replace(SOURCE, **changes)]) == [line]
 
 
-def test_a_frozen_device_is_named():
-    (line,) = told([replace(SOURCE, frozen_s=0.4)])
-    assert line.startswith("frozen samples: source.a: the values do not change")
+def test_a_device_that_is_stuck_is_named():
+    (line,) = told([replace(SOURCE, stuck_at_s=0.4)])
+    assert line.startswith("stuck-at fault: source.a: the values do not change")
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_whoever_looks_often_does_not_fill_the_window():
     assert len(window._seen) < 100
 
 
-# frozen
+# stuck-at faults
 
 
 def chunks(values):
@@ -263,7 +263,7 @@ def chunks(values):
 
 
 def judged(values, after_s):
-    judge = FrozenJudge()
+    judge = StuckAtDetector()
     judge.after_s = after_s
     found = []
     for chunk in chunks(values):
@@ -272,16 +272,16 @@ def judged(values, after_s):
     return found
 
 
-def test_values_that_do_not_change_are_frozen_and_one_that_does_ends_it():
+def test_values_that_do_not_change_are_a_stuck_at_fault_and_one_that_does_ends_it():
     rng = np.random.default_rng(0)
     values = rng.normal(size=(900, 3, 2))
     values[200:700] = values[200]
     values[700:] += 1.0
     found = judged(values, 0.3)
     times = (np.arange(len(found)) * 7 + 6) / 1000.0
-    frozen = np.array(found) > 0
-    assert frozen[(times > 0.51) & (times < 0.69)].all()
-    assert not frozen[times < 0.5].any() and not frozen[times > 0.708].any()
+    stuck = np.array(found) > 0
+    assert stuck[(times > 0.51) & (times < 0.69)].all()
+    assert not stuck[times < 0.5].any() and not stuck[times > 0.708].any()
     assert max(found) == pytest.approx(0.5, abs=0.01)
 
 
@@ -294,8 +294,8 @@ def test_one_value_of_many_that_changes_is_enough():
     assert any(judged(np.full((900, 3, 2), np.nan), 0.05))  # no number is equal to itself, here
 
 
-def test_a_sample_without_any_valid_element_says_nothing_of_freezing():
-    judge = FrozenJudge()
+def test_a_sample_without_any_valid_element_says_nothing_of_being_stuck():
+    judge = StuckAtDetector()
     judge.after_s = 0.05
     for chunk in chunks(np.zeros((900, 3, 2))):
         judge.add(replace(chunk, valid=np.zeros_like(chunk.valid)))
@@ -311,7 +311,7 @@ def test_a_sample_without_any_valid_element_says_nothing_of_freezing():
 )
 def test_how_long_nothing_changes_is_counted_sample_by_sample(values, useless, cuts, start, after):
     """By the plainest way to count it, however the stream is cut."""
-    n, judge = len(values), FrozenJudge()
+    n, judge = len(values), StuckAtDetector()
     judge.after_s = after / 1000
     loads = np.zeros((n, 3, 2), np.float32)
     loads[:, 1, 1] = values
@@ -328,8 +328,8 @@ def test_how_long_nothing_changes_is_counted_sample_by_sample(values, useless, c
         assert judge.seconds == pytest.approx(same / 1000 if same > after else 0.0)
 
 
-def test_another_array_is_no_frozen_one():
-    judge = FrozenJudge()
+def test_another_array_is_not_stuck():
+    judge = StuckAtDetector()
     judge.after_s = 0.005
     for at, elements in ((0, 3), (1, 4)):
         chunk = cut(np.zeros((9, elements, 2), np.float32), 1000.0, 9)[0]
@@ -337,8 +337,8 @@ def test_another_array_is_no_frozen_one():
         assert judge.seconds == pytest.approx(0.008)
 
 
-def test_who_is_judged_no_more_is_not_frozen():
-    judge = FrozenJudge()
+def test_who_is_judged_no_more_is_not_stuck():
+    judge = StuckAtDetector()
     assert judge.seconds == 0.0
     judge.after_s = 0.001
     (chunk,) = cut(np.zeros((9, 3, 2), np.float32), 1000.0, 9)
@@ -364,32 +364,32 @@ def sensor(noise, resolution):
 def test_from_when_on_equal_samples_are_impossible_follows_from_the_noise():
     spec = small_spec(rate_hz=1000.0)
     fine, coarse = sensor(1e-3, 1e-6), sensor(1e-6, 1e-2)
-    assert frozen_after(spec, fine) == 0.25
-    assert frozen_after(spec, coarse) == float("inf")
-    assert frozen_after(spec, sensor(0.0, 1e-3)) == float("inf")
-    assert frozen_after(spec, sensor(1e-3, 0.0)) == 0.25
+    assert derive_stuck_at_s(spec, fine) == 0.25
+    assert derive_stuck_at_s(spec, coarse) == float("inf")
+    assert derive_stuck_at_s(spec, sensor(0.0, 1e-3)) == float("inf")
+    assert derive_stuck_at_s(spec, sensor(1e-3, 0.0)) == 0.25
 
 
 def test_from_when_on_is_as_many_pairs_as_make_it_impossible():
     """At one sample a second a pair takes a second, and 0.25 s are no matter."""
     spec = small_spec(elements=1, rate_hz=1.0)
     # s = 1 sqrt(1/2), p = q / (2 s sqrt(pi)) = 0.2821 for q = s: 0.2821^22 = 8e-13
-    assert frozen_after(spec, sensor(1.0, np.sqrt(0.5))) == 22.0
+    assert derive_stuck_at_s(spec, sensor(1.0, np.sqrt(0.5))) == 22.0
     # twice the elements, half the pairs; and never fewer than three
-    assert frozen_after(small_spec(elements=2, rate_hz=1.0), sensor(1.0, np.sqrt(0.5))) == 11.0
-    assert frozen_after(spec, sensor(1.0, 1e-15)) == 3.0
+    assert derive_stuck_at_s(small_spec(elements=2, rate_hz=1.0), sensor(1.0, np.sqrt(0.5))) == 11.0
+    assert derive_stuck_at_s(spec, sensor(1.0, 1e-15)) == 3.0
 
 
 @given(ratio=st.floats(0.05, 3.0), seed=st.integers(0, 1000))
-def test_no_sensor_of_a_known_noise_is_taken_for_frozen(ratio, seed):
+def test_no_sensor_of_a_known_noise_is_taken_for_stuck(ratio, seed):
     """White noise, rounded to steps of so many standard deviations: never so long the same."""
     rate, density = 200.0, 1e-3
     sigma = density * np.sqrt(rate / 2)
     spec = small_spec(rate_hz=rate)
-    after_s = frozen_after(spec, sensor(density, sigma / ratio))
+    after_s = derive_stuck_at_s(spec, sensor(density, sigma / ratio))
     noise = np.random.default_rng(seed).normal(scale=sigma, size=(2000, 3, 1))
     rounded = (np.round(noise / (sigma / ratio)) * (sigma / ratio)).astype(np.float32)
-    judge = FrozenJudge()
+    judge = StuckAtDetector()
     judge.after_s = after_s
     for chunk in cut(rounded, rate, 7):
         judge.add(chunk)
@@ -401,6 +401,6 @@ def test_the_chance_of_equal_readings_is_that_of_noise_that_is_rounded(resolutio
     spec = small_spec(elements=2, rate_hz=2.0)
     drawn = np.round(np.random.default_rng(0).normal(size=2_000_000) / resolution)
     chance = float((drawn[1:] == drawn[:-1]).mean()) ** 2  # both elements
-    pairs = frozen_after(spec, sensor(1.0, resolution)) * spec.rate_hz
+    pairs = derive_stuck_at_s(spec, sensor(1.0, resolution)) * spec.rate_hz
     assert chance**pairs <= 1e-12 * 1.2
     assert chance ** (pairs - 1) >= 1e-12 / 1.2

@@ -1,4 +1,5 @@
-"""A device that hangs on one value: its samples come, in time and in order, and say nothing.
+"""Stuck-at faults: a device hangs on one value; its samples come, in time and in order, and say
+nothing.
 
 A sensor whose noise is above its resolution cannot give the same values twice; one that is coarse
 gives the same ones for as long as it rests. So equal samples are a fault only where the noise is
@@ -13,15 +14,15 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 
-__all__ = ["FrozenJudge", "frozen_after"]
+__all__ = ["StuckAtDetector", "derive_stuck_at_s"]
 
 LEAST_S = 0.25  # a hiccup of a driver that repeats a sample is no device that hangs
 LEAST_PAIRS = 3
 IMPOSSIBLE = 1e-12  # probability
 
 
-class FrozenJudge:
-    """For how long have the values been the same?
+class StuckAtDetector:
+    """Measures for how long the values have been the same.
 
     Attributes:
         after_s: The time for which they may be, s; infinite: for ever, and nothing is looked at.
@@ -35,8 +36,7 @@ class FrozenJudge:
         self.seconds = 0.0
 
     def add(self, chunk: Chunk) -> None:
-        """Take the next samples of the stream; of one without any valid element nothing is
-        judged."""
+        """Take the next samples of the stream; those without any valid element say nothing."""
         if math.isinf(self.after_s):
             self._last, self.seconds = None, 0.0
             return
@@ -53,12 +53,11 @@ class FrozenJudge:
         self.seconds = same_s if same_s > self.after_s else 0.0
 
 
-def frozen_after(spec: ArraySpec, sensor: SensorSpec) -> float:
-    """From when on equal samples are impossible, s, by the noise of a sensor; infinite: never.
+def derive_stuck_at_s(spec: ArraySpec, sensor: SensorSpec) -> float:
+    """Derive from the noise for how long samples may be equal, s; infinite: for ever.
 
     Two readings of a channel with white noise of standard deviation s, rounded to steps of q, are
     equal with a probability of about q / (2 s sqrt(pi)), and at most 1; channels are independent.
-
     """
     log_p = 0.0
     for channel in sensor.channels:
