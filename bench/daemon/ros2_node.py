@@ -116,7 +116,7 @@ class DecisionMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
     label: str
     labels: sequence[str]
     probabilities: sequence[float64]
-    candidates: sequence[str]
+    prediction_set: sequence[str]
     coverage: float64
     model_ms: float64
     latency_ms: float64

@@ -23,8 +23,8 @@ from bench.perception.scores import Figures, accuracy_by_source, robustness, sco
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation.coverage import Coverage, measure_coverage, named_faults
 from tactile_rt.models.evaluation.measures import Interval
-from tactile_rt.models.evaluation.promises import Promises, named_faults, promises
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.models.evaluation.robustness import conditions
 from tactile_rt.sets.manifest import SPLITS, WITHHELD
@@ -61,7 +61,7 @@ class BenchmarkResults:
         by_source: Top-1 on the held-out objects and the held-out source together, by source.
         robust: Top-1 on the held-out objects by condition.
         generator: Top-1 on generated objects by what is changed, of those that know them.
-        promises: What became of the promises of each model file, by its name and test.
+        coverage: The coverage and the refusals of each model file, by its name and test.
         faults: The share of loads that no touch makes that each model file refuses, by their name.
         false_touches: Touches a minute found while the head is shaken and nothing is near, without
             and with the rated noise; None: not measured.
@@ -73,7 +73,7 @@ class BenchmarkResults:
     by_source: dict[Method, dict[str, Interval]]
     robust: dict[Method, dict[str, Interval]]
     generator: dict[Method, dict[str, Interval]]
-    promises: dict[str, dict[str, Promises]] = field(default_factory=dict)
+    coverage: dict[str, dict[str, Coverage]] = field(default_factory=dict)
     faults: dict[str, dict[str, Interval]] = field(default_factory=dict)
     false_touches: tuple[float, float] | None = None
     digest: str = ""
@@ -145,19 +145,19 @@ def measure(
     if not quick:
         results.false_touches = false_touches(folder, 0.0), false_touches(folder, 1.0)
     for path in (shipped, *models):
-        progress(f"{path.stem}: what it promises")
-        _hold(results, path, tests, data, changed)
+        progress(f"{path.stem}: its coverage and refusals")
+        _measure_refusals(results, path, tests, data, changed)
     return results
 
 
-def _hold(
+def _measure_refusals(
     results: BenchmarkResults,
     path: Path,
     tests: dict[str, SweepSet],
     data: Data,
     changed: dict[str, list[Condition]],
 ) -> None:
-    """Hold a model file to its promises."""
+    """Measure the coverage and the refusals of a model file."""
     on: dict[str, tuple[SweepSet, Disturbance]] = {
         OBJECTS: (tests[OBJECTS], CLEAN),
         f"{OBJECTS}, rated noise": (tests[OBJECTS], Disturbance(noise=1)),
@@ -173,10 +173,10 @@ def _hold(
     found = {}
     for name, (test, disturbance) in on.items():
         known = of_kinds(test, kinds)  # there are none among the unknown
-        found[name] = promises(path, known if len(known.sweeps) else test, disturbance)
-    kept = {name: one for name, one in found.items() if one is not None}
-    if kept:
-        results.promises[path.stem] = kept
+        found[name] = measure_coverage(path, known if len(known.sweeps) else test, disturbance)
+    told = {name: one for name, one in found.items() if one is not None}
+    if told:
+        results.coverage[path.stem] = told
         results.faults[path.stem] = dict(named_faults(path, plain or tests[OBJECTS]))
 
 

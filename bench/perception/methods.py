@@ -22,7 +22,7 @@ from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.promises import familiarity
+from tactile_rt.models.evaluation.coverage import familiarity
 from tactile_rt.models.evaluation.svm import PENALTIES, fit, window_features
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.training.config import TrainingConfig

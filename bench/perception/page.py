@@ -134,8 +134,8 @@ def write_page(results: BenchmarkResults, path: Path) -> None:
             f"`{DEFAULT_RECIPE}`, whose loads have the SHA-256 `{results.digest}`.",
             "",
         ]
-    if results.promises:
-        lines += [*_promises(results), ""]
+    if results.coverage:
+        lines += [*_list_coverage(results), ""]
     path.write_text("\n".join(lines), encoding="utf-8")
 
 
@@ -150,24 +150,25 @@ def _false_touches(results: BenchmarkResults) -> list[str]:
     ]
 
 
-def _promises(results: BenchmarkResults) -> list[str]:
-    """What becomes of the models' promises, and which loads they refuse."""
+def _list_coverage(results: BenchmarkResults) -> list[str]:
+    """List the coverage of the models, and which loads they refuse."""
     lines = [
-        "### Refusals and candidates",
+        "### Refusals and prediction sets",
         "",
         "A model file may refuse to name a kind, because the object is of none that it knows or "
-        "because no touch makes such loads; and it may promise that the true kind is among its "
-        "candidates at every step of so many touches. *Candidates*: their mean number at the last "
-        "step.",
+        "because no touch makes such loads; and it may tell the coverage of its prediction sets: "
+        "of how many touches they hold the true kind at every step. *Set*: the mean number of "
+        "kinds in it at the last step.",
         "",
-        "| model | test | promised | kept | candidates | called unknown | refused for the loads |",
+        "| model | test | nominal coverage | coverage | set | called unknown "
+        "| refused for the loads |",
         "|---" * 7 + "|",
     ]
-    for name, tests in results.promises.items():
+    for name, tests in results.coverage.items():
         for test, p in tests.items():
-            promised = "-" if p.coverage != p.coverage else f"{100 * p.coverage:g}"
+            nominal = "-" if p.nominal != p.nominal else f"{100 * p.nominal:g}"
             size = "-" if p.size.value != p.size.value else f"{p.size.value:.1f}"
-            cells = (promised, _said(p.kept), size, _said(p.unknown), _said(p.faulty))
+            cells = (nominal, _said(p.covered), size, _said(p.unknown), _said(p.faulty))
             lines.append(f"| {name} | {test} | {' | '.join(cells)} |")
     lines += [
         "",

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.decision_rules import (
     IN_A_ROW,
-    CandidateRule,
     Deadline,
     EarlyExit,
     Lanes,
     Policy,
+    PredictionSetRule,
     fitting,
 )
 from tactile_rt.classifier.model_card import decided, rated_noise
@@ -72,11 +72,11 @@ class Classification:
             `probabilities`.
         probabilities: (class,) The posterior probability of each of them, float32.
         latency_s: The time that the model's step took, s.
-        candidates: The classes that are still possible, the most probable first, by the model's
-            promise for the noise that was measured; empty if it makes none, as of windows of
-            ``sliding`` that begin within a contact.
-        coverage: The promise: in this share of touches of known kinds the true class is among the
-            candidates at every step; None: there is none.
+        prediction_set: The classes that are still possible, the most probable first, by the model's
+            rule for the noise that was measured; empty if it has none, as of windows of ``sliding``
+            that begin within a contact.
+        coverage: The share of touches of known kinds of which the true class is in the prediction
+            set of every step; None: there is no such set.
         late: Whether more work had gathered than the deadline allows.
         embedding: (unit,) What the network's last layer read in the step, float32; None unless the
             classifier was asked for it.
@@ -90,7 +90,7 @@ class Classification:
     labels: tuple[str, ...]
     probabilities: NDArray[np.float32]
     latency_s: float
-    candidates: tuple[str, ...] = ()
+    prediction_set: tuple[str, ...] = ()
     coverage: float | None = None
     late: bool = False
     embedding: NDArray[np.float32] | None = None
@@ -224,7 +224,7 @@ class Classifier:
         self._skipping = False
         self._next_seq = 0
         self._rated = rated_noise(self.card)
-        self._promise: CandidateRule | None = None  # of the episode
+        self._set_rule: PredictionSetRule | None = None  # of the episode
 
     @property
     def deciding(self) -> bool:
@@ -294,7 +294,7 @@ class Classifier:
             self._begin(t_ns)
         elif before and self._sliding and self.detector.contact:
             self._begin(t_ns)  # a window within a contact, as others of this mode
-            self._promise = None
+            self._set_rule = None
         if self._onset_ns is None:
             return None
         if self._decided and not self.detector.contact:
@@ -329,7 +329,7 @@ class Classifier:
         # Of an element without a baseline the noise is not known.
         known = self._sigma[self.detector.has_baseline] / self._rated
         noise = float(np.median(known)) if known.size else np.inf
-        self._promise = fitting(self.card.candidates, noise)
+        self._set_rule = fitting(self.card.candidates, noise)
 
     def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
         """Take a step with the samples gathered; the decision that it gives, if any."""
@@ -358,7 +358,7 @@ class Classifier:
         best = decided(self.card, probabilities, step)
         final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
         # it was fitted on windows that begin where the contact does
-        promise = None if self._decided else self._promise
+        rule = None if self._decided else self._set_rule
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
             self.stats.withheld += 1
@@ -372,19 +372,19 @@ class Classifier:
             labels=self.card.labels,
             probabilities=probabilities,
             latency_s=latency,
-            candidates=self._candidates(promise, probabilities, step),
-            coverage=promise.coverage if promise else None,
+            prediction_set=self._predict_set(rule, probabilities, step),
+            coverage=rule.coverage if rule else None,
             late=late,
             embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
         )
 
-    def _candidates(
-        self, promise: CandidateRule | None, probabilities: NDArray[np.float32], step: int
+    def _predict_set(
+        self, rule: PredictionSetRule | None, probabilities: NDArray[np.float32], step: int
     ) -> tuple[str, ...]:
-        if promise is None:
+        if rule is None:
             return ()
         classes = self.card.classes
-        left = promise.candidates(probabilities[: len(classes)], step)
+        left = rule.prediction_set(probabilities[: len(classes)], step)
         return tuple(classes[k] for k in left)
 
     def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:

@@ -24,11 +24,11 @@ __all__ = [
     "MASS_ABOVE",
     "POSTERIOR",
     "UNKNOWN",
-    "CandidateRule",
     "Deadline",
     "EarlyExit",
     "Lanes",
     "Policy",
+    "PredictionSetRule",
     "UnknownRule",
     "fitting",
     "mass_above",
@@ -38,7 +38,7 @@ __all__ = [
 MAX_NAME = 200  # characters
 UNKNOWN = "unknown"  # what is decided of an object of no class that the model knows
 POSTERIOR = "posterior of unknown"  # the score of an `UnknownRule`: of the label `unknown`
-# The score of a `CandidateRule`: how much of the posterior the more probable classes have.
+# The score of a `PredictionSetRule`: how much of the posterior the more probable classes have.
 MASS_ABOVE = "mass above"
 
 
@@ -70,19 +70,19 @@ class UnknownRule(msgspec.Struct, frozen=True):
         return self.thresholds[step - 1 if len(self.thresholds) > 1 else 0]
 
 
-class CandidateRule(msgspec.Struct, frozen=True):
-    """Which classes a step leaves possible, so that the true one is seldom left out.
+class PredictionSetRule(msgspec.Struct, frozen=True):
+    """The rule of a step's prediction set: the classes that it leaves possible.
 
-    A class is a candidate at a step if its score there is not above the step's quantile.
+    A class is in the set of a step if its score there is not above the step's quantile.
 
     Attributes:
         score: The name of the score that every class gets at a step: `MASS_ABOVE`.
-        coverage: The promise: the share of sweeps of unseen objects of which the true class is a
-            candidate at every step, in (0, 1).
-        quantiles: (step,) The largest score of a candidate, by step.
+        coverage: The share of sweeps of unseen objects of which the true class is in the prediction
+            set of every step, in (0, 1).
+        quantiles: (step,) The largest score of a class in the set, by step.
         objects: The number of objects that the quantiles were fitted on; the sweeps of an object
             count as one.
-        noise: The largest noise for which the promise holds, in multiples of the rated noise;
+        noise: The largest noise for which the coverage holds, in multiples of the rated noise;
             None if for any.
     """
 
@@ -108,8 +108,8 @@ class CandidateRule(msgspec.Struct, frozen=True):
             return f"noise is {self.noise:g}, must be 0 or more"
         return ""
 
-    def candidates(self, probabilities: NDArray[np.float32], step: int) -> list[int]:
-        """The classes (indices of `probabilities` (class,)) that a step, from 1, leaves possible.
+    def prediction_set(self, probabilities: NDArray[np.float32], step: int) -> list[int]:
+        """Form the set of a step, from 1, as indices of `probabilities` (class,).
 
         The most probable one is first, and always among them.
         """
@@ -118,7 +118,7 @@ class CandidateRule(msgspec.Struct, frozen=True):
         return [int(k) for k in order[: max(1, int(allowed.sum()))]]
 
 
-def fitting(rules: Sequence[CandidateRule], noise: float) -> CandidateRule | None:
+def fitting(rules: Sequence[PredictionSetRule], noise: float) -> PredictionSetRule | None:
     """The rule that holds at a noise, in multiples of the rated: the narrowest; None if none is."""
     known = [r for r in rules if r.score == MASS_ABOVE and (r.noise is None or noise <= r.noise)]
     return min(known, key=lambda r: np.inf if r.noise is None else r.noise, default=None)

@@ -18,7 +18,7 @@ from tactile_rt.classifier.decision_rules import (
     MAX_NAME,
     POSTERIOR,
     UNKNOWN,
-    CandidateRule,
+    PredictionSetRule,
     UnknownRule,
     named,
 )
@@ -121,7 +121,7 @@ class ModelCard(msgspec.Struct, frozen=True):
         embedding: The number of units of the output ``embedding``.
         sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
         unknown: The rule by which an object is of no known class; None if there is none.
-        candidates: The rules of the classes that a step leaves possible, one for each promise.
+        candidates: The rules of prediction sets, each for another noise or coverage.
         refusals: The last of the labels, if any: those that name no class, but say that the object
             is unknown, or what is wrong with the loads.
         embeddings: The places of touches of the known classes, so that others can be told from them
@@ -153,7 +153,7 @@ class ModelCard(msgspec.Struct, frozen=True):
     sensor: dict[str, Any] = {}
     refusals: tuple[str, ...] = ()
     unknown: UnknownRule | None = None
-    candidates: tuple[CandidateRule, ...] = ()
+    candidates: tuple[PredictionSetRule, ...] = ()
     embeddings: EmbeddingStatistics | None = None
     license: str = ""
 

@@ -370,8 +370,8 @@ def _draw_guess(demo: Demonstration) -> Text:
         text.append(f"{label[:9]:<10}", f"bold {style}" if label == truth else "")
         text.append(f"{'█' * round(BAR * probability):<{BAR}}", style)
         text.append(f" {100 * probability:3.0f} %\n")
-    if decision.candidates:
-        possible = f"still possible: {len(decision.candidates)} of {len(card.classes)} kinds"
+    if decision.prediction_set:
+        possible = f"still possible: {len(decision.prediction_set)} of {len(card.classes)} kinds"
         text.append(possible, GREY)
     right = decision.label == truth
     verdict = ("✓ " if right else "✗ ") + ("RIGHT" if right else f"WRONG, it is a {truth}")

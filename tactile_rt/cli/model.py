@@ -61,7 +61,7 @@ def show(file: File, json: Json = None) -> None:
         "noise floor": _channels(spec, card.floor),
         "temperature": f"{card.temperature:.4g}",
         "unknown": _unknown(card.unknown),
-        "candidates": "\n".join(map(_candidates, card.candidates)),
+        "prediction sets": "\n".join(map(_describe_set, card.candidates)),
         "figures": _pairs(card.figures),
         "licence": card.license,
         "probe": "stored" if card.probe else "none stored",
@@ -151,7 +151,7 @@ def _unknown(rule: Any) -> str:
     return f"{rule.score} of the {rule.output} above {above}"
 
 
-def _candidates(rule: Any) -> str:
+def _describe_set(rule: Any) -> str:
     noise = "" if rule.noise is None else f" up to {rule.noise:.3g} x the rated noise"
     return f"{100 * rule.coverage:.3g} % by {rule.score}, of {rule.objects} objects{noise}"
 

@@ -38,8 +38,8 @@ def run(
     sample used and of first contact on the stream's clock; step since onset,
     from 1; final, whether it is the episode's last; label, the most probable
     class, or a refusal to name one ("unknown"); probabilities of all of them;
-    candidates, the classes that are still possible, with coverage, what the
-    model promises of them; latency_ms of the model step.
+    prediction_set, the classes that are still possible, with coverage, how
+    often the true one is among them; latency_ms of the model step.
 
     A summary goes to stderr. Ctrl-C leaves.
     """
@@ -90,7 +90,7 @@ def run(
                             label: round(float(p), 4)
                             for label, p in zip(d.labels, d.probabilities, strict=True)
                         },
-                        "candidates": d.candidates,
+                        "prediction_set": d.prediction_set,
                         "coverage": d.coverage,
                         "latency_ms": round(1e3 * d.latency_s, 3),
                     }

@@ -85,10 +85,10 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
             add the time since, by the computer's own monotonic clock.
         late: Whether the step took longer than it may, or the sample was older than that when the
             message was written.
-        candidates: The classes that are still possible, the most probable first; empty if the model
-            makes no promise.
-        coverage: The promise: in this share of touches of known kinds the true class is among the
-            candidates at every step; null without one.
+        prediction_set: The classes that are still possible, the most probable first; empty if the
+            model has no rule of it.
+        coverage: The share of touches of known kinds of which the true class is in the prediction
+            set of every step; null without one.
     """
 
     topic: ClassVar[str] = "decision"
@@ -102,7 +102,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     latency_ms: float
     age_ms: float = 0.0
     late: bool = False
-    candidates: tuple[str, ...] = ()
+    prediction_set: tuple[str, ...] = ()
     coverage: float | None = None
 
 
@@ -241,7 +241,7 @@ def _decision(item: Decision) -> DecisionMessage:
         model_ms=round(1e3 * d.latency_s, 3),
         latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), age_ms=round(age_ns / 1e6, 3),
         late=d.late or (0 < item.deadline_ns < age_ns),
-        candidates=d.candidates, coverage=d.coverage,
+        prediction_set=d.prediction_set, coverage=d.coverage,
     )  # fmt: skip
 
 

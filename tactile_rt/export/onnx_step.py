@@ -20,7 +20,7 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
-from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
+from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
 from tactile_rt.classifier.model_card import CARD_VERSION, EmbeddingStatistics, Kind
 from tactile_rt.classifier.model_file import (
     METADATA_KEY,
@@ -87,7 +87,7 @@ def export_checkpoint(
     path: Path,
     name: str,
     temperature: float = 1.0,
-    rules: tuple[UnknownRule | None, tuple[CandidateRule, ...]] = (None, ()),
+    rules: tuple[UnknownRule | None, tuple[PredictionSetRule, ...]] = (None, ()),
     embeddings: EmbeddingStatistics | None = None,
     figures: dict[str, Any] | None = None,
     precision: Precision = "fp32",
@@ -99,7 +99,7 @@ def export_checkpoint(
 
     Args:
         temperature: divides the logits at run time.
-        rules: when the model refuses to name a class, and what it promises of candidates.
+        rules: when the model refuses to name a class, and of its prediction sets.
         kind: "step" or "window".
         data: where the sweep sets that it was trained on lie now; default: where they lay.
 

@@ -14,7 +14,7 @@ from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, file_outpu
 from tactile_rt.core.files import write_whole
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
-from tactile_rt.export.promises import fitted_rules
+from tactile_rt.export.prediction_sets import fitted_rules
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
@@ -63,13 +63,13 @@ def release(
     right = hits(last, labels).reshape(2, -1).mean(axis=1).tolist()
     temperature = fit_temperature(last, labels)
     told = (*known, *saved["refusals"])
-    unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
+    unknown, prediction_sets = fitted_rules(sets, run_on(model), temperature, told, len(known))
     card = export_checkpoint(
         checkpoint,
         path,
         name,
         temperature=temperature,
-        rules=(unknown, candidates),
+        rules=(unknown, prediction_sets),
         embeddings=embedding_statistics(model, validation, len(known)),
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         precision=precision,

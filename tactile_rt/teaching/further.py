@@ -193,7 +193,7 @@ def further_graph(data: bytes, card: ModelCard, classes: FurtherClasses) -> Onnx
 
 
 def further_card(card: ModelCard, classes: FurtherClasses) -> ModelCard:
-    """The card of that: what it promised of candidates, it promised of its own classes."""
+    """Return the card of that; its prediction sets were those of its own classes."""
     state = (StateTensor(SUM, (card.embedding,), "float32"), StateTensor(COUNT, (1,), "float32"))
     return msgspec.structs.replace(
         card,

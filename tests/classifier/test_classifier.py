@@ -15,7 +15,7 @@ from tactile_rt.classifier.decision_rules import (
     MASS_ABOVE,
     POSTERIOR,
     UNKNOWN,
-    CandidateRule,
+    PredictionSetRule,
     UnknownRule,
 )
 from tactile_rt.classifier.model_card import decided, rated_noise
@@ -415,21 +415,21 @@ def test_below_its_threshold_unknown_is_not_decided_however_probable(tmp_path: P
     assert decided(other, np.array([0.8, 0.2], dtype=np.float32), 1) == 0
 
 
-def test_candidates_are_the_classes_that_the_promise_leaves_at_the_noise_that_is_measured(
+def test_the_prediction_set_is_that_of_the_rule_for_the_noise_that_is_measured(
     tmp_path: Path,
 ) -> None:
     values = stream(signal([(QUIET, 400, 0.1)], 400))
-    assert push_all(refusing(tmp_path), values)[-1].candidates == ()
+    assert push_all(refusing(tmp_path), values)[-1].prediction_set == ()
     rated = float(np.median(SIGMA / rated_noise(CARD)))
-    quiet = CandidateRule(MASS_ABOVE, 0.9, (0.5, 0.6, 0.7, 0.99), 80, noise=0.5 * rated)
-    noisy = CandidateRule(MASS_ABOVE, 0.8, (0.0, 1.0, 0.9, 0.5), 80, noise=4 * rated)
+    quiet = PredictionSetRule(MASS_ABOVE, 0.9, (0.5, 0.6, 0.7, 0.99), 80, noise=0.5 * rated)
+    noisy = PredictionSetRule(MASS_ABOVE, 0.8, (0.0, 1.0, 0.9, 0.5), 80, noise=4 * rated)
     decisions = push_all(refusing(tmp_path, candidates=(noisy, quiet)), values)
     for d, quantile in zip(decisions, noisy.quantiles, strict=True):
         own = d.probabilities[:3] / d.probabilities[:3].sum()
         order = np.argsort(-own)
         above = np.cumsum(own[order]) - own[order]
-        assert d.candidates == tuple(NAMES[k] for k in order[above <= quantile])
+        assert d.prediction_set == tuple(NAMES[k] for k in order[above <= quantile])
         assert d.coverage == 0.8
-    assert len({len(d.candidates) for d in decisions}) > 1
+    assert len({len(d.prediction_set) for d in decisions}) > 1
     none = push_all(refusing(tmp_path, candidates=(quiet,)), values)[-1]
-    assert (none.candidates, none.coverage) == ((), None), "too noisy for what was promised"
+    assert (none.prediction_set, none.coverage) == ((), None), "too noisy for the rule"

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
+from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
 from tactile_rt.classifier.model_file import (
     StateTensor,
     element_order,
@@ -140,7 +140,7 @@ SWAPPED = (
 
 
 UNKNOWN = UnknownRule(score="entropy", output="logits", thresholds=(1.5,))
-PROMISE = CandidateRule(score="1 - posterior", coverage=0.95, quantiles=(0.9,) * 4, objects=200)
+RULE = PredictionSetRule(score="1 - posterior", coverage=0.95, quantiles=(0.9,) * 4, objects=200)
 replaced = msgspec.structs.replace
 
 
@@ -251,12 +251,12 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"unknown": replaced(UNKNOWN, score="")}, "unknown.score must be 1 to 200 printable"),
         ({"unknown": replaced(UNKNOWN, output="state")}, r"Invalid enum .*\$.unknown.output"),
         ({"unknown": replaced(UNKNOWN, thresholds=())}, "unknown.thresholds: 0 values, neither 1"),
-        ({"candidates": (PROMISE, replaced(PROMISE, coverage=1.0))},
+        ({"candidates": (RULE, replaced(RULE, coverage=1.0))},
          r"candidates\[1\].coverage is 1, not between 0 and 1"),
-        ({"candidates": (replaced(PROMISE, quantiles=(0.1,)),)},
+        ({"candidates": (replaced(RULE, quantiles=(0.1,)),)},
          r"candidates\[0\].quantiles: 1 values for 4 steps"),
-        ({"candidates": (replaced(PROMISE, objects=0),)}, r"candidates\[0\].objects is 0, must be"),
-        ({"candidates": (replaced(PROMISE, noise=-1.0),)}, r"candidates\[0\].noise is -1, must be"),
+        ({"candidates": (replaced(RULE, objects=0),)}, r"candidates\[0\].objects is 0, must be"),
+        ({"candidates": (replaced(RULE, noise=-1.0),)}, r"candidates\[0\].noise is -1, must be"),
         ({"kind": "window"}, "a window has no state"),
         ({"kind": "film"}, r"Invalid enum value 'film'.*kind"),
     ],
@@ -349,7 +349,7 @@ def test_sensor_and_rules_come_back_as_they_were_written(tmp_path: Path) -> None
     given = {
         "sensor": {"rate_hz": 80.0, "range": {"bx": [-0.1, 0.1]}, "noise_density": None},
         "unknown": UNKNOWN,
-        "candidates": (PROMISE, replaced(PROMISE, coverage=0.8, noise=1.0)),
+        "candidates": (RULE, replaced(RULE, coverage=0.8, noise=1.0)),
     }
     path = write_model(tmp_path / "m.onnx", **given)
     session, card = load_model(path)

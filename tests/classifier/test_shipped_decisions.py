@@ -27,7 +27,7 @@ def decide() -> dict[str, np.ndarray]:
         "t_ns": np.array([one.t_ns for one in made]),
         "step": np.array([one.step for one in made]),
         "probabilities": np.array([one.probabilities for one in made], np.float32),
-        "candidates": np.array([",".join(one.candidates) for one in made]),
+        "prediction_set": np.array([",".join(one.prediction_set) for one in made]),
     }
 
 

@@ -21,7 +21,7 @@ from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stre
 
 TOUCHES = [(start, start + 60, 1.0) for start in range(QUIET, 900, 110)]
 VALUES = signal(TOUCHES, 950)
-FACTS = ("onset_ns", "t_ns", "step", "final", "label", "candidates", "coverage")
+FACTS = ("onset_ns", "t_ns", "step", "final", "label", "prediction_set", "coverage")
 
 
 @pytest.fixture(scope="module", autouse=True)

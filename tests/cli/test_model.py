@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
+from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
 from tactile_rt.classifier.model_file import (
     load_model,
     probe_logits,
@@ -52,12 +52,12 @@ def test_show_says_what_the_shipped_model_is(call):
 
 
 def test_show_says_what_the_file_knows_of_sensor_and_rules(call, tmp_path):
-    promise = CandidateRule("1 - posterior", 0.95, (0.9,) * 4, 200)
+    rule = PredictionSetRule("1 - posterior", 0.95, (0.9,) * 4, 200)
     path = write_model(
         tmp_path / "m.onnx",
         sensor={"rate_hz": 80.0, "note": "\x1b[2J"},
         unknown=UnknownRule("entropy", "logits", (1.0, 1.0, 1.5, 2.0)),
-        candidates=(promise, replace(promise, coverage=0.8, noise=1.0)),
+        candidates=(rule, replace(rule, coverage=0.8, noise=1.0)),
     )
     code, out, err = call("model", "show", path)
     assert (code, err) == (0, "")
@@ -66,13 +66,13 @@ def test_show_says_what_the_file_knows_of_sensor_and_rules(call, tmp_path):
         "embedding 2 units",
         "sensor rate_hz: 80 note: ?[2J",
         "unknown entropy of the logits above 1 to 2, by step",
-        "candidates 95 % by 1 - posterior, of 200 objects",
+        "prediction sets 95 % by 1 - posterior, of 200 objects",
         "80 % by 1 - posterior, of 200 objects up to 1 x the rated noise",
     ):
         assert said in words
     _, out, _ = call("model", "show", write_model(path, unknown=UnknownRule("x", "logits", (1.0,))))
     assert "unknown x of the logits above 1 probe" in " ".join(out.split())
-    assert "candidates" not in out
+    assert "prediction set" not in out
 
 
 REMEMBERS = GRAPH.replace("Where(known, load, none)", "Where(known, load, load)")

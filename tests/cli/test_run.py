@@ -25,7 +25,7 @@ def test_run_prints_every_step_of_an_episode(call):
     assert [line["final"] for line in lines] == [False] * 21 + [True]
     for line in lines:
         assert list(line) == [
-            "type", "t_ns", "onset_ns", "step", "final", "label", "probabilities", "candidates",
+            "type", "t_ns", "onset_ns", "step", "final", "label", "probabilities", "prediction_set",
             "coverage", "latency_ms",
         ]  # fmt: skip
         assert line["type"] == "classification"

@@ -237,7 +237,8 @@ def test_names_that_are_markup_stay_text(tab, port):
         one.has("document.getElementById('label').textContent.startsWith('<img')")
         one.has("document.getElementById('events').textContent.includes('onerror')")
         assert one.page.locator("img").count() == 0
-        assert "one of: <img" in one.text("#candidates") and "90 % of" in one.text("#candidates")
+        possible = one.text("#prediction-set")
+        assert "one of: <img" in possible and "90 % coverage" in possible
         assert "<img" in one.text("#degraded") and "<img" in one.text("#parts")
         assert one.page.title() == f"{EVIL} · tactile_rt"
         assert {url.rpartition("/")[2].partition("?")[0] for url in one.asked} <= {

@@ -50,14 +50,14 @@ def test_what_is_told_apart_is_all_categories_and_then_the_refusals(run):
     assert 0 <= saved["metrics"]["validation_top1"] <= 1
 
 
-def test_the_exported_file_refuses_and_promises(run, tmp_path, call):
+def test_the_exported_file_refuses_and_has_prediction_sets(run, tmp_path, call):
     code, _, said = call("export", run / "best.pt", tmp_path / "m.onnx")
     assert not code, said
     _, card = load_model(tmp_path / "m.onnx")
     assert card.classes == ("ball", "cube", "cone", "star")
     assert card.refusals == (UNKNOWN, *IMPLAUSIBLE)
     assert len(card.unknown.thresholds) == 22
-    assert card.candidates == (), "five objects are too few to promise anything"
+    assert card.candidates == (), "five objects are too few for any prediction set"
     assert len(card.provenance["also"]) == 1
     unseen = card.provenance["unseen_objects"]  # of the first set
     assert unseen and not any(name.startswith("star") for name in unseen)

@@ -91,7 +91,7 @@ def test_the_model_is_of_the_array_that_was_described(folder: Path) -> None:
     assert not read_skipped(folder / "whiskers" / "build" / "sweeps")
 
 
-def test_the_report_tells_what_it_promises(folder: Path) -> None:
+def test_the_report_tells_what_it_measured(folder: Path) -> None:
     page = (folder / "whiskers" / "report" / "report.html").read_text()
     for said in (
         "8 whiskers, my (N m), mz (N m)",

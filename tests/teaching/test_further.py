@@ -47,7 +47,7 @@ def test_the_file_is_a_model_like_any_other(base, taught):
     path, _ = taught
     card = load_model(path)[1]
     assert card.labels == (*base.card.classes, "goblet", "teapot", *base.card.refusals)
-    assert not card.candidates, "it promised them of its own classes"
+    assert not card.candidates, "they were those of its own classes"
     assert any(line.startswith("parity") for line in verify_model(path))
     Classifier(path, base.spec)
     assert path.stat().st_size < 5e6

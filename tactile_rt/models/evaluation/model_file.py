@@ -18,7 +18,7 @@ from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.promises import familiarity, named_faults, promises
+from tactile_rt.models.evaluation.coverage import familiarity, measure_coverage, named_faults
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.models.evaluation.robustness import (
     measure_robustness,
@@ -121,7 +121,7 @@ def evaluate_model(
         if quick:
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
         records.append(_open_set(model, unknown, test))
-    records += _refusals_and_candidates(model, test, unknown, sample)
+    records += _measure_coverage(model, test, unknown, sample)
     if svm:
         right = measures.hits(clean[:, -1], labels)
         records += _compare_svm(data, card, test, right)
@@ -233,27 +233,29 @@ def _calibration(
     return records
 
 
-def _refusals_and_candidates(
+def _measure_coverage(
     model: Path, test: SweepSet, unknown: SweepSet | None, sample: str
 ) -> list[Record]:
-    """What becomes of a model's promises; nothing of one that makes none."""
+    """Measure coverage and refusals; nothing of a model without them."""
     records, refusals = [], set(load_model(model)[1].refusals)
     for noise, when in ((0.0, ""), (1.0, " at rated noise")):
-        found = promises(model, test, Disturbance(noise=noise))
+        found = measure_coverage(model, test, Disturbance(noise=noise))
         if found is None:
             return []
-        if found.coverage == found.coverage:
-            how = f"promised: {100 * found.coverage:g} %; {sample}"
-            records.append(_record(f"truth always among the candidates{when}", found.kept, "", how))
+        if found.nominal == found.nominal:
+            how = f"nominal: {100 * found.nominal:g} %; {sample}"
+            records.append(
+                _record(f"coverage of the prediction sets{when}", found.covered, "", how)
+            )
             size = found.size
             interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
-            name = f"models.candidates at the last step{when}"
+            name = f"models.prediction set at the last step{when}"
             records.append(Record(name, size.value, "", "", interval, sample))
         if UNKNOWN in refusals:
             records.append(_record(f"known things called unknown{when}", found.unknown, "", sample))
         if refusals - {UNKNOWN}:
             records.append(_record(f"sound loads called faulty{when}", found.faulty, "", sample))
-    if unknown is not None and (found := promises(model, unknown)):
+    if unknown is not None and (found := measure_coverage(model, unknown)):
         how = f"{len(unknown.sweeps)} sweeps of withheld kinds"
         records.append(_record("unknown things called unknown", found.unknown, "", how))
     for name, share in named_faults(model, test):

@@ -59,7 +59,7 @@ class _Decision(_Told):
     final: bool = False
     label: str = ""
     probabilities: dict[str, float] = {}
-    candidates: list[str] = []
+    prediction_set: list[str] = []
     coverage: float | None = None
     model_ms: float = 0.0
     latency_ms: float = 0.0
@@ -88,7 +88,8 @@ def decision_message(text: bytes) -> bytes:
             "header": said.header(), "source": said.source, "model": said.model,
             "t_ns": said.t_ns, "onset_ns": said.onset_ns, "step": said.step,
             "is_final": said.final, "label": said.label, "labels": list(said.probabilities),
-            "probabilities": list(said.probabilities.values()), "candidates": said.candidates,
+            "probabilities": list(said.probabilities.values()),
+            "prediction_set": said.prediction_set,
             "coverage": math.nan if said.coverage is None else said.coverage,
             "model_ms": said.model_ms, "latency_ms": said.latency_ms, "age_ms": said.age_ms,
             "late": said.late, "json": text.decode(),

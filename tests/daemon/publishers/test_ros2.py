@@ -75,7 +75,7 @@ def test_each_message_comes_to_its_topic_as_its_type():
     assert told.header == ros2_node.HeaderMsg(ros2_node.TimeMsg(1_700_000_000, 1000), "mount")
     assert (told.source, told.model, told.label, told.step) == ("whiskers", "whiskers", "mug", 2)
     assert dict(zip(told.labels, told.probabilities, strict=True)) == {"duck": 0.25, "mug": 0.75}
-    assert np.isnan(told.coverage) and told.candidates == [] and not told.is_final
+    assert np.isnan(told.coverage) and told.prediction_set == [] and not told.is_final
     assert (touched.type, touched.part, touched.touching) == ("contact", "whiskers", True)
     assert (health.type, health.state, health.reason, health.level) == (
         "health", "running", "why", "error",

@@ -152,12 +152,12 @@ def test_json_of_any_kind_stays_whole_and_tells_what_it_can(text):
         assert messages.json_of(kind, make(text)) == text
 
 
-def test_a_decision_s_promise_and_probabilities():
+def test_a_decision_s_prediction_set_and_probabilities():
     said = {"type": "decision", "probabilities": {"a": 0.25, "b": 0.75}, "coverage": 0.9,
-            "candidates": ["b"], "final": True, "t_ns": 2, "utc_ns": 10**9 + 7}  # fmt: skip
+            "prediction_set": ["b"], "final": True, "t_ns": 2, "utc_ns": 10**9 + 7}  # fmt: skip
     found = cdr.decode(messages.DECISION, messages.decision_message(msgspec.json.encode(said)))
     assert (found["labels"], found["probabilities"]) == (["a", "b"], [0.25, 0.75])
-    assert (found["coverage"], found["candidates"], found["is_final"]) == (0.9, ["b"], True)
+    assert (found["coverage"], found["prediction_set"], found["is_final"]) == (0.9, ["b"], True)
     assert found["header"]["stamp"] == {"sec": 1, "nanosec": 7}
     none = cdr.decode(messages.DECISION, messages.decision_message(b'{"coverage": null}'))
     assert math.isnan(none["coverage"])

@@ -4,7 +4,7 @@ import { classColour, drawMap, drawProbabilities, drawTraces, layout, readColour
   from "./draw.js";
 import { Stream } from "./stream.js";
 
-const WINDOW_S = 10, STACKED = 6, CANDIDATES = 8, EVENTS = 60, STEP_MS = 60;
+const WINDOW_S = 10, STACKED = 6, SET_SHOWN = 8, EVENTS = 60, STEP_MS = 60;
 const HALF_LIFE_MS = 20000; // of the map's scale after a strong touch
 const $ = (id) => document.getElementById(id);
 
@@ -77,7 +77,7 @@ const take = {
     const last = decisions.findLast((d) => d.model === m.model);
     const from = last && last.onset === onset ? last.t : Math.max(onset, t - STEP_MS);
     decisions.push({ t, from, onset, model: m.model, step: m.step, final: m.final, label: m.label,
-      p: m.probabilities, candidates: m.candidates || [], coverage: m.coverage });
+      p: m.probabilities, prediction_set: m.prediction_set || [], coverage: m.coverage });
     if (decisions.length > 2000) decisions.splice(0, 1000);
     dirty = true;
   },
@@ -406,9 +406,9 @@ function draw() {
 }
 
 function possible(decision) {
-  const names = decision.candidates, shown = names.slice(0, CANDIDATES);
+  const names = decision.prediction_set, shown = names.slice(0, SET_SHOWN);
   const more = names.length > shown.length ? ` and ${names.length - shown.length} more` : "";
-  return `if it is of a known kind, one of: ${shown.join(", ")}${more} (${Math.round(100 * decision.coverage)} % of touches keep to this)`;
+  return `if it is of a known kind, one of: ${shown.join(", ")}${more} (${Math.round(100 * decision.coverage)} % coverage)`;
 }
 
 function decide(now) {
@@ -438,7 +438,7 @@ function decide(now) {
   $("episode").textContent = !about ? "" : touching
     ? `in contact${last ? `, step ${last.step}${last.final ? " (last)" : ""}` : ""}`
     : last ? `no contact; decided ${Math.max(0, (now - last.t) / 1000).toFixed(0)} s ago` : "no contact yet";
-  $("candidates").textContent = last && last.candidates.length ? possible(last) : "";
+  $("prediction-set").textContent = last && last.prediction_set.length ? possible(last) : "";
   const top = last ? Object.entries(last.p).sort((a, b) => b[1] - a[1]).slice(0, 5) : [];
   const list = $("top");
   while (list.children.length < 5) {

@@ -1,4 +1,4 @@
-"""What a model file says of its own decisions, held against what it does: refusals, candidates."""
+"""What a model file says of its own decisions, held against what it does: coverage, refusals."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,33 +17,35 @@ from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-__all__ = ["Promises", "familiarity", "named_faults", "promises"]
+__all__ = ["Coverage", "familiarity", "measure_coverage", "named_faults"]
 
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
-class Promises:
-    """What became of a model's promises on a test.
+class Coverage:
+    """The coverage and the refusals of a model on a test.
 
     Attributes:
-        coverage: The share of touches that is promised, 0 to 1; NaN without a promise.
-        kept: The share of the sweeps of kinds that it knows, and in which it found a contact, of
-            which the true kind was a candidate at every step.
-        size: The mean number of candidates at the last step of these.
+        nominal: The coverage that the model file tells, 0 to 1; NaN without prediction sets.
+        covered: The share of the sweeps of kinds that it knows, and in which it found a contact, of
+            which the true kind was in the prediction set of every step.
+        size: The mean number of classes in the prediction set at the last step of these.
         unknown: The share of the sweeps that it calls unknown.
         faulty: The share that it refuses for what is wrong with the loads.
     """
 
-    coverage: float
-    kept: Interval
+    nominal: float
+    covered: Interval
     size: Interval
     unknown: Interval
     faulty: Interval
 
 
-def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Promises | None:
-    """What becomes of them on a test; None if the model makes none.
+def measure_coverage(
+    path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
+) -> Coverage | None:
+    """Measure coverage and refusals on a test; None of a model without either.
 
     Args:
         test: the sweeps, labelled by the model's classes; those of none (-1) are only refused or
@@ -60,16 +62,16 @@ def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Pr
     faulty = measures.accuracy(np.isin(said, faults), objects)
     rule = fitting(card.candidates, disturbance.noise)
     if rule is None or (labels < 0).any():
-        return Promises(float("nan"), NOTHING, NOTHING, unknown, faulty)
+        return Coverage(float("nan"), NOTHING, NOTHING, unknown, faulty)
     found = np.flatnonzero(~np.isnan(posteriors[:, 0, 0]))
     labels, objects = labels[found], objects[found]
     inside, sizes = np.zeros(len(labels), dtype=np.bool_), np.zeros(len(labels))
     for k, at in enumerate(found):
         own = posteriors[at][:, : len(card.classes)]
-        left = [rule.candidates(p, step) for step, p in enumerate(own, start=1)]
+        left = [rule.prediction_set(p, step) for step, p in enumerate(own, start=1)]
         inside[k] = all(labels[k] in names for names in left)
         sizes[k] = len(left[-1])
-    return Promises(
+    return Coverage(
         rule.coverage,
         measures.accuracy(inside, objects),
         measures.bootstrap(lambda at: float(sizes[at].mean()), objects),

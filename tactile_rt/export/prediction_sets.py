@@ -1,13 +1,13 @@
-"""What a model file promises, fitted on sweeps that its network has not learnt from.
+"""Prediction sets and refusals, fitted on sweeps that the network has not learnt from.
 
-Candidates are conformal: the truth is among them at every step for as many touches of new objects
-as was promised, whatever the network makes of them, as long as these are drawn as those were that
-the rule was fitted on (Vovk, Gammerman & Shafer 2005). Sweeps of one object are alike, so that an
-object counts once, however often it was swept (Lee, Barber & Willett 2023, hierarchical conformal
-prediction). A robot may stop at any step, so that the promise is about all of them at once: a
-sweep's score is that of its worst step. What is usual at a step, which steps are compared by, is
-told by half of the objects; the other half, for which that is given, tells how far a sweep may be
-from it.
+Prediction sets are conformal: the truth is in that of every step for as many touches of new objects
+as the coverage says, whatever the network makes of them, as long as these are drawn as those were
+that the rule was fitted on (Vovk, Gammerman & Shafer 2005). Sweeps of one object are alike, so that
+an object counts once, however often it was swept (Lee, Barber & Willett 2023, hierarchical
+conformal prediction). A robot may stop at any step, so that the coverage is that of all of them at
+once: a sweep's score is that of its worst step. What is usual at a step, which steps are compared
+by, is told by half of the objects; the other half, for which that is given, tells how far a sweep
+may be from it.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ from tactile_rt.classifier.decision_rules import (
     MASS_ABOVE,
     POSTERIOR,
     UNKNOWN,
-    CandidateRule,
+    PredictionSetRule,
     UnknownRule,
     mass_above,
 )
@@ -28,12 +28,12 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation.measures import Step, at_temperature, predict
 
-__all__ = ["COVERAGE", "fit_candidates", "fit_unknown", "fitted_rules"]
+__all__ = ["COVERAGE", "fit_prediction_sets", "fit_unknown", "fitted_rules"]
 
 COVERAGE = 0.95
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
 LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
-FEWEST = 50  # objects below which no promise is made: it would leave nearly all classes possible
+FEWEST = 50  # objects below which there is no rule: nearly all classes would be in each set
 USUAL = 0.9  # the share of sweeps that are no worse than what is usual at a step
 SMALLEST = 0.05  # what is usual, at least: where nearly all sweeps are right, it would be nothing
 # A rule holds up to a noise, in units of the rated, and is fitted at the ends of its range.
@@ -45,12 +45,12 @@ Floats = NDArray[np.float64]
 
 def fitted_rules(
     sets: Sequence[SweepSet], run: Step, temperature: float, labels: Sequence[str], classes: int
-) -> tuple[UnknownRule | None, tuple[CandidateRule, ...]]:
+) -> tuple[UnknownRule | None, tuple[PredictionSetRule, ...]]:
     """The rules of a model.
 
     Args:
-        sets: labelled sweeps that it has not learnt from, as groups of which each is to be kept
-            the promise.
+        sets: labelled sweeps that it has not learnt from, as groups of which each is to have
+            the coverage.
         run: (samples, offset, sigma) of windows to (batch, step, label) logits.
         classes: how many of the labels are classes; the others are refusals.
     """
@@ -79,7 +79,7 @@ def fitted_rules(
             )
             for k, one in enumerate(sets)
         ]
-        if (rule := fit_candidates(drawn, bound)) is not None:
+        if (rule := fit_prediction_sets(drawn, bound)) is not None:
             rules.append(rule)
     return unknown, tuple(rules)
 
@@ -108,12 +108,12 @@ def fit_unknown(
     return UnknownRule(POSTERIOR, "logits", tuple(float(t) for t in thresholds))
 
 
-def fit_candidates(
+def fit_prediction_sets(
     groups: Sequence[tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.str_]]],
     noise: float,
     coverage: float = COVERAGE,
-) -> CandidateRule | None:
-    """The quantiles that keep the promise to each of the groups; None if one has too few objects.
+) -> PredictionSetRule | None:
+    """Fit the quantiles of a coverage in each group; None if one has too few objects.
 
     Args:
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)
@@ -140,7 +140,7 @@ def fit_candidates(
             )
         )
     quantiles = np.max(fitted, axis=0)
-    return CandidateRule(
+    return PredictionSetRule(
         MASS_ABOVE, coverage, tuple(float(q) for q in quantiles), len(objects), noise=noise
     )
 
@@ -158,7 +158,7 @@ def _touched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     if not kept:
         raise RecordingError(
             "in no validation sweep a contact was found and answered by numbers, so that nothing "
-            "can be promised: are the loads of the sweep set in SI units? did training converge?"
+            "can be fitted: are the loads of the sweep set in SI units? did training converge?"
         )
     return kept
 

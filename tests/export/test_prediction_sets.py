@@ -1,11 +1,11 @@
-"""What a model promises holds on draws that it was not fitted on."""
+"""The coverage of a rule holds on draws that it was not fitted on."""
 
 import numpy as np
 import pytest
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, mass_above
 from tactile_rt.core.errors import RecordingError
-from tactile_rt.export.promises import fit_candidates, fit_unknown
+from tactile_rt.export.prediction_sets import fit_prediction_sets, fit_unknown
 
 STEPS, CLASSES = 22, 10
 
@@ -25,7 +25,7 @@ def objects(
 
 def kept(rule, posteriors: np.ndarray, labels: np.ndarray) -> float:
     inside = [
-        all(labels[k] in rule.candidates(p, step) for step, p in enumerate(steps, start=1))
+        all(labels[k] in rule.prediction_set(p, step) for step, p in enumerate(steps, start=1))
         for k, steps in enumerate(posteriors)
     ]
     return float(np.mean(inside))
@@ -33,36 +33,36 @@ def kept(rule, posteriors: np.ndarray, labels: np.ndarray) -> float:
 
 @pytest.mark.parametrize("sweeps", [1, 4])
 @pytest.mark.parametrize("coverage", [0.8, 0.95])
-def test_the_truth_is_among_the_candidates_at_every_step_as_often_as_promised(
+def test_the_truth_is_in_the_prediction_set_at_every_step_as_often_as_its_coverage_says(
     coverage: float, sweeps: int
 ) -> None:
     rng = np.random.default_rng(0)
     found = []
     for _ in range(40):
-        rule = fit_candidates([objects(rng, 60, sweeps)], noise=1.0, coverage=coverage)
+        rule = fit_prediction_sets([objects(rng, 60, sweeps)], noise=1.0, coverage=coverage)
         found.append(kept(rule, *objects(rng, 40)[:2]))
     # one figure strays by the objects that its rule was fitted on, the mean by a sixth of it
     assert coverage - 0.015 < np.mean(found) < coverage + 0.04
     assert rule.objects == 60 and rule.noise == 1.0
 
 
-def test_the_promise_is_kept_to_the_harder_group() -> None:
+def test_the_coverage_is_that_of_the_harder_group() -> None:
     rng = np.random.default_rng(1)
     hard = objects(rng, 200)
     easy = objects(rng, 200)
     easy[0][:] = 0.001
     easy[0][np.arange(800), :, easy[1]] = 0.991
-    alone = fit_candidates([hard], 1.0)
-    both = fit_candidates([easy, hard], 1.0)
+    alone = fit_prediction_sets([hard], 1.0)
+    both = fit_prediction_sets([easy, hard], 1.0)
     # of one name, as where some objects are in two sets
     assert both.quantiles == pytest.approx(alone.quantiles) and both.objects == 200
 
 
-def test_too_few_objects_make_no_promise() -> None:
+def test_too_few_objects_make_no_prediction_set() -> None:
     rng = np.random.default_rng(0)
     few, enough = objects(rng, 49), objects(rng, 90)
-    assert fit_candidates([few], 1.0) is None
-    assert fit_candidates([enough, few], 1.0) is None, "it would not be kept to all"
+    assert fit_prediction_sets([few], 1.0) is None
+    assert fit_prediction_sets([enough, few], 1.0) is None, "it would not be kept to all"
 
 
 def test_sweeps_without_contact_do_not_count() -> None:
@@ -70,12 +70,12 @@ def test_sweeps_without_contact_do_not_count() -> None:
     with_gaps = posteriors.copy()
     with_gaps[::4] = np.nan
     kept_of = np.arange(len(labels)) % 4 > 0
-    same = fit_candidates([(posteriors[kept_of], labels[kept_of], names[kept_of])], 1.0)
-    assert fit_candidates([(with_gaps, labels, names)], 1.0) == same
+    same = fit_prediction_sets([(posteriors[kept_of], labels[kept_of], names[kept_of])], 1.0)
+    assert fit_prediction_sets([(with_gaps, labels, names)], 1.0) == same
     silent = np.full_like(posteriors, np.nan), labels, names
-    assert fit_candidates([silent, (with_gaps, labels, names)], 1.0) == same
+    assert fit_prediction_sets([silent, (with_gaps, labels, names)], 1.0) == same
     with pytest.raises(RecordingError, match="in no validation sweep a contact was found"):
-        fit_candidates([silent], 1.0)
+        fit_prediction_sets([silent], 1.0)
 
 
 def test_known_kinds_are_refused_no_more_than_said() -> None:

@@ -1,4 +1,4 @@
-"""What a model promises is counted as it is decided."""
+"""The coverage of a model is counted as it is decided."""
 
 from pathlib import Path
 
@@ -8,11 +8,11 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
-from tactile_rt.classifier.decision_rules import MASS_ABOVE, POSTERIOR, UNKNOWN, CandidateRule
+from tactile_rt.classifier.decision_rules import MASS_ABOVE, POSTERIOR, UNKNOWN, PredictionSetRule
 from tactile_rt.classifier.decision_rules import UnknownRule as Rule
 from tactile_rt.core.stream import Timing
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation.promises import named_faults, promises
+from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import Sweeps
 from tactile_rt.testing import small_spec
@@ -42,35 +42,37 @@ def model(tmp_path: Path, **changes: object) -> Path:
     return write_model(tmp_path / "m.onnx", labels=LABELS, refusals=LABELS[3:], **changes)
 
 
-def test_a_model_without_refusals_promises_nothing(tmp_path: Path) -> None:
-    assert promises(write_model(tmp_path / "m.onnx"), touched(0.1, labels=(1,))) is None
+def test_a_model_without_refusals_has_no_coverage(tmp_path: Path) -> None:
+    assert measure_coverage(write_model(tmp_path / "m.onnx"), touched(0.1, labels=(1,))) is None
 
 
-def test_what_is_kept_is_the_truth_among_the_candidates_of_every_step(tmp_path: Path) -> None:
+def test_covered_is_what_has_the_truth_in_the_prediction_set_of_every_step(tmp_path: Path) -> None:
     # of 0.1 "late" is most probable at every step, of 10 "strong"
     data = touched(0.1, 10.0, 10.0, labels=(1, 2, 1))
-    narrow = CandidateRule(MASS_ABOVE, 0.9, (0.0,) * STEPS, 80)
-    found = promises(model(tmp_path, candidates=(narrow,)), data)
-    assert (found.coverage, found.kept.value, found.size.value) == (0.9, 2 / 3, 1.0)
+    narrow = PredictionSetRule(MASS_ABOVE, 0.9, (0.0,) * STEPS, 80)
+    found = measure_coverage(model(tmp_path, candidates=(narrow,)), data)
+    assert (found.nominal, found.covered.value, found.size.value) == (0.9, 2 / 3, 1.0)
     wide = replace_quantiles(narrow, 1.0)
-    found = promises(model(tmp_path, candidates=(wide,)), data)
-    assert (found.kept.value, found.size.value) == (1.0, 3.0)
+    found = measure_coverage(model(tmp_path, candidates=(wide,)), data)
+    assert (found.covered.value, found.size.value) == (1.0, 3.0)
     first = replace_quantiles(narrow, 1.0, first=0.0)  # one step is enough to break it
-    assert promises(model(tmp_path, candidates=(first,)), data).kept.value == 2 / 3
+    assert measure_coverage(model(tmp_path, candidates=(first,)), data).covered.value == 2 / 3
 
 
-def replace_quantiles(rule: CandidateRule, q: float, first: float | None = None) -> CandidateRule:
+def replace_quantiles(
+    rule: PredictionSetRule, q: float, first: float | None = None
+) -> PredictionSetRule:
     quantiles = (q if first is None else first, *(q,) * (STEPS - 1))
-    return CandidateRule(rule.score, rule.coverage, quantiles, rule.objects)
+    return PredictionSetRule(rule.score, rule.coverage, quantiles, rule.objects)
 
 
 def test_things_of_no_known_kind_are_counted_as_refused_or_not(tmp_path: Path) -> None:
     strange = touched(0.1, 0.1, labels=(-1, -1))
     for threshold, share in ((1.0, 0.0), (0.0, 1.0)):
         rule = Rule(POSTERIOR, "logits", (threshold,))
-        found = promises(model(tmp_path, unknown=rule), strange)
+        found = measure_coverage(model(tmp_path, unknown=rule), strange)
         assert found.unknown.value == share
-        assert np.isnan(found.kept.value) and np.isnan(found.coverage)
+        assert np.isnan(found.covered.value) and np.isnan(found.nominal)
 
 
 def test_a_fault_is_named_where_a_label_that_is_one_is_decided(tmp_path: Path) -> None:
@@ -84,7 +86,9 @@ def test_a_fault_is_named_where_a_label_that_is_one_is_decided(tmp_path: Path) -
     assert named == {"wrong gain": 1.0, "turned channels": 0.0}  # turned, they are not strong
 
 
-def test_touches_that_are_not_found_break_no_promise(tmp_path: Path) -> None:
-    all_classes = CandidateRule(MASS_ABOVE, 0.9, (1.0,) * STEPS, 80)
-    found = promises(model(tmp_path, candidates=(all_classes,)), touched(0.1, 0.0, labels=(1, 1)))
-    assert (found.kept.value, found.size.value) == (1.0, 3.0)
+def test_touches_that_are_not_found_count_against_no_coverage(tmp_path: Path) -> None:
+    all_classes = PredictionSetRule(MASS_ABOVE, 0.9, (1.0,) * STEPS, 80)
+    found = measure_coverage(
+        model(tmp_path, candidates=(all_classes,)), touched(0.1, 0.0, labels=(1, 1))
+    )
+    assert (found.covered.value, found.size.value) == (1.0, 3.0)
