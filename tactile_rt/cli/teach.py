@@ -46,12 +46,14 @@ def teach(
     ] = "",
     model: Annotated[
         str,
-        typer.Option(help="Teach this model further classes: an .onnx file, or `shipped`."),
+        typer.Option(
+            help="Class-incremental: teach this model (an .onnx file, or `shipped`) new classes."
+        ),
     ] = "",
     seconds: Seconds = None,
     json: Json = None,
 ) -> None:
-    """Touch it ten times a class, and it knows the classes: FOLDER/model.onnx.
+    """Touch it ten times a class (few-shot), and it knows the classes: FOLDER/model.onnx.
 
     Keep the sensor untouched for two seconds, then touch as you are told. A line is an order: a
     class's name or number, n (next), u (undo: takes the last touch back), or q (done: learns and
@@ -97,7 +99,7 @@ def teach(
         "model": folder / MODEL,
         "classes": card.classes,
         "touches": {name: lesson.count(name) for name in learnt},
-        "left_out_touches_right": {
+        "leave_one_out_right": {
             name: {"right": good, "of": count} for name, count, good in teacher.progress.classes
         },
         "corrupt": opened.stats.corrupt,
@@ -220,7 +222,7 @@ def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":
     """The lesson that a folder holds; None: none.
 
     Args:
-        base: the model that is taught further classes, if one is.
+        base: the model that is taught new classes, if one is.
     """
     from tactile_rt.classifier.model_file import hash_of
     from tactile_rt.teaching.lesson import FEATURES, Lesson

@@ -1,8 +1,8 @@
-"""Teaching: a few touches of each class, on any sensor, become a model, on the robot itself.
+"""Few-shot teaching: some touches of each class, on any sensor, become a model, on the robot.
 
     Source --> Classifier(features.onnx) --> Lesson --> model.onnx     (`tactile-rt teach`)
 
-`lesson` keeps touches and what each was; `features` and `head` are what is learnt with, `further`
-what a network is taught beside what it knows; `model` and `onnx_bytes` write the file; `teacher`
-and `page` lead whoever touches. Nothing here needs torch, or the package onnx.
+`lesson` keeps touches and what each was; `features` and `head` are what is learnt with,
+`class_incremental` what a network is taught beside what it knows; `model` and `onnx_bytes` write
+the file; `teacher` and `page` lead whoever touches. Nothing here needs torch, or the package onnx.
 """

@@ -4,7 +4,7 @@ At every step, a class is the mean of its touches' features, and all classes sha
 one class differ: a covariance of few directions, and of the same small variance in all others
 (probabilistic principal components: Tipping & Bishop 1999, doi:10.1111/1467-9868.00196). A
 decision is the nearest mean by that measure; what is far from all of them is unknown. How far a
-touch of a class may be from its mean is learnt from touches that are left out in turn.
+touch of a class may be from its mean is learnt leave-one-out.
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["FEWEST", "LeftOut", "TouchClasses", "check_enough", "fit_classes", "leave_out"]
+__all__ = ["FEWEST", "LeaveOneOut", "TouchClasses", "check_enough", "fit_classes", "leave_one_out"]
 
 FEWEST = 2  # touches of a class
 AXES = 16  # directions in which touches of a class differ
 SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction
 FOLDS = 10
-REFUSED = 0.06  # of the touches that were left out, at most, are taken for unknown
+REFUSED = 0.06  # of the touches, leave-one-out, at most, are taken for unknown
 MAD, FARTHEST = 1.4826, 2.5  # standard deviations of the logarithm of the distance, at most
 LIMIT = 5.0  # standardised features are limited to, either way: one outlier is not the decision
 # A feature's scale is no less than so many times the median one of its kind, and than this share
@@ -68,8 +68,8 @@ class TouchClasses:
 
 
 @dataclass(frozen=True)
-class LeftOut:
-    """What was made of every touch when it was left out.
+class LeaveOneOut:
+    """What was made of every touch, leave-one-out: by the others alone.
 
     Attributes:
         distances: (touch, step, class) Squared distances from the classes of the others.
@@ -81,7 +81,10 @@ class LeftOut:
 
 
 def fit_classes(
-    features: Floats, labels: Sequence[str], kinds: Sequence[slice], left_out: LeftOut | None = None
+    features: Floats,
+    labels: Sequence[str],
+    kinds: Sequence[slice],
+    judged: LeaveOneOut | None = None,
 ) -> TouchClasses:
     """Learn classes.
 
@@ -89,14 +92,14 @@ def fit_classes(
         features: (touch, step, feature) of all touches.
         labels: (touch,) the class of each.
         kinds: which features are of one kind, and so of one scale.
-        left_out: what `leave_out` said of these touches; None: it is asked.
+        judged: what `leave_one_out` said of these touches; None: it is asked.
 
     Raises:
         ConfigError: a class with fewer than two touches.
     """
     check_enough(labels)
-    left_out = left_out or leave_out(features, labels, kinds)
-    nearest = left_out.distances.min(axis=2)  # (touch, step)
+    judged = judged or leave_one_out(features, labels, kinds)
+    nearest = judged.distances.min(axis=2)  # (touch, step)
     rank = min(len(labels) - 1, int(np.ceil((1 - REFUSED) * (len(labels) + 1))) - 1)
     # A touch under a wrong name is far from its class; it is not to let everything through.
     logs = np.log(nearest + TINY)
@@ -104,13 +107,13 @@ def fit_classes(
     spread = MAD * np.median(np.abs(logs - middle), axis=0)
     reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
-    temperature = _temperature(left_out.distances[:, -1], own)
+    temperature = _temperature(judged.distances[:, -1], own)
     names = tuple(str(name) for name in classes)
     return TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
 
 
-def leave_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeftOut:
-    """Leave every touch out in turn, a tenth of each class at a time, and learn from the others.
+def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeaveOneOut:
+    """Judge every touch by what is learnt from others: of many, a tenth of each class at a time.
 
     Args:
         features: (touch, step, feature) of all touches.
@@ -134,7 +137,7 @@ def leave_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -
             tuple(classes), *_shared(features[~out], own[~out], kinds), np.zeros(0), 1.0
         )
         distances[out] = learnt.distances(features[out])
-    return LeftOut(distances, distances[:, -1].argmin(axis=1) == own)
+    return LeaveOneOut(distances, distances[:, -1].argmin(axis=1) == own)
 
 
 def check_enough(labels: Sequence[str]) -> None:

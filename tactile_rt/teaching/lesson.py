@@ -5,7 +5,7 @@
 A lesson is a folder, so that it can be gone on with, looked at and corrected:
 
     features.onnx      what is looked at: the array, and its noise when the lesson began; or the
-                       network that is taught further classes
+                       network that is taught new classes
     session-1.mcap     everything that was felt, one recording each time
     labels.csv         which part of it was which touch; a line is written as a touch ends
     model.onnx         what was learnt: runs like any other model
@@ -38,10 +38,10 @@ from tactile_rt.recording.labels import (
     read_labels,
     remove_label,
 )
-from tactile_rt.teaching.further import check_further
-from tactile_rt.teaching.head import FEWEST, LeftOut
+from tactile_rt.teaching.class_incremental import check_new_classes
+from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
-from tactile_rt.teaching.model import TOUCH, Taught, TaughtFurther, write_features
+from tactile_rt.teaching.model import TOUCH, ClassIncremental, FewShot, write_features
 
 __all__ = [
     "BEFORE_NS",
@@ -87,7 +87,7 @@ class Lesson:
     """
 
     folder: Path
-    taught: Taught | TaughtFurther
+    taught: FewShot | ClassIncremental
     touches: list[TaughtTouch] = field(default_factory=list)
     lost: int = 0
 
@@ -104,13 +104,13 @@ class Lesson:
         """
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        taught = Taught(spec, floor)
+        taught = FewShot(spec, floor)
         write_features(folder / FEATURES, taught)
         return cls(folder, taught)
 
     @classmethod
     def on(cls, folder: Path, model: Path) -> "Lesson":
-        """A new lesson that teaches a network further classes.
+        """Begin a class-incremental lesson, that teaches a network new classes.
 
         Args:
             folder: where to; made if it is not there.
@@ -121,7 +121,7 @@ class Lesson:
             ModelError: the file cannot be used.
         """
         _check_free(folder)
-        taught = TaughtFurther(model)
+        taught = ClassIncremental(model)
         folder.mkdir(parents=True, exist_ok=True)
         data = model.read_bytes()
         write_whole(folder / FEATURES, lambda file: file.write(data))
@@ -140,9 +140,9 @@ class Lesson:
         card = load_model(path)[1]
         lesson = cls(
             folder,
-            Taught(card.array, np.array(card.floor, dtype=np.float32))
+            FewShot(card.array, np.array(card.floor, dtype=np.float32))
             if card.labels == (TOUCH,)
-            else TaughtFurther(path),
+            else ClassIncremental(path),
         )
         if (folder / LABELS).exists():
             lesson._read_touches()
@@ -220,8 +220,8 @@ class Lesson:
         Raises:
             ConfigError: no class of this lesson can be named so.
         """
-        if isinstance(self.taught, TaughtFurther):
-            check_further(self.taught.card, (label,))
+        if isinstance(self.taught, ClassIncremental):
+            check_new_classes(self.taught.card, (label,))
         return check_label(label)
 
     def count(self, label: str) -> int:
@@ -238,8 +238,8 @@ class Lesson:
         """The classes of which there are enough touches to learn from."""
         return tuple(name for name in self.labels if self.count(name) >= FEWEST)
 
-    def left_out(self) -> "LessonProgress":
-        """How well touches are told apart by the others, at their last step.
+    def leave_one_out(self) -> "LessonProgress":
+        """Judge every touch by the others alone, at its last step.
 
         Of one class alone no touch can be wrong, and none is counted as right.
         """
@@ -247,9 +247,9 @@ class Lesson:
         if not used:
             return LessonProgress((), (), ())
         names = [self.touches[k].label for k in used]
-        found = self.taught.left_out(self._features(used), names)
+        found = self.taught.leave_one_out(self._features(used), names)
         progress = _progress(used, names, found)
-        if isinstance(self.taught, Taught) and len(set(names)) < 2:
+        if isinstance(self.taught, FewShot) and len(set(names)) < 2:
             return replace(progress, classes=())
         return progress
 
@@ -279,7 +279,7 @@ class Lesson:
 
 @dataclass(frozen=True)
 class LessonProgress:
-    """How well touches are told apart when each is left out in turn.
+    """How well touches are told apart, leave-one-out.
 
     Attributes:
         classes: The name of each class, the number of its touches, and how many of them were
@@ -299,7 +299,7 @@ class LessonProgress:
         return sum(c[2] for c in self.classes), sum(c[1] for c in self.classes)
 
 
-def _progress(used: Sequence[int], names: Sequence[str], found: LeftOut) -> LessonProgress:
+def _progress(used: Sequence[int], names: Sequence[str], found: LeaveOneOut) -> LessonProgress:
     classes = np.unique(np.asarray(names))
     own = np.searchsorted(classes, names)
     distances = found.distances[:, -1]

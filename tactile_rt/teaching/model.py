@@ -26,19 +26,19 @@ from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_log
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing
-from tactile_rt.teaching.features import FeatureNetwork
-from tactile_rt.teaching.further import (
-    check_further,
-    fit_further,
-    further_card,
-    further_graph,
-    leave_out_further,
-    taught_features,
+from tactile_rt.teaching.class_incremental import (
+    check_new_classes,
+    extend_card,
+    extend_graph,
+    fit_new_classes,
+    join_features,
+    leave_one_out_new_classes,
 )
-from tactile_rt.teaching.head import LIMIT, LeftOut, TouchClasses, fit_classes, leave_out
+from tactile_rt.teaching.features import FeatureNetwork
+from tactile_rt.teaching.head import LIMIT, LeaveOneOut, TouchClasses, fit_classes, leave_one_out
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
 
-__all__ = ["FASTEST_NS", "TOUCH", "Taught", "TaughtFurther", "write_features", "write_taught"]
+__all__ = ["FASTEST_NS", "TOUCH", "ClassIncremental", "FewShot", "write_features", "write_few_shot"]
 
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
@@ -49,8 +49,8 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Taught:
-    """What a model that is taught is of.
+class FewShot:
+    """What is needed to learn a model few-shot, from a lesson alone.
 
     Attributes:
         floor: (channel,) The smallest noise that the contact detector assumes, in the channel's
@@ -79,21 +79,21 @@ class Taught:
         """(step, feature) of a touch, from what `write_features`' model said of it."""
         return np.stack([step.embedding for step in steps if step.embedding is not None])
 
-    def left_out(self, features: Floats, labels: Sequence[str]) -> LeftOut:
-        """What is made of touches, at their last step, when each is left out in turn."""
-        return leave_out(features[:, -1:], labels, self.network.kinds)
+    def leave_one_out(self, features: Floats, labels: Sequence[str]) -> LeaveOneOut:
+        """Judge every touch by the others alone, at its last step."""
+        return leave_one_out(features[:, -1:], labels, self.network.kinds)
 
     def learn(
         self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
     ) -> ModelCard:
         """Write the model of the classes of these touches (touch, step, feature)."""
-        return write_taught(
+        return write_few_shot(
             path, self, fit_classes(features, labels, self.network.kinds), name, told
         )
 
 
-class TaughtFurther:
-    """What a network is taught further classes of.
+class ClassIncremental:
+    """What is needed to teach a network new classes, class-incremental.
 
     Raises:
         ModelError: it cannot be used.
@@ -104,32 +104,32 @@ class TaughtFurther:
         self.card, _, self._data = read_model(model)
         self.spec = self.card.array
         self.floor = np.array(self.card.floor, dtype=np.float32)
-        check_further(self.card, ())
+        check_new_classes(self.card, ())
 
     def felt(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
         """(step, unit and label) of a touch, from what the model said of it."""
         embeddings = np.stack([step.embedding for step in steps if step.embedding is not None])
         posteriors = np.stack([step.probabilities for step in steps])
         logits = np.log(np.maximum(posteriors, TINY)) * np.float32(self.card.temperature)
-        return taught_features(embeddings, logits).astype(np.float32)
+        return join_features(embeddings, logits).astype(np.float32)
 
-    def left_out(self, features: Floats, labels: Sequence[str]) -> LeftOut:
-        """What is made of touches, at their last step, when each is left out in turn."""
-        return leave_out_further(self.card, features[:, -1], labels)
+    def leave_one_out(self, features: Floats, labels: Sequence[str]) -> LeaveOneOut:
+        """Judge every touch by the others alone, at its last step."""
+        return leave_one_out_new_classes(self.card, features[:, -1], labels)
 
     def learn(
         self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
     ) -> ModelCard:
         """Write the network with the classes of these touches beside its own."""
-        classes = fit_further(self.card, features[:, -1], labels)
-        card = further_card(self.card, classes)
+        classes = fit_new_classes(self.card, features[:, -1], labels)
+        card = extend_card(self.card, classes)
         card = msgspec.structs.replace(
             card, name=name, provenance={**card.provenance, **_made_by(), **told}
         )
-        return write_checked(path, further_graph(self._data, self.card, classes), card)
+        return write_checked(path, extend_graph(self._data, self.card, classes), card)
 
 
-def write_features(path: Path, taught: Taught) -> ModelCard:
+def write_features(path: Path, taught: FewShot) -> ModelCard:
     """Write the model of one class, of which the embedding are the features of a touch."""
     graph, network = OnnxGraph(), taught.network
     features, after = network.build(graph)
@@ -137,8 +137,8 @@ def write_features(path: Path, taught: Taught) -> ModelCard:
     return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
 
 
-def write_taught(
-    path: Path, taught: Taught, classes: TouchClasses, name: str, provenance: dict[str, Any]
+def write_few_shot(
+    path: Path, taught: FewShot, classes: TouchClasses, name: str, provenance: dict[str, Any]
 ) -> ModelCard:
     """Write the model of the classes; it appears whole or not at all."""
     graph, network = OnnxGraph(), taught.network
@@ -183,7 +183,7 @@ def _first(g: OnnxGraph, size: int) -> tuple[str, str, str]:
 
 def _write(
     path: Path,
-    taught: Taught,
+    taught: FewShot,
     graph: OnnxGraph,
     features: str,
     after: dict[str, str],

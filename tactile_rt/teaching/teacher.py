@@ -40,7 +40,7 @@ class Teacher:
     def __post_init__(self) -> None:
         for name in self.wanted:
             self.lesson.check(name)
-        self.progress = self.lesson.left_out()
+        self.progress = self.lesson.leave_one_out()
         self.label = next(iter(self._short()), "")
         self._planned = bool(self.label)
         self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
@@ -97,7 +97,7 @@ class Teacher:
         self.lesson.add(label, features, recording, span_s)
         said = [f"{len(self.lesson.touches):3d}  {label} {self.lesson.count(label)}"]
         before = set(self.progress.odd)
-        self.progress = self.lesson.left_out()
+        self.progress = self.lesson.leave_one_out()
         said.append(self._told_apart())
         said += [
             f"touch {number} is unlike the others of {self.lesson.touches[number - 1].label}"
@@ -153,7 +153,7 @@ class Teacher:
     def summary(self) -> Sequence[str]:
         """What was learnt, line by line."""
         lines = [
-            f"{name}: {good} of {count} left-out touches right"
+            f"{name}: {good} of {count} touches right, leave-one-out"
             for name, count, good in self.progress.classes
         ]
         lines += [f"{a} is taken for {b}" for a, b in self.progress.confused[:3]]
@@ -169,13 +169,13 @@ class Teacher:
             return ""
         worst = min(self.progress.classes, key=lambda c: c[2] / c[1])
         weak = f"; weakest: {worst[0]}, {worst[2]} of {worst[1]}" if worst[2] < worst[1] else ""
-        return f"told apart: {right} of {of} left-out touches{weak}"
+        return f"told apart, leave-one-out: {right} of {of} touches{weak}"
 
     def _undo(self) -> str:
         gone = self.lesson.undo()
         if gone is None:
             return "there is no touch to take back"
-        self.progress = self.lesson.left_out()
+        self.progress = self.lesson.leave_one_out()
         self.label, self.done = gone.label, False
         return f"touch {len(self.lesson.touches) + 1} ({gone.label}) is taken back\n{self.prompt()}"
 

@@ -60,7 +60,7 @@ def test_ten_lines_tell_what_to_do_and_what_was_learnt(lesson):
     assert lines[2] == f"touch it: press (1 of {EACH})"
     assert f"touch it: slide (1 of {EACH})" in lines
     assert "all touches are there" in lines
-    assert f"press: {EACH} of {EACH} left-out touches right" in lines
+    assert f"press: {EACH} of {EACH} touches right, leave-one-out" in lines
     assert f"{folder}/model.onnx: knows press, slide, double, and what it does not know" in out
     assert load_model(folder / "model.onnx")[1].refusals == ("unknown",)
 

@@ -9,7 +9,7 @@ import pytest
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.teaching.features import FeatureNetwork
-from tactile_rt.teaching.model import Taught, write_features
+from tactile_rt.teaching.model import FewShot, write_features
 from tactile_rt.testing import small_spec
 from tests.helpers.made_up_touches import wrench_spec
 
@@ -20,7 +20,7 @@ class Run:
     """A feature network, and its runs on episodes (touch, sample, element, channel)."""
 
     def __init__(self, path: Any, spec: ArraySpec) -> None:
-        self.taught = Taught(spec, np.full(len(spec.channels), SIGMA, np.float32))
+        self.taught = FewShot(spec, np.full(len(spec.channels), SIGMA, np.float32))
         write_features(path, self.taught)
         self.session: onnxruntime.InferenceSession = load_model(path)[0]
         self.spec, self.network = spec, self.taught.network

@@ -14,7 +14,7 @@ from tactile_rt.classifier.model_file import load_model, verify_model
 from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
-from tactile_rt.teaching.head import fit_classes, leave_out
+from tactile_rt.teaching.head import fit_classes, leave_one_out
 from tactile_rt.teaching.lesson import MODEL, ORDERS, Lesson
 from tactile_rt.teaching.listener import measured_floor
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
@@ -253,7 +253,7 @@ def test_a_touch_under_a_wrong_name_is_found(taught):
     names = list(TAUGHT)
     names[1] = "slide"
     features = np.stack([t.features for t in taught.touches]).astype(float)
-    found = leave_out(features[:, -1:], names, taught.taught.network.kinds)
+    found = leave_one_out(features[:, -1:], names, taught.taught.network.kinds)
     assert not found.right[1] and found.right[2:].mean() >= 0.9
 
 
@@ -278,7 +278,9 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert teacher.obey("2") == "touch it: slide (1 of 2)"
     take(9)
     said = take(9)
-    assert "told apart: 4 of 4 left-out touches" in said and said.endswith("all touches are there")
+    assert "told apart, leave-one-out: 4 of 4 touches" in said and said.endswith(
+        "all touches are there"
+    )
     assert teacher.done
     teacher.done = False
     assert "cannot be part of a file's name" in teacher.obey("a/b")

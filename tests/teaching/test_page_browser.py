@@ -74,7 +74,7 @@ def test_buttons_are_orders_and_what_is_said_is_shown(tmp_path):
                 touch(at)
             teacher.done = False
             has("#classes", "press2 of 2 touches, 2 told right")
-            has("#told", "4 of 4 touches are right when each is left out in turn.")
+            has("#told", "4 of 4 touches are right, leave-one-out: judged by all others.")
             press("Take the last touch back", "undo")
             has("#note", "touch 4 (slide) is taken back")
             has("#prompt", "touch it: slide (2 of 2)")

@@ -36,7 +36,7 @@ function show(state) {
     ...state.classes.map((entry) => button(state.each, entry, entry.name === state.label)),
   );
   $("told").textContent = state.of
-    ? `${state.right} of ${state.of} touches are right when each is left out in turn.`
+    ? `${state.right} of ${state.of} touches are right, leave-one-out: judged by all others.`
     : "Two touches of a class are needed first.";
   const lines = state.odd.map(([n, label, like]) => like === label
     ? `Touch ${n} is unlike the others of ${label}.`

@@ -1,4 +1,4 @@
-"""Further classes for a network that knows others, from a few touches and without its data.
+"""Class-incremental learning: new classes for a network, few-shot and without its data.
 
 The network's file tells where touches of its own classes lie in its embedding, and how touches of
 one class differ. Where touches of a new class lie is their mean. A touch is of the new class if it
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.teaching.head import FEWEST, LeftOut, check_enough
+from tactile_rt.teaching.head import FEWEST, LeaveOneOut, check_enough
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
 
 __all__ = [
-    "FurtherClasses",
-    "check_further",
-    "fit_further",
-    "further_card",
-    "further_graph",
-    "leave_out_further",
-    "taught_features",
+    "IncrementalClasses",
+    "check_new_classes",
+    "extend_card",
+    "extend_graph",
+    "fit_new_classes",
+    "join_features",
+    "leave_one_out_new_classes",
 ]
 
 # Chosen on the four kinds that the shipped model has never met, five touches of each:
@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class FurtherClasses:
+class IncrementalClasses:
     """What tells new classes from those that a network knows.
 
     Attributes:
@@ -77,15 +77,15 @@ class FurtherClasses:
         return scored
 
 
-def taught_features(embeddings: NDArray[np.float32], logits: NDArray[np.float32]) -> Floats:
+def join_features(embeddings: NDArray[np.float32], logits: NDArray[np.float32]) -> Floats:
     """(step, unit and label): the mean of the embeddings so far, and the logits."""
     mean = np.cumsum(embeddings, axis=0) / np.arange(1, len(embeddings) + 1)[:, None]
     together: Floats = np.concatenate([mean, logits], axis=1, dtype=float)
     return together
 
 
-def fit_further(card: ModelCard, features: Floats, labels: Sequence[str]) -> FurtherClasses:
-    """Learn further classes.
+def fit_new_classes(card: ModelCard, features: Floats, labels: Sequence[str]) -> IncrementalClasses:
+    """Learn new classes.
 
     Args:
         card: of the network's file.
@@ -96,7 +96,7 @@ def fit_further(card: ModelCard, features: Floats, labels: Sequence[str]) -> Fur
         ConfigError: the file does not tell where its classes lie, knows one of the classes, or a
             class has fewer than two touches.
     """
-    check_further(card, labels)
+    check_new_classes(card, labels)
     check_enough(labels)
     assert card.embeddings is not None
     means, covariance = card.embeddings.arrays(len(card.classes), card.embedding)
@@ -108,7 +108,7 @@ def fit_further(card: ModelCard, features: Floats, labels: Sequence[str]) -> Fur
     new = np.stack([features[own == k, : card.embedding].mean(axis=0) for k in range(len(names))])
     count = np.bincount(own)
     unknown = card.labels.index(UNKNOWN) if UNKNOWN in card.refusals else -1
-    return FurtherClasses(
+    return IncrementalClasses(
         names,
         whitening,
         means @ whitening,
@@ -119,7 +119,7 @@ def fit_further(card: ModelCard, features: Floats, labels: Sequence[str]) -> Fur
     )
 
 
-def check_further(card: ModelCard, labels: Sequence[str]) -> None:
+def check_new_classes(card: ModelCard, labels: Sequence[str]) -> None:
     """Raise a ConfigError if a file cannot be taught these classes."""
     if card.embeddings is None:
         raise ConfigError(
@@ -132,10 +132,12 @@ def check_further(card: ModelCard, labels: Sequence[str]) -> None:
         raise ConfigError(f"model {card.name} knows {known[0]!r} already: name it otherwise")
 
 
-def leave_out_further(card: ModelCard, features: Floats, labels: Sequence[str]) -> LeftOut:
-    """Leave every touch out in turn: is it named by the others of its class, among all?
+def leave_one_out_new_classes(
+    card: ModelCard, features: Floats, labels: Sequence[str]
+) -> LeaveOneOut:
+    """Judge every touch by the others alone: is it named, among all classes?
 
-    Args, Raises: as `fit_further`. A class of two touches is fitted with itself.
+    Args, Raises: as `fit_new_classes`. A class of two touches is fitted with itself.
     """
     names = tuple(np.unique(np.asarray(labels)))
     own = np.searchsorted(names, labels)
@@ -145,7 +147,7 @@ def leave_out_further(card: ModelCard, features: Floats, labels: Sequence[str]) 
         others = np.arange(len(own)) != k
         if (own[others] == own[k]).sum() < FEWEST:
             others[k] = True
-        found = fit_further(
+        found = fit_new_classes(
             card,
             features[others],
             [name for name, used in zip(labels, others, strict=True) if used],
@@ -154,11 +156,11 @@ def leave_out_further(card: ModelCard, features: Floats, labels: Sequence[str]) 
         order = [found.labels.index(name) for name in names]
         away[k, 0] = -scores[order]
         right[k] = scores.max() > 0 and found.labels[int(scores.argmax())] == names[own[k]]
-    return LeftOut(away, right)
+    return LeaveOneOut(away, right)
 
 
-def further_graph(data: bytes, card: ModelCard, classes: FurtherClasses) -> OnnxGraph:
-    """The network's graph with logits of the new classes after those of its own."""
+def extend_graph(data: bytes, card: ModelCard, classes: IncrementalClasses) -> OnnxGraph:
+    """Return the network's graph with logits of the new classes after its own."""
     g = OnnxGraph.of(data, "logits")
     units, (known, told, unknown) = card.embedding, classes.knows
     total = g("Add", g.input(SUM, ["batch", units]), "embedding")
@@ -182,9 +184,9 @@ def further_graph(data: bytes, card: ModelCard, classes: FurtherClasses) -> Onnx
     if unknown >= 0:
         there = g("Slice", logits, g.integers(unknown), g.integers(unknown + 1), axis)
         top = g("Max", top, there)
-    further = g("Add", top, scores)
+    added = g("Add", top, scores)
     rest = g("Slice", logits, g.integers(known), g.integers(told), axis)
-    parts = [mine, further, rest] if told > known else [mine, further]
+    parts = [mine, added, rest] if told > known else [mine, added]
     together = g("Concat", *parts, axis=1)
     g.output("logits", together, ["batch", told + len(classes.labels)])
     g.output(f"{SUM}_next", total, ["batch", units])
@@ -192,7 +194,7 @@ def further_graph(data: bytes, card: ModelCard, classes: FurtherClasses) -> Onnx
     return g
 
 
-def further_card(card: ModelCard, classes: FurtherClasses) -> ModelCard:
+def extend_card(card: ModelCard, classes: IncrementalClasses) -> ModelCard:
     """Return the card of that; its prediction sets were those of its own classes."""
     state = (StateTensor(SUM, (card.embedding,), "float32"), StateTensor(COUNT, (1,), "float32"))
     return msgspec.structs.replace(

@@ -1,4 +1,4 @@
-"""Further classes for the shipped network: the graph is the formula, and what is known stays so."""
+"""New classes for the shipped network: the graph is the formula, and what is known stays so."""
 
 import msgspec
 import numpy as np
@@ -10,13 +10,13 @@ from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_card import EmbeddingStatistics
 from tactile_rt.classifier.model_file import file_outputs, load_model, shipped_model, verify_model
 from tactile_rt.core.errors import ConfigError, ModelError
-from tactile_rt.teaching.further import (
+from tactile_rt.teaching.class_incremental import (
     EARLY,
-    fit_further,
-    leave_out_further,
-    taught_features,
+    fit_new_classes,
+    join_features,
+    leave_one_out_new_classes,
 )
-from tactile_rt.teaching.model import TaughtFurther
+from tactile_rt.teaching.model import ClassIncremental
 from tests.helpers import tiny_model
 
 LABELS = ["goblet"] * 3 + ["teapot"] * 4
@@ -24,7 +24,7 @@ LABELS = ["goblet"] * 3 + ["teapot"] * 4
 
 @pytest.fixture(scope="module")
 def base():
-    return TaughtFurther(shipped_model())
+    return ClassIncremental(shipped_model())
 
 
 def touches(card, rng, count):
@@ -40,7 +40,7 @@ def taught(base, tmp_path_factory):
     path = tmp_path_factory.mktemp("taught") / "model.onnx"
     features = touches(base.card, rng, len(LABELS))
     base.learn(path, np.repeat(features[:, None], 2, axis=1), LABELS, "more", {"taught": {}})
-    return path, fit_further(base.card, features, LABELS)
+    return path, fit_new_classes(base.card, features, LABELS)
 
 
 def test_the_file_is_a_model_like_any_other(base, taught):
@@ -72,7 +72,7 @@ def test_the_graph_computes_the_scores_and_leaves_the_network_alone(base, taught
     for logits, new, embeddings in zip(
         before["logits"], after[..., known : known + 2], before["embedding"], strict=True
     ):
-        features = taught_features(embeddings, logits)
+        features = join_features(embeddings, logits)
         top = np.maximum(logits[:, :known].max(1), logits[:, unknown])[:, None]
         last = top[-1] + classes.scores(features)[-1]
         np.testing.assert_allclose(new[-1], last, rtol=1e-4, atol=1e-3)
@@ -93,26 +93,26 @@ def test_what_lies_where_a_class_was_taught_is_that_class_and_what_is_known_is_n
     assert (np.diag(classes.scores(taught_means)) > 0).all()
 
 
-def test_left_out_touches_of_one_place_are_right(base):
+def test_touches_of_one_place_are_right_leave_one_out(base):
     rng = np.random.default_rng(1)
     two = touches(base.card, rng, 2)
     features = np.repeat(two, 4, axis=0) + rng.normal(size=(8, two.shape[1])) * 1e-3
-    found = leave_out_further(base.card, features, ["a"] * 4 + ["b"] * 4)
+    found = leave_one_out_new_classes(base.card, features, ["a"] * 4 + ["b"] * 4)
     assert found.right.all()
-    swapped = leave_out_further(base.card, features, ["a"] * 3 + ["b"] * 5)
+    swapped = leave_one_out_new_classes(base.card, features, ["a"] * 3 + ["b"] * 5)
     assert not swapped.right[3]
 
 
 def test_what_cannot_be_taught_is_one_line(base, tmp_path):
     features = touches(base.card, np.random.default_rng(0), 2)
     with pytest.raises(ConfigError, match="knows 'mug' already"):
-        fit_further(base.card, features, ["mug", "mug"])
+        fit_new_classes(base.card, features, ["mug", "mug"])
     with pytest.raises(ConfigError, match="one touch of 'teapot'"):
-        fit_further(base.card, features, ["teapot", "cup of tea"])
+        fit_new_classes(base.card, features, ["teapot", "cup of tea"])
     with pytest.raises(ConfigError, match="does not tell where its classes lie"):
-        TaughtFurther(tiny_model.write_model(tmp_path / "tiny.onnx"))
+        ClassIncremental(tiny_model.write_model(tmp_path / "tiny.onnx"))
     with pytest.raises(ModelError, match="no model file"):
-        TaughtFurther(tmp_path / "none.onnx")
+        ClassIncremental(tmp_path / "none.onnx")
 
 
 def test_statistics_that_do_not_fit_are_refused(base):
