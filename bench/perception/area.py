@@ -131,7 +131,7 @@ def measure(
         if method.taught == GENERATED:  # real objects that it has not seen are all there are
             of.append(ALL)
         unknown = data.sets[WITHHELD]
-        strange = method.familiarity(unknown), unknown.sweeps.objects
+        strange = method.score_known(unknown), unknown.sweeps.objects
         for test in of:  # unknown things stand: they are no match for known ones that do not
             against = None if test in (WIDE, SHARED_WIDE) else strange
             results.scores[test][method] = score(method, tests[test], against)
@@ -189,7 +189,7 @@ def records_of(results: BenchmarkResults) -> list[Record]:
                 "top-1": one.top1,
                 "four sweeps fused": one.four,
                 "calibration error": one.calibration,
-                "known against unknown (AUROC)": one.auroc,
+                "open set (AUROC)": one.auroc,
             }
             found += [
                 Record(

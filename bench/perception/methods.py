@@ -22,7 +22,7 @@ from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.coverage import familiarity
+from tactile_rt.models.evaluation.coverage import score_known
 from tactile_rt.models.evaluation.svm import PENALTIES, fit, window_features
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.training.config import TrainingConfig
@@ -67,7 +67,7 @@ class Method:
     posteriors: Callable[[SweepSet, Disturbance], Floats]
     familiar: Callable[[SweepSet], Floats] | None = None
 
-    def familiarity(self, sweeps: SweepSet) -> Floats:
+    def score_known(self, sweeps: SweepSet) -> Floats:
         """How sure (sweep,) it is that things are of kinds that it knows."""
         if self.familiar is not None:
             return self.familiar(sweeps)
@@ -110,7 +110,7 @@ def onnx_model(path: Path) -> Method:
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return measures.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
-    taught, familiar = _learnt_from(card), partial(familiarity, path)
+    taught, familiar = _learnt_from(card), partial(score_known, path)
     return Method(path.stem, taught, card.classes, posteriors, familiar)
 
 

@@ -31,8 +31,8 @@ class Figures:
             their posteriors are fused.
         calibration: The expected calibration error, 15 bins.
         at: The accuracy of the surest sweeps, by the percentage that is decided.
-        auroc: How well its familiarity tells known kinds from the withheld ones; NaN where there
-            are none.
+        auroc: Open set: how well its scores tell known kinds from the withheld ones; NaN where
+            there are none.
     """
 
     top1: Interval
@@ -53,7 +53,7 @@ def score(
     Args:
         method: which.
         test: the sweeps.
-        strange: its familiarity (sweep,) of things of unknown kinds, and the objects (sweep,);
+        strange: its scores (sweep,) of things of unknown kinds, and the objects (sweep,);
             None: there are none in this test's world.
     """
     known = of_kinds(test, method.kinds)
@@ -67,7 +67,7 @@ def score(
     sure = np.nan_to_num(posteriors.max(axis=1), nan=0.0)
     area = NOTHING
     if strange is not None:
-        area = _told_apart(method.familiarity(known), objects, *strange)
+        area = _told_apart(method.score_known(known), objects, *strange)
 
     return Figures(
         top1=measures.accuracy(right, objects),
@@ -111,7 +111,7 @@ def robustness(
 def _told_apart(
     familiar: Floats, objects: NDArray[np.str_], strange: Floats, others: NDArray[np.str_]
 ) -> Interval:
-    """AUROC of the familiarity of known things against that of unknown ones."""
+    """AUROC, open set: the scores of known things against those of unknown ones."""
     both = np.concatenate([familiar, strange])
 
     def area(at: NDArray[np.int64]) -> float:

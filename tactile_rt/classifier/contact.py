@@ -27,19 +27,19 @@ STRETCH_SAMPLES = 20
 WILD_Z2, WILD_SAMPLES = 60.0, 2  # from the median: so many of a still stretch may be further away
 SAME_Z2 = 60.0  # of the medians of two stretches
 
-# Exponential means of rate r: the sample itself, and means over about 7 and 19 samples (2/r - 1).
+# EWMA charts of rate r: the sample itself, and means over about 7 and 19 samples (2/r - 1).
 RATES = np.array([1.0, 0.25, 0.1], dtype=np.float32)
 MEAN_VARIANCE = (RATES / (2 - RATES)).astype(np.float64)
 ONSET_Z2 = np.array([26.0, 40.0, 40.0])
 RELEASE = 0.83  # of the onset's threshold: from there on a contact lasts
 SUSPICION = 0.45  # of the onset's threshold: samples since then are not the baseline's
-# One sample adds no more than this to a mean, in sigma: a glitch is no touch, and a mean forgets a
+# One sample adds no more than this to a chart, in sigma: a glitch is no touch, and it forgets a
 # touch soon after its end.
 LIMIT = np.array([np.inf, 3.0, 3.0], dtype=np.float32)[:, None, None]
 
 
 def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Compute the thresholds of the squared means, (mean, element) sigma^2.
+    """Compute the thresholds of the EWMA charts, (chart, element) sigma^2.
 
     `quiet` (element,) samples make the baseline. The offset is itself a mean, of variance 1 / n;
     and sigma is an estimate of n - 1 degrees of freedom, by which a square is too large by (n - 1)
@@ -52,16 +52,16 @@ def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 class ContactDetector:
-    """Sample by sample: is anything touched, and what is the baseline?
+    """EWMA charts: is anything touched, and what is the baseline? Sample by sample.
 
     The statistic of an element is z^2 = sum over its channels of (m / sigma)^2 / v, where m is a
     mean of (x - offset) over the last samples, and v the variance of m in units of sigma^2: that
-    of an exponential mean of rate r, r / (2 - r), and that of the baseline. While nothing is
-    touched it is chi-square distributed with as many degrees of freedom as channels. An exponential
-    mean whose length suits the size of a step finds it in white noise nearly as soon as any test
-    can (Roberts 1959, Technometrics 1:239; of several channels together: Lowry et al. 1992,
-    Technometrics 34:46, eq. 2.2 and 2.3). Touches are of every size, so three lengths stand side
-    by side: the sample itself, about 7 and about 19.
+    of an exponentially weighted mean of rate r, r / (2 - r), and that of the baseline. While
+    nothing is touched it is chi-square distributed with as many degrees of freedom as channels. An
+    EWMA chart whose length suits the size of a step finds it in white noise nearly as soon as
+    any test can (Roberts 1959, Technometrics 1:239; of several channels together: Lowry et al.
+    1992, Technometrics 34:46, eq. 2.2 and 2.3). Touches are of every size, so three charts stand
+    side by side: the sample itself, about 7 and about 19.
 
     Contact begins when one element exceeds its threshold (26, 40, 40) in two samples running. It
     ends when no element has exceeded 0.83 of it for 20 samples. For six channels, 30 whiskers and
@@ -106,8 +106,8 @@ class ContactDetector:
         self._sum = np.zeros(shape)
         self._sum_of_squares = np.zeros(shape)
         self._pooled = self.sigma
-        self._means = np.zeros((len(RATES), *shape), dtype=np.float32)  # in sigma
-        self._onset_z2 = onset_z2(self._count)  # (mean, element)
+        self._ewma = np.zeros((len(RATES), *shape), dtype=np.float32)  # in sigma
+        self._onset_z2 = onset_z2(self._count)  # (chart, element)
         self._suspicious_for = np.zeros(shape[0], dtype=np.int64)
         self._above: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
         self._quiet_for = 0
@@ -159,10 +159,8 @@ class ContactDetector:
         """(element,) largest statistic, each in units of its threshold."""
         trusted = (valid & self.has_baseline)[:, None]
         z = np.where(trusted, sample - self.offset, np.float32(0)) / self._pooled
-        self._means += RATES[:, None, None] * (
-            np.minimum(np.maximum(z, -LIMIT), LIMIT) - self._means
-        )
-        z2 = np.square(self._means).sum(axis=2)  # (mean, element)
+        self._ewma += RATES[:, None, None] * (np.minimum(np.maximum(z, -LIMIT), LIMIT) - self._ewma)
+        z2 = np.square(self._ewma).sum(axis=2)  # (chart, element)
         excess: NDArray[np.float64] = (z2 / self._onset_z2).max(axis=0)
         return excess
 
@@ -178,7 +176,7 @@ class ContactDetector:
         self.contact = False
         self._above = np.zeros_like(self._above)
         self._suspicious_for = np.zeros_like(self._suspicious_for)
-        self._means = np.zeros_like(self._means)
+        self._ewma = np.zeros_like(self._ewma)
         self._pending.clear()
         self._baseline.clear()
         self._quiet = 0

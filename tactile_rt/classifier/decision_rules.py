@@ -27,9 +27,9 @@ __all__ = [
     "Deadline",
     "EarlyExit",
     "Lanes",
+    "OpenSetRule",
     "Policy",
     "PredictionSetRule",
-    "UnknownRule",
     "fitting",
     "mass_above",
     "named",
@@ -37,13 +37,13 @@ __all__ = [
 
 MAX_NAME = 200  # characters
 UNKNOWN = "unknown"  # what is decided of an object of no class that the model knows
-POSTERIOR = "posterior of unknown"  # the score of an `UnknownRule`: of the label `unknown`
+POSTERIOR = "posterior of unknown"  # the score of an `OpenSetRule`: of the label `unknown`
 # The score of a `PredictionSetRule`: how much of the posterior the more probable classes have.
 MASS_ABOVE = "mass above"
 
 
-class UnknownRule(msgspec.Struct, frozen=True):
-    """When a step's decision is that the object is of no class that the model knows.
+class OpenSetRule(msgspec.Struct, frozen=True):
+    """The open-set rule: when an object is of no class that the model knows.
 
     Attributes:
         score: The name of the score: `POSTERIOR`.

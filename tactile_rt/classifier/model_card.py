@@ -18,8 +18,8 @@ from tactile_rt.classifier.decision_rules import (
     MAX_NAME,
     POSTERIOR,
     UNKNOWN,
+    OpenSetRule,
     PredictionSetRule,
-    UnknownRule,
     named,
 )
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
@@ -152,7 +152,7 @@ class ModelCard(msgspec.Struct, frozen=True):
     embedding: int = 0
     sensor: dict[str, Any] = {}
     refusals: tuple[str, ...] = ()
-    unknown: UnknownRule | None = None
+    unknown: OpenSetRule | None = None
     candidates: tuple[PredictionSetRule, ...] = ()
     embeddings: EmbeddingStatistics | None = None
     license: str = ""

@@ -20,7 +20,7 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
-from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
+from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
 from tactile_rt.classifier.model_card import CARD_VERSION, EmbeddingStatistics, Kind
 from tactile_rt.classifier.model_file import (
     METADATA_KEY,
@@ -87,7 +87,7 @@ def export_checkpoint(
     path: Path,
     name: str,
     temperature: float = 1.0,
-    rules: tuple[UnknownRule | None, tuple[PredictionSetRule, ...]] = (None, ()),
+    rules: tuple[OpenSetRule | None, tuple[PredictionSetRule, ...]] = (None, ()),
     embeddings: EmbeddingStatistics | None = None,
     figures: dict[str, Any] | None = None,
     precision: Precision = "fp32",

@@ -20,15 +20,15 @@ from tactile_rt.classifier.decision_rules import (
     MASS_ABOVE,
     POSTERIOR,
     UNKNOWN,
+    OpenSetRule,
     PredictionSetRule,
-    UnknownRule,
     mass_above,
 )
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation.measures import Step, at_temperature, predict
 
-__all__ = ["COVERAGE", "fit_prediction_sets", "fit_unknown", "fitted_rules"]
+__all__ = ["COVERAGE", "fit_open_set", "fit_prediction_sets", "fitted_rules"]
 
 COVERAGE = 0.95
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 def fitted_rules(
     sets: Sequence[SweepSet], run: Step, temperature: float, labels: Sequence[str], classes: int
-) -> tuple[UnknownRule | None, tuple[PredictionSetRule, ...]]:
+) -> tuple[OpenSetRule | None, tuple[PredictionSetRule, ...]]:
     """The rules of a model.
 
     Args:
@@ -68,7 +68,7 @@ def fitted_rules(
             for level in REFUSED_AT
             for k in range(len(sets))
         ]
-        unknown = fit_unknown(groups)
+        unknown = fit_open_set(groups)
     rules = []
     for bound, ends in NOISE.items():
         drawn = [
@@ -84,10 +84,10 @@ def fitted_rules(
     return unknown, tuple(rules)
 
 
-def fit_unknown(
+def fit_open_set(
     groups: Sequence[tuple[NDArray[np.float32], NDArray[np.str_]]], refused: float = REFUSED
-) -> UnknownRule:
-    """The thresholds by which at each step at most so many sweeps of known kinds are refused.
+) -> OpenSetRule:
+    """Fit thresholds by which at most so many sweeps of known kinds are refused at each step.
 
     Args:
         groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
@@ -105,7 +105,7 @@ def fit_unknown(
         ranked = np.vstack([np.take_along_axis(posteriors, order, axis=0), np.ones(rank.shape)])
         each.append(ranked[rank, np.arange(len(rank))])
     thresholds = np.maximum(np.max(each, axis=0), LEAST)
-    return UnknownRule(POSTERIOR, "logits", tuple(float(t) for t in thresholds))
+    return OpenSetRule(POSTERIOR, "logits", tuple(float(t) for t in thresholds))
 
 
 def fit_prediction_sets(

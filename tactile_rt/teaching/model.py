@@ -20,7 +20,7 @@ import onnxruntime
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, UnknownRule
+from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, OpenSetRule
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_logits, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
@@ -149,7 +149,7 @@ def write_few_shot(
         "name": name,
         "labels": (*classes.labels, UNKNOWN),
         "refusals": (UNKNOWN,),
-        "unknown": UnknownRule(POSTERIOR, "logits", (MAYBE,)),
+        "unknown": OpenSetRule(POSTERIOR, "logits", (MAYBE,)),
         "temperature": classes.temperature,
         "provenance": {**_made_by(), **provenance},
     }

@@ -15,8 +15,8 @@ from tactile_rt.classifier.decision_rules import (
     MASS_ABOVE,
     POSTERIOR,
     UNKNOWN,
+    OpenSetRule,
     PredictionSetRule,
-    UnknownRule,
 )
 from tactile_rt.classifier.model_card import decided, rated_noise
 from tactile_rt.core.errors import ModelError, SpecMismatch
@@ -396,7 +396,7 @@ def test_what_no_class_fits_is_unknown_and_a_refusal_is_a_decision_like_any_othe
     assert (probable.label, probable.probability) == ("mug", max(probable.probabilities))
     unknown = float(probable.probabilities[NAMES.index(UNKNOWN)])
     for threshold, label in ((unknown + 1e-3, "mug"), (unknown - 1e-3, UNKNOWN)):
-        rule = UnknownRule(POSTERIOR, "logits", (1.0, 1.0, 1.0, threshold))
+        rule = OpenSetRule(POSTERIOR, "logits", (1.0, 1.0, 1.0, threshold))
         decisions = push_all(refusing(tmp_path, unknown=rule), values)
         assert [d.label for d in decisions] == ["mug", "mug", "mug", label]
         assert decisions[-1].labels == NAMES
@@ -406,12 +406,12 @@ def test_what_no_class_fits_is_unknown_and_a_refusal_is_a_decision_like_any_othe
 
 def test_below_its_threshold_unknown_is_not_decided_however_probable(tmp_path: Path) -> None:
     names = ("cup", UNKNOWN)
-    card = {"unknown": UnknownRule(POSTERIOR, "logits", (0.9,))}
+    card = {"unknown": OpenSetRule(POSTERIOR, "logits", (0.9,))}
     card = msgspec.structs.replace(CARD, labels=names, refusals=(UNKNOWN,), **card)
     assert decided(card, np.array([0.2, 0.8], dtype=np.float32), 1) == 0
     assert decided(card, np.array([0.05, 0.95], dtype=np.float32), 1) == 1
     # a score that this release does not know cannot be applied
-    other = msgspec.structs.replace(card, unknown=UnknownRule("entropy", "logits", (0.1,)))
+    other = msgspec.structs.replace(card, unknown=OpenSetRule("entropy", "logits", (0.1,)))
     assert decided(other, np.array([0.8, 0.2], dtype=np.float32), 1) == 0
 
 

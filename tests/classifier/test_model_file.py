@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
+from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
 from tactile_rt.classifier.model_file import (
     StateTensor,
     element_order,
@@ -139,7 +139,7 @@ SWAPPED = (
 )
 
 
-UNKNOWN = UnknownRule(score="entropy", output="logits", thresholds=(1.5,))
+UNKNOWN = OpenSetRule(score="entropy", output="logits", thresholds=(1.5,))
 RULE = PredictionSetRule(score="1 - posterior", coverage=0.95, quantiles=(0.9,) * 4, objects=200)
 replaced = msgspec.structs.replace
 

@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
+from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
 from tactile_rt.classifier.model_file import (
     load_model,
     probe_logits,
@@ -56,7 +56,7 @@ def test_show_says_what_the_file_knows_of_sensor_and_rules(call, tmp_path):
     path = write_model(
         tmp_path / "m.onnx",
         sensor={"rate_hz": 80.0, "note": "\x1b[2J"},
-        unknown=UnknownRule("entropy", "logits", (1.0, 1.0, 1.5, 2.0)),
+        unknown=OpenSetRule("entropy", "logits", (1.0, 1.0, 1.5, 2.0)),
         candidates=(rule, replace(rule, coverage=0.8, noise=1.0)),
     )
     code, out, err = call("model", "show", path)
@@ -70,7 +70,7 @@ def test_show_says_what_the_file_knows_of_sensor_and_rules(call, tmp_path):
         "80 % by 1 - posterior, of 200 objects up to 1 x the rated noise",
     ):
         assert said in words
-    _, out, _ = call("model", "show", write_model(path, unknown=UnknownRule("x", "logits", (1.0,))))
+    _, out, _ = call("model", "show", write_model(path, unknown=OpenSetRule("x", "logits", (1.0,))))
     assert "unknown x of the logits above 1 probe" in " ".join(out.split())
     assert "prediction set" not in out
 

@@ -22,7 +22,7 @@ import torch
 import tactile_rt
 from bench.inference.full_size import random_model
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.decision_rules import PredictionSetRule, UnknownRule
+from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
 from tactile_rt.classifier.model_file import ModelCard, file_outputs, load_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
@@ -327,7 +327,7 @@ def test_what_the_card_says_of_sensor_and_rules_is_in_the_file(
     replay(monkeypatch, exported.proto)
     given = {
         "sensor": {"rate_hz": 80.0, "noise_density": [1e-6] * 6},
-        "unknown": UnknownRule("entropy", "embedding", (0.5,) * STEPS),
+        "unknown": OpenSetRule("entropy", "embedding", (0.5,) * STEPS),
         "candidates": (PredictionSetRule("rank", 0.95, (2.5,) * STEPS, 200),),
         "license": "Apache-2.0 OR MIT",
     }

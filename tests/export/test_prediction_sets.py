@@ -5,7 +5,7 @@ import pytest
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, mass_above
 from tactile_rt.core.errors import RecordingError
-from tactile_rt.export.prediction_sets import fit_prediction_sets, fit_unknown
+from tactile_rt.export.prediction_sets import fit_open_set, fit_prediction_sets
 
 STEPS, CLASSES = 22, 10
 
@@ -82,7 +82,7 @@ def test_known_kinds_are_refused_no_more_than_said() -> None:
     rng = np.random.default_rng(0)
     names = np.array([f"o-{k}" for k in range(100)]).repeat(5)
     groups = [rng.beta(1, 9, (500, STEPS)), rng.beta(1, 3, (500, STEPS))]
-    rule = fit_unknown([(group, names) for group in groups], refused=0.1)
+    rule = fit_open_set([(group, names) for group in groups], refused=0.1)
     for group in groups:
         share = (group > np.array(rule.thresholds)).mean(axis=0)
         assert (share <= 0.1 + 1e-9).all()
@@ -94,14 +94,14 @@ def test_new_objects_are_refused_no_more_than_said_where_few_told_the_threshold(
     rng, refused = np.random.default_rng(0), []
     for _ in range(200):
         few = rng.beta(1, 9, (12, 1)), np.array([f"o-{k}" for k in range(12)])
-        (threshold,) = fit_unknown([few], refused=0.1).thresholds
+        (threshold,) = fit_open_set([few], refused=0.1).thresholds
         refused.append((rng.beta(1, 9, 500) > threshold).mean())
     assert 0.03 < np.mean(refused) <= 0.1
 
 
 def test_a_network_that_is_sure_of_known_things_refuses_none_of_them() -> None:
     sure = np.full((300, STEPS), 1e-7) * np.random.default_rng(0).random((300, STEPS))
-    rule = fit_unknown([(sure, np.array([f"o-{k}" for k in range(300)]))])
+    rule = fit_open_set([(sure, np.array([f"o-{k}" for k in range(300)]))])
     assert rule.thresholds == (0.05,) * STEPS
 
 

@@ -9,7 +9,7 @@ pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.decision_rules import MASS_ABOVE, POSTERIOR, UNKNOWN, PredictionSetRule
-from tactile_rt.classifier.decision_rules import UnknownRule as Rule
+from tactile_rt.classifier.decision_rules import OpenSetRule as Rule
 from tactile_rt.core.stream import Timing
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults

@@ -17,7 +17,7 @@ from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-__all__ = ["Coverage", "familiarity", "measure_coverage", "named_faults"]
+__all__ = ["Coverage", "measure_coverage", "named_faults", "score_known"]
 
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 
@@ -80,8 +80,8 @@ def measure_coverage(
     )
 
 
-def familiarity(path: Path, test: SweepSet) -> NDArray[np.float32]:
-    """How sure (sweep,) a model is that things are of kinds that it knows.
+def score_known(path: Path, test: SweepSet) -> NDArray[np.float32]:
+    """Score (sweep,), open set, how sure a model is that things are of known kinds.
 
     That is the posterior of all labels but `unknown`; of a model that has no such label, that of
     the most probable class. 0 where no contact was found.

@@ -18,7 +18,7 @@ from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.coverage import familiarity, measure_coverage, named_faults
+from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults, score_known
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.models.evaluation.robustness import (
     measure_robustness,
@@ -120,7 +120,7 @@ def evaluate_model(
         unknown = replace(SweepSet.read(data, WITHHELD), window=test.window)
         if quick:
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
-        records.append(_open_set(model, unknown, test))
+        records.append(_measure_open_set(model, unknown, test))
     records += _measure_coverage(model, test, unknown, sample)
     if svm:
         right = measures.hits(clean[:, -1], labels)
@@ -263,9 +263,9 @@ def _measure_coverage(
     return records
 
 
-def _open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
-    """How well a model tells categories that training never saw from those it did."""
-    there, here = familiarity(model, unknown), familiarity(model, known)
+def _measure_open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
+    """Measure, open set, how well a model tells categories that training never saw."""
+    there, here = score_known(model, unknown), score_known(model, known)
     scores = np.concatenate([here, there])
 
     def area(at: NDArray[np.int64]) -> float:
@@ -275,7 +275,7 @@ def _open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
     names = np.concatenate([known.sweeps.objects, unknown.sweeps.objects])
     estimate = measures.bootstrap(area, names)
     how = f"{len(here)} sweeps of known and {len(there)} of withheld kinds"
-    name = "known against withheld categories"
+    name = "open set, known against withheld categories"
     return _record(name, estimate, "", how, "% AUROC", "; 50: chance")
 
 

@@ -136,7 +136,7 @@ def oracle(data: Data, wrong: set[str] = frozenset()) -> Method:  # type: ignore
 def strange(data: Data) -> tuple[np.ndarray, np.ndarray]:
     """What the oracle makes of things of unknown kinds."""
     unknown = data.sets[WITHHELD]
-    return oracle(data).familiarity(unknown), unknown.sweeps.objects
+    return oracle(data).score_known(unknown), unknown.sweeps.objects
 
 
 def test_an_oracle_is_right_and_one_that_errs_on_a_source_is_found_out(data: Data) -> None:
