@@ -371,7 +371,7 @@ def _draw_guess(demo: Demonstration) -> Text:
         text.append(f"{'█' * round(BAR * probability):<{BAR}}", style)
         text.append(f" {100 * probability:3.0f} %\n")
     if decision.prediction_set:
-        possible = f"still possible: {len(decision.prediction_set)} of {len(card.classes)} kinds"
+        possible = f"prediction set: {len(decision.prediction_set)} of {len(card.classes)} kinds"
         text.append(possible, GREY)
     right = decision.label == truth
     verdict = ("✓ " if right else "✗ ") + ("RIGHT" if right else f"WRONG, it is a {truth}")

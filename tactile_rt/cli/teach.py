@@ -46,9 +46,7 @@ def teach(
     ] = "",
     model: Annotated[
         str,
-        typer.Option(
-            help="Class-incremental: teach this model (an .onnx file, or `shipped`) new classes."
-        ),
+        typer.Option(help="Class-incremental: new classes for this .onnx file, or `shipped`."),
     ] = "",
     seconds: Seconds = None,
     json: Json = None,

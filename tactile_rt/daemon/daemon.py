@@ -90,10 +90,9 @@ class Daemon:
         self._watcher.start()
 
     def reload(self, loaded: Loaded) -> None:
-        """Reconcile the parts with another configuration.
+        """Reconcile the parts with a configuration: what is the same in it goes on undisturbed.
 
-        What is the same in it goes on undisturbed, and a model goes on until the one that takes its
-        place is admitted.
+        A model goes on until the one that takes its place is admitted.
 
         Raises:
             ConfigError: a consumer cannot be made; nothing has changed.

@@ -1,5 +1,4 @@
-"""Diagnostics: what the daemon does not do as it should, said from facts at the end of each
-promise.
+"""Diagnostics: what the daemon does not do as it should, said from facts.
 
 That a thread runs says nothing of whether its work is done. So what counts is how old the newest
 sample is, whether it is on the disk, how long what is to be published has waited, and what was lost

@@ -1,5 +1,4 @@
-"""Stuck-at faults: a device hangs on one value; its samples come, in time and in order, and say
-nothing.
+"""Stuck-at faults: a device hangs on one value; its samples come, in time, and say nothing.
 
 A sensor whose noise is above its resolution cannot give the same values twice; one that is coarse
 gives the same ones for as long as it rests. So equal samples are a fault only where the noise is

@@ -81,10 +81,7 @@ class LeaveOneOut:
 
 
 def fit_classes(
-    features: Floats,
-    labels: Sequence[str],
-    kinds: Sequence[slice],
-    judged: LeaveOneOut | None = None,
+    features: Floats, labels: Sequence[str], kinds: Sequence[slice], told: LeaveOneOut | None = None
 ) -> TouchClasses:
     """Learn classes.
 
@@ -92,14 +89,14 @@ def fit_classes(
         features: (touch, step, feature) of all touches.
         labels: (touch,) the class of each.
         kinds: which features are of one kind, and so of one scale.
-        judged: what `leave_one_out` said of these touches; None: it is asked.
+        told: what `leave_one_out` said of these touches; None: it is asked.
 
     Raises:
         ConfigError: a class with fewer than two touches.
     """
     check_enough(labels)
-    judged = judged or leave_one_out(features, labels, kinds)
-    nearest = judged.distances.min(axis=2)  # (touch, step)
+    told = told or leave_one_out(features, labels, kinds)
+    nearest = told.distances.min(axis=2)  # (touch, step)
     rank = min(len(labels) - 1, int(np.ceil((1 - REFUSED) * (len(labels) + 1))) - 1)
     # A touch under a wrong name is far from its class; it is not to let everything through.
     logs = np.log(nearest + TINY)
@@ -107,7 +104,7 @@ def fit_classes(
     spread = MAD * np.median(np.abs(logs - middle), axis=0)
     reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
-    temperature = _temperature(judged.distances[:, -1], own)
+    temperature = _temperature(told.distances[:, -1], own)
     names = tuple(str(name) for name in classes)
     return TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
 

@@ -259,7 +259,7 @@ def test_nothing_is_reported_before_the_baseline_is_complete() -> None:
 
 
 @pytest.mark.parametrize("garbage", [0.0, 1.0, np.nan, np.inf])
-def test_a_dead_element_neither_touches_nor_tares(garbage: float) -> None:
+def test_a_dead_element_neither_touches_nor_counts_as_rest(garbage: float) -> None:
     n = QUIET + 100
     samples = noise(n)
     samples[:, 7] = garbage

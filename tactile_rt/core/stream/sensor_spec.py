@@ -46,9 +46,8 @@ CLIP = {"N": 5e-3, "N m": 5e-6}
 SCALE = {"N": 3e-5, "N m": 1.5e-7}
 CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
 SILENT = 0.2  # that least, of the noise of a sensor that is described
-# Of the drift: an offset that has wandered for ten seconds since the baseline (by 0.6 of its
-# spread, if it forgets in a minute) is then no contact that never ends, also of the worst of
-# dozens.
+# Of the drift: an offset that has wandered for 10 s since the baseline (by 0.6 of its spread, if it
+# forgets in a minute) is then no contact that never ends, also of the worst of dozens.
 WANDERED = 1.5
 ROUNDING = 1 / math.sqrt(12)  # standard deviation of a rounding error, in steps
 

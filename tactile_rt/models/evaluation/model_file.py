@@ -244,9 +244,8 @@ def _measure_coverage(
             return []
         if found.nominal == found.nominal:
             how = f"nominal: {100 * found.nominal:g} %; {sample}"
-            records.append(
-                _record(f"coverage of the prediction sets{when}", found.covered, "", how)
-            )
+            name = f"coverage of the prediction sets{when}"
+            records.append(_record(name, found.covered, "", how))
             size = found.size
             interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
             name = f"models.prediction set at the last step{when}"
