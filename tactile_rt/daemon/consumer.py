@@ -97,8 +97,8 @@ class Consumer(abc.ABC):
         return {}
 
     def diagnose(self) -> str:
-        """Say what keeps it from its work now, without a number that counts on; empty: nothing.
-        Called from any thread, must be quick."""
+        """Say what keeps it from its work now; empty: nothing. It holds no number that counts on,
+        is called from any thread, must be quick."""
         return ""
 
     def on_disk(self) -> Mapping[str, OnDisk]:
