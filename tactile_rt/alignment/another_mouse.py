@@ -59,8 +59,6 @@ class BesideMice:
         fit: (model,) The mean fit of each model; NaN where no layer has an RDM.
         error: (model,) The standard error of that less the ceiling, over animals and stimuli.
         floor: (model,) What each fit exceeds in seven of eight cases, given that error.
-        ceiling: The mean fit of a mouse to another.
-        bound: The fit that one more mouse would exceed in nine of ten cases.
     """
 
     fits: Floats
@@ -86,7 +84,6 @@ class Power:
     """What the two tests find in a benchmark, by trial on its own mice.
 
     Attributes:
-        passes: The share of the mice that pass when taken for a model of the others.
         fails: The share of damaged mice that fail, by the share of the geometry that they lost.
     """
 

@@ -73,9 +73,6 @@ def decode_paper(patterns: ArrayLike) -> Decoded:
     """The paper's variant (Table "Stimuli decoding"): logistic regression, one stimulus held out.
 
     Its chance is that of every way to divide the stimuli into classes of the same sizes.
-
-    Args:
-        patterns: (6, unit), as they are.
     """
     values = np.asarray(patterns, dtype=np.float64)
     values = values - values.mean(axis=0)

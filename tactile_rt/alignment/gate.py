@@ -42,12 +42,7 @@ LARGEST_DROP = 0.05  # of the noise ceiling
 
 @dataclass(frozen=True)
 class Check:
-    """One test and how it went.
-
-    Attributes:
-        code: The outcome of the test: `PASS`, `FAIL` or `INCONCLUSIVE`.
-        why: The reason for the outcome, in a line with the figures.
-    """
+    """One test and how it went."""
 
     name: str
     code: int
@@ -105,9 +100,6 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
 
     That takes a fit within the margin of the noise ceiling, and a p of the maximum below
     `LARGEST_P`. What is neither worse nor shown to be like one is inconclusive.
-
-    Args:
-        power: of the test in this benchmark, to be told beside the verdict.
     """
     found = mice.compare(score.rdms[None])
     fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling

@@ -36,9 +36,6 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
         What to call each: what a file calls itself; a training run by its folder, one of a grid by
         its task, and where runs are alike in that, by as many folders as tell them apart. What is
         called alike all the same is told apart as `told_apart` has it.
-
-    Raises:
-        ModelError, ConfigError: one is not such a file.
     """
     names: list[str] = []
     runs = {path: path.resolve().parent for path in paths if path.name == BEST}
@@ -91,7 +88,6 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
     """Layers, and the model's accuracy on its task with what it was measured on, where known.
 
     Raises:
-        ModelError: not such a file.
         ConfigError: the stimuli are of another array.
     """
     if path.suffix == CHECKPOINT:
@@ -114,7 +110,6 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
     card that does not name its network.
 
     Raises:
-        ModelError: not such a file.
         ConfigError: a seed below 0.
     """
     if path.suffix == RESPONSES:

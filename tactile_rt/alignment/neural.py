@@ -156,9 +156,6 @@ def read_published(path: Path) -> dict[str, Floats]:
     animal: it is passed over, and nothing is ever unpickled.
 
     The stimulus axis has no names in such a file, so only protocol paper-code can use it.
-
-    Raises:
-        ConfigError: not such a file.
     """
     try:
         with zipfile.ZipFile(path) as archive:

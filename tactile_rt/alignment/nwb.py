@@ -75,9 +75,6 @@ def find_nwb(paths: Iterable[Path]) -> list[Path]:
     """Files named, and those in folders named.
 
     Of a folder, files with ``ecephys`` in their names if there are any: others have no spikes.
-
-    Raises:
-        ConfigError: nothing there.
     """
     found = []
     for path in paths:
@@ -105,9 +102,6 @@ def read_nwb(
 
     Args:
         window: rates count from first ``contact`` or from the ``start`` of the trial, to choice.
-        progress: called with the share done, 0 to 1, after every unit.
-        clock: spike times are on the ``session``'s clock, or the ``recording``'s.
-        selection: which sessions and units are kept; None for all.
 
     Returns:
         What was read of the sessions that are selected, and notes on what was left out, sessions
@@ -153,11 +147,7 @@ def read_session(
     clock: str = "session",
     selection: Selection | None = None,
 ) -> Reading:
-    """One NWB file; see `read_nwb`.
-
-    Raises:
-        ConfigError: naming the file, which cannot be read as one of these recordings, and why.
-    """
+    """One NWB file; see `read_nwb`."""
     for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")

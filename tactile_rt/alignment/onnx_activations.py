@@ -38,12 +38,7 @@ TAP = "tap:"  # prefix of the outputs that are added
 
 
 def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
-    """Read the layers of a step or window file, and its card.
-
-    Raises:
-        ModelError: not there, damaged, or not a model of this package.
-        ConfigError: the stimuli are of another array.
-    """
+    """Read the layers of a step or window file, and its card."""
     with _readable(path):
         plain, card, model = _opened(path, stimuli)
         taps = named_taps(model)
@@ -76,11 +71,7 @@ def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
 
 
 def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelProto:
-    """A copy whose tensors are outputs too, ``tap:`` and their name; of a window for every step.
-
-    Args:
-        tensors: names in the graph of the step.
-    """
+    """A copy whose tensors are outputs too, ``tap:`` and their name; of a window for every step."""
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
     graph, scan = step_graph(copy)

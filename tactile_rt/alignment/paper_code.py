@@ -56,7 +56,6 @@ def freeze_paper_code(
 
     Args:
         rates: (row, 6, unit) per animal, in the published layout.
-        progress: called with the share done, 0 to 1.
 
     Raises:
         ConfigError: no animal has a mean response that makes an RDM; one of several is left out.

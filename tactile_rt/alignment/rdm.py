@@ -45,11 +45,7 @@ UPPER = np.triu_indices(len(STIMULI), k=1)
 
 
 def stimulus_index(shape: str, distance: str) -> int:
-    """Place of a stimulus on the named axis; ``near`` is ``close``.
-
-    Raises:
-        ConfigError: no such shape or distance.
-    """
+    """Place of a stimulus on the named axis; ``near`` is ``close``."""
     distance = SYNONYMS.get(distance, distance)
     if shape not in SHAPES:
         raise ConfigError(f"no shape {shape!r}: there are {', '.join(SHAPES)}")

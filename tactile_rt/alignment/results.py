@@ -25,13 +25,10 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
 
     Attributes:
         performance: The accuracy on the task, 0 to 1; NaN if no accuracy is known.
-        performance_of: The words that say what that accuracy was measured on.
-        untrained: The score of the network before its training, where there is one.
         groups: The groups that the model belongs to, by what they divide models by: encoder,
             attender, objective, augmentation, masking; without those that are not known.
         turing: The verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty
             under paper-code.
-        turing_why: The reason for that verdict, and what the test would find in this benchmark.
     """
 
     name: str
@@ -56,7 +53,6 @@ class Results(
 
     Attributes:
         raw: The control that no model is needed for: the readings of the sensors themselves.
-        input: The file name and the SHA-256 sum of the stimuli's loads.
     """
 
     benchmark: Benchmark
@@ -121,11 +117,7 @@ def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
 
 
 def read_results(path: Path) -> Results:
-    """Read scores from the JSON that `tactile-rt align score` writes.
-
-    Raises:
-        ConfigError: not there, damaged, or of another version.
-    """
+    """Read scores from the JSON that `tactile-rt align score` writes."""
     results = read_json(path, Results, "tactile-rt align score --json")
     check_benchmark(results.benchmark, path)
     targets = tuple(t.name for t in results.benchmark.all_targets)

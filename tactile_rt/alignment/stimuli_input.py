@@ -33,7 +33,6 @@ class StimuliInput:
         sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
             assumed of a sensor. The tare is zero, for the whiskers rest before they whisk.
         elements, channels, units: Names along the last two axes, and the unit of each channel.
-        sha256: The SHA-256 sum of the samples, hex.
     """
 
     samples: NDArray[np.float32]
@@ -55,7 +54,6 @@ class StimuliInput:
         """Hold the input against what a model was trained on.
 
         Args:
-            model: what messages call it.
             period_ns: of its samples, ns; None where that is not known.
 
         Raises:

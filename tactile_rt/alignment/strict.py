@@ -128,10 +128,6 @@ def freeze_strict(
     Args:
         animals: whose rates count from first contact to choice, and no session twice.
         bootstraps: the number of divisions of the trials; each is used in both directions.
-        progress: called with the share done, 0 to 1.
-
-    Raises:
-        ConfigError: no session can be used.
     """
     names, notes = [], []
     targets: list[Target] = []

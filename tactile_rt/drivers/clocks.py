@@ -64,7 +64,6 @@ class Stamper:
         stats: The account in which losses are counted; deliveries are the reader's to count.
 
     Attributes:
-        sequencer: Numbers the samples by the device's counter.
         clock: The clock that dates the samples; None for a device that sends neither time nor
             count.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.

@@ -76,7 +76,6 @@ class Step(Generic[Packet]):
         timeout_s: Longest time that the answer may take, s; a device that does not answer in time
             counts as not there.
         pause_s: Time to wait before the next step, answer or not, s.
-        what: The step in words, for the message when no answer comes.
     """
 
     send: Packet
@@ -203,9 +202,6 @@ class Codec(abc.ABC, Generic[Packet]):
         """Options that a device may have besides the defaults, of those that change its frames.
 
         For whoever must find out what a device is.
-
-        Args:
-            identifiers: The CAN identifiers of 11 bits that there are.
         """
         return []
 
@@ -304,11 +300,7 @@ def six_axis(name: str, rate_hz: float) -> ArraySpec:
 
 
 def codec_class(wire: str, name: str) -> type[Codec[Any]]:
-    """The codec of this name for ``serial`` or ``can``.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """The codec of this name for ``serial`` or ``can``."""
     if (wire, name) in CODECS:
         module, attribute, _ = CODECS[wire, name]
         there = import_module(module)

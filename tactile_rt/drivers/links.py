@@ -20,11 +20,7 @@ WAIT_S = 0.05  # how soon a line without a descriptor looks for the end of the w
 
 
 class Link(abc.ABC, Generic[Packet]):
-    """A line to a device; opened when made.
-
-    Raises:
-        SourceError: it cannot be opened: what and why.
-    """
+    """A line to a device; opened when made."""
 
     name: str
     can_errors = 0

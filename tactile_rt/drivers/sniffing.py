@@ -73,7 +73,6 @@ class CodecFit:
         samples: Number of samples; of a device that has not described itself 0.
         explained: Part of the bytes, or of the bus's frames, that is of this device's frames.
         proof: Part of damaged frames that the codec notices, 0 to 1.
-        likely: Whether there are frames and, of a device that has told all that it must, samples.
     """
 
     wire: str
@@ -131,9 +130,6 @@ def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> l
 
     Args:
         frames: as they came; other devices may be on the bus.
-
-    Raises:
-        ConfigError: one of `further` cannot be.
     """
     frames = frames[:LOOK_FRAMES]
     packets = [[frame] for frame in frames]
@@ -246,9 +242,6 @@ def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Itera
     Args:
         seconds: how long to listen at each, s.
         speeds: (baud, parity) of each.
-
-    Raises:
-        SourceError: it cannot be opened, or is gone.
     """
     link = SerialLink(port, *speeds[0])
     try:

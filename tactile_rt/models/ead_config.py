@@ -65,11 +65,7 @@ def _encoders(asked: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class EADConfig:
-    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters.
-
-    Raises:
-        ConfigError: a field that names or measures nothing possible.
-    """
+    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters."""
 
     classes: int
     encoder: str = "zhuang-intersection-ln"

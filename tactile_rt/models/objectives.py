@@ -162,9 +162,6 @@ class SimCLR(Objective):
     """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is thrown away afterwards.
 
     Both views are one batch, to batch norms in the network, too.
-
-    Args:
-        temperature: as `nt_xent` takes it.
     """
 
     views = 2

@@ -56,9 +56,6 @@ class Surface:
         chord_mm, height_mm: The straight width and height of the face, mm.
         thickness_mm: The thickness of the sheet, behind the face, mm.
         facets: The number of flat strips that the face is made of; their edges lie on the arc.
-
-    Raises:
-        ConfigError: no such shape, or an impossible size.
     """
 
     shape: str
@@ -218,9 +215,6 @@ def write_input(
     Args:
         path: ends in .npz; both files appear whole or not at all.
         angles: (sample, element, 3) base angles theta, phi, zeta at 1 kHz, rad.
-
-    Raises:
-        ConfigError: a stimulus is not touched, or for too short a time.
     """
     windows = []
     for name, what in felt.items():

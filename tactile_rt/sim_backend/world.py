@@ -177,7 +177,6 @@ def add_whiskers(
 
     Args:
         whiskers: the array; names of all whiskers in one world differ.
-        head: name of the head's body, which is returned.
     """
     body = world.worldbody.add_body(name=head, pos=mount.position, quat=quaternion(mount.rotation))
     for whisker in whiskers:

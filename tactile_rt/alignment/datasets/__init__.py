@@ -87,11 +87,7 @@ def dataset_names() -> tuple[str, ...]:
 
 
 def find_dataset(name: str) -> NeuralDataset:
-    """A dataset by its name.
-
-    Raises:
-        ConfigError: no such dataset, or it cannot be loaded.
-    """
+    """A dataset by its name."""
     if name in DATASETS:
         module, _, attribute = DATASETS[name].partition(":")
         ours: NeuralDataset = getattr(import_module(module), attribute)

@@ -86,7 +86,6 @@ class FramePart:
         extended: Whether the identifier has 29 bits.
         length: Length of the message's data, bytes.
         when: The multiplexers in the message, and the values of each that make a frame this part.
-        message: The message as cantools read it, which encodes the data of an emulated device.
     """
 
     id: int
@@ -178,11 +177,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_mapping(path: Path) -> DbcMapping:
-    """Read a mapping and the DBC file that it names.
-
-    Raises:
-        ConfigError: one line that names the file, the message or signal, and the nearest name.
-    """
+    """Read a mapping and the DBC file that it names."""
     file: _File = convert(read_toml(path), _File)
     return _Reader(path, file).mapping()
 

@@ -143,9 +143,6 @@ def _within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_]:
 class FrameLayout:
     """A mapping, checked, as a codec wants it.
 
-    Raises:
-        ConfigError: the frame cannot be so; names file and key.
-
     Attributes:
         sync, ends: The bytes with which a frame begins and ends.
         between: A pattern of what else comes between frames.

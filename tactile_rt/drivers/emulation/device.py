@@ -32,11 +32,7 @@ class EmulatedDevice:
     """An emulated device on a line that exists; a context manager, plugged in while entered.
 
     Attributes:
-        codec: The codec that the device speaks; it also remembers what hosts have commanded.
         emulator: The emulator behind the line; its `log` tells what it did with each sample.
-
-    Raises:
-        ConfigError: The codec or one of its options is unknown.
     """
 
     wire: ClassVar[str]

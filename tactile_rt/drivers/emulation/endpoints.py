@@ -44,11 +44,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def plug(self) -> None:
-        """Appear.
-
-        Raises:
-            ConfigError: it cannot: what and why.
-        """
+        """Appear."""
 
     @abc.abstractmethod
     def pull(self) -> None:
@@ -159,10 +155,8 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
     """A device on a CAN bus with an slcan adapter on a pty: frames come once the channel is open.
 
     Args:
-        link: A name under which the port appears, besides /dev/pts/N.
         bitrate: Speed of the bus, bit/s; a host that chooses another one hears nothing. None
             accepts any.
-        fifo_bytes: How many bytes the port holds for a host that does not read.
         paced: Whether frames take the time that they take on a bus of the host's bit rate.
     """
 
@@ -217,9 +211,6 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
 
     Args:
         bitrate: Speed of the bus, bit/s, where the interface sets it.
-
-    Raises:
-        ConfigError: not such a name.
     """
 
     wire = "can"

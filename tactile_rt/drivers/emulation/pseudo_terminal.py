@@ -128,7 +128,6 @@ class Pty:
         """Queue all of these bytes, or none: nobody has it open, or there is no room.
 
         Args:
-            answer: Whether this answers a command, for which there is more room.
             takes_s: The time that they take on the wire, s.
         """
         with self.lock:

@@ -63,11 +63,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """The frame, nodes, and the dense node that is read out.
-
-    Raises:
-        ConfigError: from the constructor, in one line that names the node and what is wrong.
-    """
+    """The frame, nodes, and the dense node that is read out."""
 
     frame: Input
     nodes: tuple[Node, ...]

@@ -45,11 +45,7 @@ class _File(msgspec.Struct):
 
 
 def parse_graph(text: str, where: str = "graph") -> Graph:
-    """Read a graph from TOML, as in the module's docstring.
-
-    Raises:
-        ConfigError: naming `where`, the line, the key and what is wrong.
-    """
+    """Read a graph from TOML, as in the module's docstring."""
     tree = parse_toml(text, where)
     file: _File = convert(tree, _File)
     for table in ("inputs", "nodes"):

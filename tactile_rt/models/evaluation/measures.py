@@ -103,9 +103,6 @@ def predict(
 def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
     """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected,
     or the network overflows.
-
-    Args:
-        run: as `predict` takes it.
     """
     logits, found = run_over(cut, run)
     with np.errstate(invalid="ignore"):
@@ -121,7 +118,6 @@ def cut_windows(
     """The windows of all sweeps as the robot would cut them, so many at a time.
 
     Args:
-        data, seed, disturbance: as `predict` takes them.
         batch: sweeps whose windows come together.
     """
     rng = np.random.default_rng(seed)

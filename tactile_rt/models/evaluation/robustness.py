@@ -72,7 +72,6 @@ def measure_robustness(
     """Accuracy under every condition, the first without any.
 
     Args:
-        run: as `measures.predict` takes it.
         clean: (sweep, class) final posteriors of the same sweeps, undisturbed.
     """
     labels, objects = test.sweeps.labels, test.sweeps.objects
@@ -88,11 +87,7 @@ def measure_robustness(
 
 
 def robustness_records(found: list[Robustness], how: str) -> list[Record]:
-    """One figure per condition.
-
-    Args:
-        found: as `measure_robustness` gives it.
-    """
+    """One figure per condition."""
     return [
         Record(
             f"models.top-1, {r.name}",

@@ -85,7 +85,6 @@ class Outcome(msgspec.Struct, frozen=True):
             at the rated noise.
         seconds: The CPU time of the training that was scored, s, as in `Training`.
         trials, growth: What chose rate and warm-up, then the updates; of the first seed alone.
-        failed: The reason why there is no figure; empty if there is one.
     """
 
     name: str

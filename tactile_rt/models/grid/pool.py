@@ -41,11 +41,9 @@ def run_grid(
         folder: where its sweeps, runs and outcomes go.
         processes: to share the tasks; one works in this process.
         report: called with each outcome as it comes, and how many of all there are.
-        accelerator: what trains, as `train` takes it.
 
     Raises:
         ConfigError: the folder holds outcomes of another grid, or another process works in it.
-        RecordingError: the sweep set cannot be read.
     """
     with alone_in(folder):
         _run(grid, folder, processes, report, accelerator)
@@ -116,7 +114,6 @@ def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
     """Write, or go on writing, the first sweeps of every object of a set.
 
     Raises:
-        RecordingError: the source cannot be read.
         ConfigError: the folder holds another set.
     """
     manifest = SweepManifest.read(source)

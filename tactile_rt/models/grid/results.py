@@ -28,7 +28,6 @@ class Row:
         seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
         share: The share of the training objects that it learnt from.
         flat: Whether the last of these gained less than the grid asks for.
-        failed: The reason why seeds are missing; empty if none failed.
     """
 
     name: str

@@ -63,7 +63,6 @@ class WhiskerArray:
     """Whiskers on one head.
 
     Attributes:
-        name: The name that the array is called by, e.g. ``mouse-right``.
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
         sensor: What reads the whiskers; None: the base loads are read as they are.
 

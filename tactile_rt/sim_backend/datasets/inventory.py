@@ -35,11 +35,9 @@ class Tally:
     """Counts of a set.
 
     Attributes:
-        sweeps: The number of sweeps that are there.
         misses: The number of these sweeps that pass beside the array.
         unstable: The number of these sweeps that could not be simulated at the set's profile, and
             are empty.
-        skipped: The number of objects that could not be made.
     """
 
     sweeps: int = 0
@@ -59,14 +57,7 @@ class Tally:
 
 
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
-    """Count what there is of these objects.
-
-    Args:
-        sweeps: of each of them.
-
-    Raises:
-        RecordingError: an object's file is damaged.
-    """
+    """Count what there is of these objects."""
     there = [name for name in names if has_object(folder, name)]
     misses = unstable = 0
     for name in there:

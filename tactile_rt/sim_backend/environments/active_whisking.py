@@ -63,11 +63,7 @@ def whisker_nodes(head: WhiskingHead) -> list[Floats]:
 
 
 def picture(head: WhiskingHead) -> NDArray[np.uint8]:
-    """(320, 640, 3) the array, red where whiskers touch, and the object.
-
-    Raises:
-        ModuleNotFoundError: without Pillow (extra ``view``).
-    """
+    """(320, 640, 3) the array, red where whiskers touch, and the object."""
     from PIL import Image, ImageDraw
 
     placed = head.placed

@@ -86,9 +86,6 @@ def place_beside(
 ) -> Placed | None:
     """Stand an object ahead of an array, to the side to which its whiskers reach.
 
-    Args:
-        size_mm, yaw_deg, height_mm, distance_mm, gap_mm: as in `Sweep`.
-
     Returns:
         Where it stands; None if the head would go past it without a touch.
     """

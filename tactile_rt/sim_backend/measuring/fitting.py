@@ -76,7 +76,6 @@ def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
     Raises:
         ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or as
             `read_described`.
-        SpecMismatch: as `read_described`.
     """
     array = read_described(path, spec)
     sensor = array.sensor

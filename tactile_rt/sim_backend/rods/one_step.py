@@ -120,9 +120,6 @@ def step(
         q, v: (degree of freedom,) rad and rad/ms.
         base: see `chains.inertial_forces`.
         surface: (3,) velocity of the object, mm/ms.
-        count, near: what is near, see `touching.find_near`.
-        link_of: (segment,) the link on which each segment is.
-        last: see `stepping.RodState`.
     """
     clamped, stiffness, friction = chain.clamped, chain.stiffness, chain.friction
     nodes, frames, axes = pose

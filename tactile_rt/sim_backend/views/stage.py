@@ -34,7 +34,6 @@ class Dressed:
     """A copy of a simulation's model, and a state of it, made fit to be seen.
 
     Attributes:
-        model, data: The copies of the simulation's model and of a state.
         sites: The site at each element's base, by number, in the order of the elements.
     """
 
@@ -152,9 +151,6 @@ class Stage:
 
     Args:
         width, height: of the pictures, pixels.
-
-    Raises:
-        ConfigError: this machine has no OpenGL to draw with.
     """
 
     def __init__(
