@@ -25,8 +25,9 @@ from tactile_rt.alignment.benchmark import (
 )
 from tactile_rt.alignment.building import build
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import STIMULI, rsa, stimulus_index
+from tactile_rt.alignment.rdm import rsa, stimulus_index
 from tactile_rt.alignment.scoring import Score, layer_rdms, score, score_rdms
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "PROTOCOLS",

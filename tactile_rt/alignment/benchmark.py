@@ -14,9 +14,10 @@ import msgspec
 import numpy as np
 
 from tactile_rt.alignment.json_file import Floats, Number, encode, read_json, write_json
-from tactile_rt.alignment.rdm import PAIRS, STIMULI
+from tactile_rt.alignment.rdm import PAIRS
 from tactile_rt.alignment.statistics import standard_error
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "PROTOCOLS",

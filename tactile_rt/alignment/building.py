@@ -10,19 +10,14 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
-from tactile_rt.alignment.neural import (
-    NeuralSession,
-    by_animal,
-    published_layout,
-    read_published,
-)
+from tactile_rt.alignment.neural import NeuralSession, by_animal, published_layout, read_published
 from tactile_rt.alignment.nwb import Reading, find_nwb, read_nwb
 from tactile_rt.alignment.paper_code import freeze_paper_code
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, trial_mean
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["animal_means", "build", "checked_sessions", "refuse_copies"]
 

@@ -15,7 +15,8 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import DISTANCES, SHAPES, STIMULI, rdm, square
+from tactile_rt.alignment.rdm import rdm, square
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 __all__ = ["Decoded", "decode", "decode_paper", "decode_rdm", "mean_decoded"]
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import DISTANCES, SHAPES, STIMULI
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 __all__ = ["MODELS", "Brain", "example_models"]
 

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.example import MODELS, Brain, example_models, gains
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import whole_folder
+from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
     import h5py

@@ -33,9 +33,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark
-from tactile_rt.alignment.rdm import PAIRS, STIMULI, UPPER, relabellings, square
+from tactile_rt.alignment.rdm import PAIRS, UPPER, relabellings, square
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "FAIL",

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.alignment.layers import PARTS, Layers
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 
 __all__ = [
@@ -116,10 +116,7 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
         return None
     if seed < 0:
         raise ConfigError(f"a seed is at least 0, not {seed}")
-    from tactile_rt.alignment.activations import (
-        untrained_card_layers,
-        untrained_layers,
-    )
+    from tactile_rt.alignment.activations import untrained_card_layers, untrained_layers
 
     if path.suffix == CHECKPOINT:
         from tactile_rt.models.checkpoints import load_checkpoint

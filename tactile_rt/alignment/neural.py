@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "Animal",

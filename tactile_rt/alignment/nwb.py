@@ -38,10 +38,11 @@ from tactile_rt.alignment.nwb_parts import (
     trial_columns,
     unit_column,
 )
-from tactile_rt.alignment.rdm import DISTANCES, SHAPES, stimulus_index
+from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.packages import lacking
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
 if TYPE_CHECKING:
     import h5py

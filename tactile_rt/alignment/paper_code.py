@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import pad, rates_sha256
-from tactile_rt.alignment.rdm import STIMULI, pearson, rdm
+from tactile_rt.alignment.rdm import pearson, rdm
 from tactile_rt.alignment.reliability import (
     BOOTSTRAPS,
     SEED,
@@ -38,6 +38,7 @@ from tactile_rt.alignment.reliability import (
     trial_mean,
 )
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["POOLED", "freeze_paper_code"]
 

@@ -12,10 +12,11 @@ from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_be
 from tactile_rt.alignment.gate import neural_checks
 from tactile_rt.alignment.json_file import Floats, Number, read_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.rdm import PAIRS, STIMULI, normalised
+from tactile_rt.alignment.rdm import PAIRS, normalised
 from tactile_rt.alignment.scoring import Score, score
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["ModelResult", "Results", "baseline_of", "model_result", "read_results", "results_of"]
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from tactile_rt.alignment.benchmark import Benchmark
 from tactile_rt.alignment.json_file import Floats, Number
-from tactile_rt.alignment.rdm import PAIRS, STIMULI, pearson, rdm
+from tactile_rt.alignment.rdm import PAIRS, pearson, rdm
 from tactile_rt.alignment.statistics import (
     held_out,
     highest,
@@ -17,6 +17,7 @@ from tactile_rt.alignment.statistics import (
     standard_error,
 )
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["Score", "layer_rdms", "score", "score_rdms"]
 

@@ -29,9 +29,10 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import Animal, NeuralSession, rates_sha256
-from tactile_rt.alignment.rdm import CONSTANT, STIMULI, UPPER, normalised, pearson
+from tactile_rt.alignment.rdm import CONSTANT, UPPER, normalised, pearson
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "MINIMUM_RELIABILITY",

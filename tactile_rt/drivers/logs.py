@@ -21,14 +21,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.log_lines import (
-    Found,
-    of_candump,
-    of_gvret,
-    of_heard,
-    of_hex,
-    of_slcan,
-)
+from tactile_rt.drivers.log_lines import Found, of_candump, of_gvret, of_heard, of_hex, of_slcan
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 

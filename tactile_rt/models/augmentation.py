@@ -28,14 +28,7 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models import published_pictures
 from tactile_rt.models.array_symmetries import compose, symmetries
 
-__all__ = [
-    "Augmentation",
-    "as_published",
-    "build",
-    "image",
-    "mask_steps",
-    "tactile_paper",
-]
+__all__ = ["Augmentation", "as_published", "build", "image", "mask_steps", "tactile_paper"]
 
 HALF = 0.5
 JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's, and a noise of the log

@@ -31,15 +31,7 @@ from tactile_rt.models.ead_config import (
 )
 from tactile_rt.models.encoders.cells import Cell
 
-__all__ = [
-    "ATTENDERS",
-    "DECODERS",
-    "EAD",
-    "ENCODERS",
-    "READOUTS",
-    "EADConfig",
-    "count_parameters",
-]
+__all__ = ["ATTENDERS", "DECODERS", "EAD", "ENCODERS", "READOUTS", "EADConfig", "count_parameters"]
 
 GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and only there
 

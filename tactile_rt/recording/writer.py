@@ -40,14 +40,7 @@ from tactile_rt.recording.description import (
     seal,
     utc_offset_ns,
 )
-from tactile_rt.recording.layout import (
-    HEALTH,
-    SAMPLES,
-    WIRE,
-    Packet,
-    encode_packet,
-    samples_in,
-)
+from tactile_rt.recording.layout import HEALTH, SAMPLES, WIRE, Packet, encode_packet, samples_in
 from tactile_rt.recording.ros2.cdr import schema_text
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer

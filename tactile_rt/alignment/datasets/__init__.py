@@ -13,11 +13,11 @@ from importlib import import_module
 from pathlib import Path
 
 from tactile_rt.alignment.neural import Animal
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import added, added_names
 from tactile_rt.core.settings import no_such
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.reliability import spearman_brown
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "DIVISIONS",

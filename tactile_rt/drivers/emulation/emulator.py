@@ -17,12 +17,7 @@ from tactile_rt.core.stream import NS_PER_S, Chunk, EndOfStream, Source
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedule
-from tactile_rt.drivers.emulation.transmitter import (
-    EmulatedClock,
-    RateConverter,
-    Transmitter,
-    fit,
-)
+from tactile_rt.drivers.emulation.transmitter import EmulatedClock, RateConverter, Transmitter, fit
 
 __all__ = ["PACES", "Emulator"]
 

@@ -10,13 +10,7 @@ from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = [
-    "Robustness",
-    "conditions",
-    "measure_robustness",
-    "rated_amount",
-    "robustness_records",
-]
+__all__ = ["Robustness", "conditions", "measure_robustness", "rated_amount", "robustness_records"]
 
 
 REST = 80  # samples: 0.7 s of a mouse's, which a tare can be taken from

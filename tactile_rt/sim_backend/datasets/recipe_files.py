@@ -28,13 +28,7 @@ from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = [
-    "DEFAULT_RECIPE",
-    "read_recipe",
-    "recipe_from_dict",
-    "recipe_of_set",
-    "shipped_recipes",
-]
+__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_from_dict", "recipe_of_set", "shipped_recipes"]
 
 DEFAULT_RECIPE = "wide24"
 

@@ -23,13 +23,7 @@ import trimesh
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "MESH_SUFFIXES",
-    "check_mesh_file",
-    "mesh_content",
-    "read_parts",
-    "read_triangles",
-]
+__all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
 
 MOST_UNPACKED: Final = 256 << 20  # bytes of an archive ...
 MOST_RATIO: Final = 100  # ... and times its own size; XML of numbers has 10

@@ -45,11 +45,7 @@ from tactile_rt.sim_backend.objects.deviation import (
     surface_of,
 )
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM, STANDARD, MeshDetail
-from tactile_rt.sim_backend.objects.mesh_files import (
-    check_mesh_file,
-    mesh_content,
-    read_triangles,
-)
+from tactile_rt.sim_backend.objects.mesh_files import check_mesh_file, mesh_content, read_triangles
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
 __all__ = ["Pieces", "cache_key", "load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
