@@ -166,11 +166,7 @@ def load_benchmark(path: Path) -> Benchmark:
 
 
 def load_strict(path: Path) -> Benchmark:
-    """Read a benchmark of the protocol whose stimuli have names, as gate and decoder need.
-
-    Raises:
-        ConfigError: as `load_benchmark`; or the benchmark is of the other protocol.
-    """
+    """Read a benchmark of the protocol whose stimuli have names, as gate and decoder need."""
     benchmark = load_benchmark(path)
     if benchmark.protocol != "strict":
         raise ConfigError(

@@ -45,7 +45,6 @@ class BoardRow(msgspec.Struct, frozen=True):
     Attributes:
         kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or
             ``animal``.
-        parameters: The count of numbers that the model is made of; 0 where there are none.
     """
 
     name: str
@@ -147,7 +146,6 @@ def with_cells(
 
     Args:
         rows: each with its layers for this dataset's conditions.
-        parts: of cortex, from `targets.TARGET_PARTS`.
     """
     from threadpoolctl import threadpool_limits
 

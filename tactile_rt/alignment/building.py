@@ -120,9 +120,6 @@ def checked_sessions(
     Args:
         strict: rates count from first contact, and sessions of another clock are left out; else
             from the start of the trial, and a note warns of them.
-
-    Returns:
-        Sessions, and notes that begin with what the clock's check found.
     """
     clock = clock or ("session" if strict else "recording")
     window = "contact" if strict else "start"

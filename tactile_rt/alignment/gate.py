@@ -109,11 +109,7 @@ class BesideMice:
 
 @dataclass(frozen=True)
 class Power:
-    """What the two tests find in a benchmark, by trial on its own mice.
-
-    Attributes:
-        fails: The share of damaged mice that fail, by the share of the geometry that they lost.
-    """
+    """What the two tests find in a benchmark, by trial on its own mice."""
 
     passes: float
     fails: dict[float, float]

@@ -15,14 +15,7 @@ from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 
-__all__ = [
-    "RESPONSES",
-    "check_models",
-    "load_layers",
-    "load_untrained",
-    "responses_layers",
-    "told_apart",
-]
+__all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
 
 CHECKPOINT, BEST = ".pt", "best.pt"
 OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
@@ -39,7 +32,10 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
     """
     names: list[str] = []
     runs = {path: path.resolve().parent for path in paths if path.name == BEST}
-    called = {folder: _run_name(folder) for folder in runs.values()}
+    called = {
+        folder: folder.parent.name if (folder / OF_GRID).exists() else folder.name
+        for folder in runs.values()
+    }
     depth = 1
     while len(set(called.values())) < len(called):
         depth += 1
@@ -67,10 +63,6 @@ def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
         again = (f"{called[:-1]}, {number})" for number in count(2))
         found.append(called if called not in found else next(a for a in again if a not in found))
     return tuple(found)
-
-
-def _run_name(folder: Path) -> str:
-    return folder.parent.name if (folder / OF_GRID).exists() else folder.name
 
 
 def _own_name(path: Path) -> str:

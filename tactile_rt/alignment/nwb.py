@@ -62,7 +62,6 @@ class Reading(NamedTuple):
     """What a file holds.
 
     Attributes:
-        task: The task of the mouse, ``discrimination`` or ``detection``.
         response: The change of the rates with contact; None without contacts to tell by.
     """
 
@@ -107,9 +106,6 @@ def read_nwb(
     Returns:
         What was read of the sessions that are selected, and notes on what was left out, sessions
         that cannot be read among these.
-
-    Raises:
-        ConfigError: no session is left; why, of each.
     """
     _h5py()
     wanted = selection or Selection()

@@ -26,11 +26,7 @@ MAPS_A_ROW = 4
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar, hatched where its value is NaN.
-
-    Attributes:
-        ring: Whether the bar counts in the score, and is framed.
-    """
+    """One bar, hatched where its value is NaN."""
 
     name: str
     value: float

@@ -50,11 +50,7 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
 class Results(
     msgspec.Struct, frozen=True, eq=False, tag_field="kind", tag="tactile_rt alignment scores 2"
 ):
-    """One file of scores.
-
-    Attributes:
-        raw: The control that no model is needed for: the readings of the sensors themselves.
-    """
+    """One file of scores."""
 
     benchmark: Benchmark
     models: tuple[ModelResult, ...]

@@ -40,7 +40,6 @@ class Score(msgspec.Struct, frozen=True, eq=False):
             `corrected`.
         p: The share of the 720 relabellings of the stimuli, layers chosen anew, that reach the
             score, at least 1/720.
-        null_95: The 95th percentile of their scores, which chance exceeds once in twenty times.
     """
 
     protocol: str

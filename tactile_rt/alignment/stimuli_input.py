@@ -89,11 +89,7 @@ class StimuliInput:
 
 
 def read_stimuli(path: Path | None = None) -> StimuliInput:
-    """Read what `tactile-rt whisk` wrote; without a path, the input that ships.
-
-    Raises:
-        ConfigError: not there, not such a file, or not all six stimuli.
-    """
+    """Read what `tactile-rt whisk` wrote; without a path, the input that ships."""
     path = SHIPPED if path is None else path
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -34,17 +34,7 @@ from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = [
-    "MINIMUM_RELIABILITY",
-    "MINIMUM_TRIALS",
-    "MINIMUM_UNITS",
-    "Divided",
-    "Moments",
-    "canonical",
-    "divided",
-    "freeze_strict",
-    "moments_of",
-]
+__all__ = ["MINIMUM_TRIALS", "MINIMUM_UNITS", "divided", "freeze_strict"]
 
 Floats = NDArray[np.float64]
 

@@ -145,7 +145,6 @@ class Codec(abc.ABC, Generic[Packet]):
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
-        greeting: What the device says when it is switched on, before anything else.
         measures: Whether the device measures although no host has asked for samples. The device's
             side.
         newest: The newest sample of a device that measures and does not send, None if there is
@@ -192,9 +191,6 @@ class Codec(abc.ABC, Generic[Packet]):
         Args:
             chunk: Samples of `spec`; `seq` is the device's counter and `t_ns` its clock, neither
                 wrapped.
-
-        Returns:
-            One packet per sample.
         """
 
     @classmethod

@@ -191,7 +191,6 @@ def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
 
     Args:
         form: one of `FORMS`; empty: as it begins.
-        bus: of a CAN log with several, the one to take; empty for all.
     """
     if form and form not in FORMS:
         raise ConfigError(f"no form {form!r} of a log: there are {', '.join(FORMS)}")

@@ -132,9 +132,6 @@ def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
 def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:
     """What opens the device on a serial port.
 
-    Args:
-        array: of a device that would be asked what it is; it is not asked then.
-
     Raises:
         ConfigError: wrong options. To open what is returned raises `SourceError` if the port
             cannot be opened, or the device does not send.
@@ -163,7 +160,6 @@ def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = N
     Raises:
         ConfigError: wrong options. To open what is returned raises `SourceError` if the bus cannot
             be opened, or the device does not send.
-        SpecMismatch: the calibration is of another device.
     """
     from can import VALID_INTERFACES
 

@@ -69,7 +69,6 @@ class CodecFit:
     """A codec that fits.
 
     Attributes:
-        options: The codec's options besides their defaults.
         samples: Number of samples; of a device that has not described itself 0.
         explained: Part of the bytes, or of the bus's frames, that is of this device's frames.
         proof: Part of damaged frames that the codec notices, 0 to 1.
@@ -98,9 +97,6 @@ def sniff_bytes(data: bytes, further: Sequence[Tried] = ()) -> list[CodecFit]:
     Args:
         data: bytes as they came, cut anywhere; the first 64 kB are looked at, and where nothing
             fits them, the second half of these.
-
-    Raises:
-        ConfigError: one of `further` cannot be.
     """
     data = data[:LOOK_BYTES]
     # what comes first may be a device that starts, or the line before it was plugged in
@@ -266,7 +262,6 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
 
     Args:
         url: ``can:INTERFACE:CHANNEL``, with the bus's options.
-        seconds: how long to listen, s.
     """
     link: Link[Any] = open_line(url)
     frames: list[CanFrame] = []

@@ -137,7 +137,7 @@ def _encoder(config: EADConfig) -> Any:
     module, name = encoder_class(config.encoder)
     kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
     if config.encoder == "graph":
-        from tactile_rt.models.encoders.graph_files import parse_graph
+        from tactile_rt.models.encoders.graph import parse_graph
 
         graph = parse_graph(config.graph)
         read = graph.frame

@@ -88,7 +88,6 @@ class Objective(nn.Module):
 
         Args:
             views: `self.views` batches of loads, SI.
-            generator: on the loads' device; the augmentation of frames draws from it.
         """
         return [self.frames(view, generator) for view in views]
 

@@ -46,10 +46,7 @@ class NeuralDataset:
     """A public set of recordings, and how to read it.
 
     Attributes:
-        name: The name that a user gives, such as the number of a DANDI set.
         license: The SPDX name of its license; empty for a set of the user's own.
-        url: The address of its page; empty if there is none.
-        size: The size and the number of its files, in words.
         conditions: The names of its six conditions, in the order of the stimulus axis.
         about: Sentences on what is compared and what that leaves out.
         read: The function that reads downloaded files or folders. It takes them, the input of the

@@ -34,15 +34,7 @@ from tactile_rt.core.files import write_whole
 if TYPE_CHECKING:
     import urllib3
 
-__all__ = [
-    "Fetched",
-    "PublishedFile",
-    "RangeFile",
-    "connections",
-    "counted",
-    "fetch",
-    "published_files",
-]
+__all__ = ["connections", "counted", "fetch", "published_files"]
 
 UNITS = ("spike_times", "spike_times_index", "depth", "inhibitory")
 BLOCK = 1 << 16  # bytes
@@ -202,9 +194,6 @@ def fetch(
     """Write what alignment needs of some files to a folder, one small NWB file each.
 
     What is there already stays, so that a fetch that broke off goes on.
-
-    Args:
-        folder: is made if it is not there.
 
     Raises:
         ConfigError: a file cannot be had, or is not the one that was published; those before it

@@ -41,8 +41,6 @@ class Signal:
         start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
             bit, counted from the highest of byte 0.
         length: Width of the signal, in bits.
-        signed: Whether the number is in two's complement.
-        real: Whether the number is an IEEE 754 floating-point number.
     """
 
     message: str
@@ -83,7 +81,6 @@ class FramePart:
     """A frame that every sample has: a message, with these values of its multiplexers.
 
     Attributes:
-        extended: Whether the identifier has 29 bits.
         length: Length of the message's data, bytes.
         when: The multiplexers in the message, and the values of each that make a frame this part.
     """

@@ -94,7 +94,6 @@ class StrideFinder:
     can measure.
 
     Args:
-        size: length of a frame with its ending, bytes.
         possible: of (n, size) bytes, which of these n the device can have sent.
     """
 

@@ -122,7 +122,6 @@ class EmulatedSerial(EmulatedDevice):
     Args:
         link: A symbolic link to the port, so that the port has the same name when it is plugged
             in again; None: /dev/pts/N.
-        options: Options of the codec, and ``baud``, as in a URL.
         pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read, over a line
             without a speed.
     """

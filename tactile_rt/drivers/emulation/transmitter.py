@@ -231,7 +231,6 @@ class RateConverter:
 
     Args:
         source_hz: rate of the source, Hz.
-        codec: the device's, which knows its rate and what a host has commanded.
     """
 
     def __init__(self, source_hz: float, codec: Codec[Any]) -> None:

@@ -115,11 +115,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
 def cut_windows(
     data: SweepSet, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
 ) -> Iterator[CutWindows]:
-    """The windows of all sweeps as the robot would cut them, so many at a time.
-
-    Args:
-        batch: sweeps whose windows come together.
-    """
+    """The windows of all sweeps as the robot would cut them, so many at a time."""
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]

@@ -32,11 +32,7 @@ PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
 
 @dataclass(frozen=True)
 class FittedSVM:
-    """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels.
-
-    Attributes:
-        kernel: The map of (sweep, feature) values to what the machine takes.
-    """
+    """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels."""
 
     machine: SVC
     kernel: Callable[[NDArray[np.float32]], NDArray[np.float32]]

@@ -190,9 +190,6 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
         """How a task is trained on the sweep set at `data`.
 
-        Args:
-            chosen: what its trials and its growth have found, by the names of `TrainingConfig`.
-
         Raises:
             ConfigError: an option that there is not, or a value that it cannot have.
         """

@@ -78,20 +78,13 @@ class Card:
 
     Attributes:
         sweeps, objects: The counts of sweeps and of objects, by split and category.
-        skipped: The names of objects that could not be made, and why each could not.
         unit: The unit of what counts as load: the force, N, if it is measured, else all channels
             that have the first one's unit.
-        clip: The largest load that networks believe.
         load_edges: The (bin + 1,) edges of the histogram of the largest load of every touched
             whisker in every sweep.
         load_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
         coverage: The share of the sweeps in which each whisker is touched, 0 to 1, by its name.
         whiskers_touched: The mean number of whiskers touched by a sweep that touches.
-        samples: The number of values in all sweeps, of every channel of every element at every
-            time.
-        misses: The number of sweeps known to pass beside the array.
-        unstable: The number of sweeps that could not be simulated at the set's profile, and are
-            empty.
     """
 
     sweeps: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -237,8 +230,6 @@ def window_features(
     Args:
         values: (sample, element, channel) SI.
         start: sample of first contact.
-        period_ms: of the samples, ms.
-        limits: what is believed of the channels.
     """
     edges = start + np.arange(STEPS + 1) * STEP_MS / period_ms
     edges = np.minimum(edges.round().astype(int), len(values) - 1)

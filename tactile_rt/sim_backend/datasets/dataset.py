@@ -99,7 +99,6 @@ def make_sweeps(
         folder: where; on a cluster, a file system that all of its machines share.
         processes: how many at a time; None: one per core.
         engine: "processes" of this machine, or "ray".
-        address: of the Ray cluster, see `engines.run_ray`.
 
     Raises:
         ConfigError: no such split or engine, or the folder holds another set, or sweeps of who

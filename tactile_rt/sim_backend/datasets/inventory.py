@@ -24,13 +24,7 @@ STALE_S = 60  # no file of a set takes as long to write
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of a set.
-
-    Attributes:
-        misses: The number of these sweeps that pass beside the array.
-        unstable: The number of these sweeps that could not be simulated at the set's profile, and
-            are empty.
-    """
+    """Counts of a set."""
 
     sweeps: int = 0
     misses: int = 0

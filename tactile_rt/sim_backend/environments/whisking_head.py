@@ -123,7 +123,6 @@ class WhiskingHead:
         profile: how finely to simulate; by `rods`, whatever the profile's engine.
 
     Attributes:
-        samples: The number of samples of 1 ms simulated so far.
         position, velocity: The (3,) place of the head from where it started, mm, and its velocity,
             mm/s, in the world.
     """

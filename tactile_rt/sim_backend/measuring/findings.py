@@ -92,7 +92,6 @@ class ArrayFinding:
     Attributes:
         what: The name of the quantity, e.g. ``noise density of mz``.
         described: The value that the array's file gives; None: it gives none.
-        measured: The value that was measured; None: it could not be.
     """
 
     what: str

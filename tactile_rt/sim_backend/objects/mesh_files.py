@@ -233,11 +233,7 @@ def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
 
 
 def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
-    """All triangles of the files of one object in one mesh, z up, in the unit of the files.
-
-    Args:
-        up: see `read_triangles`.
-    """
+    """All triangles of the files of one object in one mesh, z up, in the unit of the files."""
     parts = [_part(path, up) for path in paths]
     joined = trimesh.util.append_faces([m.vertices for m in parts], [m.faces for m in parts])
     mesh = trimesh.Trimesh(*joined, process=False)

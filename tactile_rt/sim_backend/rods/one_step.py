@@ -192,7 +192,6 @@ def step(
         matched: whether with the masses with which the modes have their frequencies at this length
             of a step, or with the true ones.
         q, v: (degree of freedom,) rad and rad/ms.
-        base: see `chains.inertial_forces`.
         surface: (3,) velocity of the object, mm/ms.
     """
     clamped, stiffness, friction = chain.clamped, chain.stiffness, chain.friction

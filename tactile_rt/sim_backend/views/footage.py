@@ -113,7 +113,6 @@ class Footage:
     """A simulation as it went, moment by moment.
 
     Attributes:
-        period_ms: The time between moments, ms.
         loads: The (moment, element, 6) base loads, N and N m, each the mean over the period before.
         states: The (moment, n) places of everything at the end of each period.
     """
@@ -165,7 +164,6 @@ def record(
     Args:
         simulation: made with `whole=True`, so that it has all whiskers of the array; fresh or
             advanced, it goes on from where it is.
-        period_ms: between moments, whole ms.
     """
     moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)
