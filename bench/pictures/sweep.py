@@ -17,6 +17,7 @@ from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
+from tactile_rt.sim_backend.views.film import Stage
 from tactile_rt.sim_backend.views.footage import Camera, record
 from tactile_rt.sim_backend.views.sheet import (
     INK,
@@ -26,7 +27,6 @@ from tactile_rt.sim_backend.views.sheet import (
     draw_scale,
     draw_traces,
 )
-from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.world import PROFILES, array_spec
 
 TARGET, PROFILE = ("mug", 1), "dataset"

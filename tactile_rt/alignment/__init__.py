@@ -3,14 +3,14 @@
 rdm           RDMs of the six stimuli and their comparison
 reliability   split halves, Spearman-Brown, the correction for noise
 neural, nwb, nwb_parts, selection   recordings: from NWB files, and in the published layout
-strict, canonical, paper_code, building   the two protocols: recordings -> a frozen benchmark
+strict, paper_code, building   the two protocols: recordings -> a frozen benchmark
 benchmark, json_file     the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
-stimuli_input, layers, activations, onnx_taps, onnx_activations, loading   a model -> its layers
+stimuli_input, layers, activations, onnx_activations, loading   a model -> its layers
 example, example_files   a made-up brain of known truth, and its files
 metrics/, datasets/      what compares, and recordings as plug-ins: license, citation, reader
 board, board_page        models by datasets by metrics
-another_mouse, fidelity, gate, decoding, results, pictures, report   what is done with them
+fidelity, gate, decoding, results, pictures, report   what is done with them
 """
 
 from tactile_rt.alignment.benchmark import (
@@ -25,8 +25,9 @@ from tactile_rt.alignment.benchmark import (
 )
 from tactile_rt.alignment.building import build
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import STIMULI, rsa, stimulus_index
+from tactile_rt.alignment.rdm import rsa, stimulus_index
 from tactile_rt.alignment.scoring import Score, layer_rdms, score, score_rdms
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "PROTOCOLS",

@@ -34,25 +34,14 @@ from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.encoders.gru import GRUEncoder
 
-__all__ = [
-    "checkpoint_layers",
-    "network_layers",
-    "reach",
-    "untrained_card_layers",
-    "untrained_layers",
-]
+__all__ = ["checkpoint_layers", "reach", "untrained_card_layers", "untrained_layers"]
 
 Traces = dict[str, Tensor]
 Change = Callable[[Tensor], Tensor]
 
 
 def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[str, Any]]:
-    """Layers of a `best.pt`, and what else it holds.
-
-    Raises:
-        ModelError: no such checkpoint.
-        ConfigError: the stimuli are of another array.
-    """
+    """Layers of a `best.pt`, and what else it holds."""
     model, saved = load_checkpoint(path)
     timing, period = model.timing, saved.get("period_ns")  # which earlier ones do not say
     stimuli.check(
@@ -81,9 +70,6 @@ def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0)
 
     None for a card that describes no network that can be built here, as one of another program or
     of a later release might.
-
-    Raises:
-        ConfigError: the stimuli are of another array.
     """
     network = card.provenance.get("network")
     if not isinstance(network, dict):

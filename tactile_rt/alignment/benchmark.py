@@ -14,9 +14,10 @@ import msgspec
 import numpy as np
 
 from tactile_rt.alignment.json_file import Floats, Number, encode, read_json, write_json
-from tactile_rt.alignment.rdm import PAIRS, STIMULI
+from tactile_rt.alignment.rdm import PAIRS
 from tactile_rt.alignment.statistics import standard_error
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "PROTOCOLS",
@@ -44,7 +45,6 @@ class Frozen(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
             strict, that of the RDM of one half of a division.
         factor: The factor K by which a model's r_xy is multiplied to give its score; NaN if the RDM
             is too noisy to score on.
-        units: The number of units that the RDM was made from; for strict, on average.
     """
 
     rdm: Floats
@@ -58,10 +58,7 @@ class Target(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
 
     Attributes:
         chosen: The RDM that the protocol scores on; for strict, it is made of reliable units only.
-        unfiltered: The RDM of all units, without the protocol's filter.
-        reliable: Whether the target is reliable enough to count in a mean over animals.
         trials: The number of trials that were used; for paper-code, the rows of the padded array.
-        sha256: The SHA-256 sum of the rates that the target was made from, hex.
     """
 
     name: str
@@ -113,10 +110,7 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
     """A frozen benchmark.
 
     Attributes:
-        protocol: The name of the protocol, ``strict`` or ``paper-code``.
         pooled: All animals as one target, which paper-code scores on as well; None under strict.
-        a2a: The animal-to-animal consistency, which a model cannot be expected to exceed.
-        bootstraps, seed: Number and seed of the random divisions of the trials.
     """
 
     protocol: str
@@ -172,11 +166,7 @@ def load_benchmark(path: Path) -> Benchmark:
 
 
 def load_strict(path: Path) -> Benchmark:
-    """Read a benchmark of the protocol whose stimuli have names, as gate and decoder need.
-
-    Raises:
-        ConfigError: as `load_benchmark`; or the benchmark is of the other protocol.
-    """
+    """Read a benchmark of the protocol whose stimuli have names, as gate and decoder need."""
     benchmark = load_benchmark(path)
     if benchmark.protocol != "strict":
         raise ConfigError(

@@ -45,8 +45,6 @@ class BoardRow(msgspec.Struct, frozen=True):
     Attributes:
         kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or
             ``animal``.
-        sha256: The SHA-256 sum of the model's file, hex; empty for what has no file.
-        parameters: The count of numbers that the model is made of; 0 where there are none.
     """
 
     name: str
@@ -60,8 +58,6 @@ class BoardColumn(msgspec.Struct, frozen=True):
     """Part of a dataset under a metric.
 
     Attributes:
-        part: The part of cortex, such as ``all`` or ``L4``.
-        animals: The number of animals with units of that part.
         usable: The number of animals whose noise is low enough to be corrected for.
         ceiling: The mean over these of the value that a perfect model is expected to reach; NaN
             without any.
@@ -81,8 +77,6 @@ class BoardCell(msgspec.Struct, frozen=True):
     Attributes:
         score: The mean over animals of the value as a share of the ceiling; NaN without any.
         sem: The standard error of that mean; NaN with fewer than two animals.
-        value: The mean over animals before the division by the ceiling.
-        layer: The name of the layer that was chosen most often.
     """
 
     score: Number = math.nan
@@ -92,11 +86,7 @@ class BoardCell(msgspec.Struct, frozen=True):
 
 
 class BoardDataset(msgspec.Struct, frozen=True):
-    """Where a dataset comes from; attributes as in `datasets.NeuralDataset`, and what was read.
-
-    Attributes:
-        units: The number of units of all animals together.
-    """
+    """Where a dataset comes from; attributes as in `datasets.NeuralDataset`, and what was read."""
 
     name: str
     title: str
@@ -115,7 +105,6 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
 
     Attributes:
         cells: (row, column) The value of each row in each column.
-        metrics: What each metric is, in a line, by its name.
     """
 
     rows: tuple[BoardRow, ...]
@@ -157,12 +146,6 @@ def with_cells(
 
     Args:
         rows: each with its layers for this dataset's conditions.
-        parts: of cortex, from `targets.TARGET_PARTS`.
-        progress: called with the share done, 0 to 1.
-
-    Raises:
-        ConfigError: no such part or metric.
-        ModuleNotFoundError: threadpoolctl is not installed.
     """
     from threadpoolctl import threadpool_limits
 

@@ -2,14 +2,7 @@
 
 from html import escape
 
-from tactile_rt.alignment.board import (
-    ANOTHER,
-    Alignments,
-    BoardCell,
-    BoardColumn,
-    BoardDataset,
-    BoardRow,
-)
+from tactile_rt.alignment.board import ANOTHER, Alignments, BoardCell, BoardDataset, BoardRow
 from tactile_rt.alignment.html_page import format_number, join_notes, make_page, make_table
 from tactile_rt.alignment.metrics import MINIMUM_CEILING
 
@@ -67,7 +60,10 @@ def _show_part(board: Alignments, dataset: str, part: str) -> str:
         [_show_name(row), *(_show_cell(cells[k], row.kind) for k in places)]
         for row, cells in zip(board.rows, board.cells, strict=True)
     ]
-    ceiling = ["ceiling<small>animals that count</small>", *map(_show_ceiling, columns)]
+    ceiling = ["ceiling<small>animals that count</small>"]
+    ceiling += [
+        f"{format_number(c.ceiling)}<small>{c.usable} of {c.animals}</small>" for c in columns
+    ]
     table = make_table(["", *(escape(c.metric) for c in columns)], [*rows, ceiling])
     return f"<h2>{escape(dataset)}, {escape('all units' if part == 'all' else part)}</h2>{table}"
 
@@ -89,10 +85,6 @@ def _show_cell(cell: BoardCell, kind: str) -> str:
         f'<b>{score}</b>{sem}<span class="bar"><i style="width:{wide:.0f}%;'
         f'background:var(--{kind})"></i></span><small>{escape(cell.layer)}</small>'
     )
-
-
-def _show_ceiling(column: BoardColumn) -> str:
-    return f"{format_number(column.ceiling)}<small>{column.usable} of {column.animals}</small>"
 
 
 def _show_dataset(one: BoardDataset) -> str:

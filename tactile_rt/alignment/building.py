@@ -10,19 +10,14 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
-from tactile_rt.alignment.neural import (
-    NeuralSession,
-    by_animal,
-    published_layout,
-    read_published,
-)
+from tactile_rt.alignment.neural import NeuralSession, by_animal, published_layout, read_published
 from tactile_rt.alignment.nwb import Reading, find_nwb, read_nwb
 from tactile_rt.alignment.paper_code import freeze_paper_code
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, trial_mean
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["animal_means", "build", "checked_sessions", "refuse_copies"]
 
@@ -46,7 +41,6 @@ def build(
 
     Args:
         inputs: NWB files and folders of them; or, for paper-code, one published ``.npz``.
-        protocol: ``strict`` or ``paper-code``.
         progress: called with the share done, 0 to 1.
         selection: which sessions and units of NWB files are kept; None for all.
         clock: spike times are on the ``session``'s clock, as NWB has it and strict by default, or
@@ -126,14 +120,6 @@ def checked_sessions(
     Args:
         strict: rates count from first contact, and sessions of another clock are left out; else
             from the start of the trial, and a note warns of them.
-        progress: called with the share done, 0 to 1.
-        clock, selection: as `build` has them.
-
-    Returns:
-        Sessions, and notes that begin with what the clock's check found.
-
-    Raises:
-        ConfigError: recordings that cannot be used, and why.
     """
     clock = clock or ("session" if strict else "recording")
     window = "contact" if strict else "start"
@@ -214,9 +200,6 @@ def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
     Two copies of a session would be split into the same halves and agree with each other perfectly.
     Two sessions are copies if they share most of their trials (when each began, and its stimulus),
     or most of their units (how often which rate came with which stimulus), whatever the order.
-
-    Raises:
-        ConfigError: naming two sessions that are copies.
     """
     trials = [_count_trials(session) for session in sessions]
     units = [_count_units(session) for session in sessions]
@@ -263,9 +246,6 @@ def animal_means(path: Path) -> tuple[dict[str, NDArray[np.float64]], list[str]]
     Args:
         path: rates in the published layout, ``.npz``, as their authors publish them, mistakes
             included (`neural.published_layout`); or an NWB file, or a folder of them.
-
-    Raises:
-        ConfigError: recordings that cannot be used, and why.
     """
     if path.suffix == ".npz":
         return {name: trial_mean(rates) for name, rates in read_published(path).items()}, []

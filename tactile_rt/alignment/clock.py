@@ -172,12 +172,7 @@ def _search(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floa
 
 
 def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
-    """One line on a build: the clock, the rates around contact, the latency, the effect.
-
-    Args:
-        responses: of the sessions, at least one.
-        clock: one of `CLOCKS`.
-    """
+    """One line on a build: the clock, the rates around contact, the latency, the effect."""
     whole = ContactResponse(
         session="all",
         shift_s=0.0,

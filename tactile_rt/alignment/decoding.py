@@ -15,7 +15,8 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import DISTANCES, SHAPES, STIMULI, rdm, square
+from tactile_rt.alignment.rdm import rdm, square
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 __all__ = ["Decoded", "decode", "decode_paper", "decode_rdm", "mean_decoded"]
 
@@ -73,9 +74,6 @@ def decode_paper(patterns: ArrayLike) -> Decoded:
     """The paper's variant (Table "Stimuli decoding"): logistic regression, one stimulus held out.
 
     Its chance is that of every way to divide the stimuli into classes of the same sizes.
-
-    Args:
-        patterns: (6, unit), as they are.
     """
     values = np.asarray(patterns, dtype=np.float64)
     values = values - values.mean(axis=0)

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import DISTANCES, SHAPES, STIMULI
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 __all__ = ["MODELS", "Brain", "example_models"]
 
@@ -43,7 +43,6 @@ class Brain:
 
     Attributes:
         sessions: The number of sessions of each mouse; each records units of its own.
-        trials: The number of trials of each of the six stimuli in each session.
         private: The share of the variance of a mouse's features that is its own, 0 to 1.
         tuning: The standard deviation over stimuli of the logarithm of a unit's rate.
         distance, shape, own: The weights of the three parts of the shared geometry: distance,

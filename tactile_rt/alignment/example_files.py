@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.example import MODELS, Brain, example_models, gains
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import whole_folder
+from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
     import h5py
@@ -56,7 +56,6 @@ def write_example(
     Args:
         folder: is made; it must not be there yet.
         seed: of every random number in it, 0 or more.
-        progress: called with the share done, 0 to 1.
 
     Returns:
         The folder of NWB files, one a session, and the folder of models, ``.npz`` of responses
@@ -64,7 +63,6 @@ def write_example(
 
     Raises:
         ConfigError: the folder is there, or the seed is below 0.
-        ModuleNotFoundError: h5py is not installed.
         OSError: naming `folder`: the medium is full.
     """
     import h5py

@@ -28,13 +28,11 @@ class LayerFidelity:
     """One layer in both models.
 
     Attributes:
-        layer: The name of the layer; `OUTPUT` is what the model decides with.
         pearson: The correlation of the two RDMs of the layer; NaN if one has none, or both are
             flat.
         difference: The largest difference between the two (6, unit) responses, as a share of the
             reference's largest response where that is above 1; infinite for another number of
             units.
-        kept: Whether both figures are within the bars of the precision.
     """
 
     layer: str
@@ -81,11 +79,7 @@ def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[La
 
 
 def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layers:
-    """Read the layers of an ONNX file for a comparison with a reference.
-
-    Raises:
-        ModelError, ConfigError: as `onnx_activations.onnx_layers`.
-    """
+    """Read the layers of an ONNX file for a comparison with a reference."""
     from tactile_rt.alignment.onnx_activations import onnx_layers
 
     exported, _ = onnx_layers(path, stimuli)

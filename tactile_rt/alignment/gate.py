@@ -2,9 +2,27 @@
 
 1. validity: enough reliable animals to say anything.
 2. NeuroAI Turing test: the model is not worse than another mouse, shown to be near one, and better
-   than chance (`another_mouse`). How far that can be told in this benchmark stands beside it.
+   than chance, see below.
 3. regression: not worse than a stored model on the same animals.
 4. export fidelity (`fidelity`), which needs no neural data.
+
+The Turing test compares the model's mean fit to single mice with each mouse's mean fit to the
+others, all corrected for the noise of the mice. The mean over pairs of mice is the *noise ceiling*,
+what a perfect model of a mouse can be expected to reach.
+
+- A *fit* is a correlation of RDMs in which entries are weighted. Two entries that share a stimulus
+  vary together, and a large one varies more than a small one, in a way that follows from the RDM
+  itself (Diedrichsen et al. 2021, "Comparing representational geometries using whitened
+  unbiased-distance-matrix similarity"); the inverse of that covariance, from the mice's mean RDM,
+  is the weight.
+- *Worse than another mouse*: below the fit that one more mouse would exceed in nine of ten cases,
+  given how much the mice that are there differ: a prediction bound, with Student's t.
+- *Within the margin*: above the ceiling less `MARGIN` of it, in seven of eight cases: a one-sided
+  test whose error is of both animals and stimuli (jackknives).
+
+What the two find in a benchmark is in `Mice.power`: each mouse is taken for a model of the others,
+whole or with a share of its geometry replaced by one that has nothing to do with it: that of
+another mouse, the stimuli relabelled and the features turned at random.
 """
 
 import math
@@ -12,20 +30,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.another_mouse import MARGIN, SURE, Mice, Power
 from tactile_rt.alignment.benchmark import Benchmark
+from tactile_rt.alignment.rdm import PAIRS, UPPER, relabellings, square
 from tactile_rt.alignment.scoring import Score
-from tactile_rt.alignment.statistics import student
+from tactile_rt.alignment.statistics import held_out, student
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "FAIL",
     "INCONCLUSIVE",
     "INPUT_ERROR",
     "LARGEST_DROP",
+    "LOST",
+    "MARGIN",
     "PASS",
+    "BesideMice",
     "Check",
+    "Mice",
+    "Power",
     "exit_code",
     "mice_of",
     "neural_checks",
@@ -33,6 +57,181 @@ __all__ = [
     "turing",
     "validity",
 ]
+
+Floats = NDArray[np.float64]
+
+MARGIN = 0.65  # of the noise ceiling
+WORSE, SURE = 10, 8  # a mouse is called worse in one of so many cases, a floor is too high in one
+LOST = (0.25, 0.5)  # shares of its geometry that a damaged mouse has lost, for the power
+DRAWS = 20  # of damage, for every mouse and share
+# Beside its change along the differences that are there, how much a distance varies by what is
+# added to it, as a share. It grows with the deviation; 0.25 to 1 do about as well.
+OWN = 0.5
+NO_FIT = -9.0  # of a layer that has none, lower than any
+
+N = len(STIMULI)
+CENTRE = np.eye(N) - 1 / N
+CONTRASTS = np.eye(N)[UPPER[0]] - np.eye(N)[UPPER[1]]  # (15, 6): a pair's first less its second
+# Entries that take part: all, and those without each of the stimuli.
+PARTS = np.array(
+    [[True] * len(PAIRS), *([s not in pair for pair in PAIRS] for s in range(N))], dtype=np.bool_
+)
+
+
+@dataclass(frozen=True, eq=False)
+class BesideMice:
+    """Models beside mice. Fits are mean correlations with single mice, corrected for their noise.
+
+    Attributes:
+        fits: (model, mouse) The fit to each mouse, of a layer that was chosen on the others.
+        fit: (model,) The mean fit of each model; NaN where no layer has an RDM.
+        error: (model,) The standard error of that less the ceiling, over animals and stimuli.
+        floor: (model,) What each fit exceeds in seven of eight cases, given that error.
+    """
+
+    fits: Floats
+    fit: Floats
+    error: Floats
+    floor: Floats
+    ceiling: float
+    bound: float
+
+    @property
+    def worse(self) -> NDArray[np.bool_]:
+        """(model,) Whether each is worse than another mouse."""
+        return np.asarray(self.fit < self.bound)
+
+    @property
+    def within(self) -> NDArray[np.bool_]:
+        """(model,) Whether each is shown to be within the margin."""
+        return np.asarray(self.floor > (1 - MARGIN) * self.ceiling)
+
+
+@dataclass(frozen=True)
+class Power:
+    """What the two tests find in a benchmark, by trial on its own mice."""
+
+    passes: float
+    fails: dict[float, float]
+
+
+class Mice:
+    """The mice that models are compared to.
+
+    Args:
+        rdms: (mouse, 15), finite, of three mice or more.
+        factors: (mouse,) that correct a mouse's correlations for its noise.
+    """
+
+    def __init__(self, rdms: Floats, factors: Floats) -> None:
+        self.rdms, self.factors = rdms, factors
+        self._maps = _weights(rdms.mean(axis=0))
+        self._targets = self._vectors(rdms) * factors[:, None]  # (part, mouse, 15)
+        number = len(rdms)
+        pairs = self._targets @ self._targets.swapaxes(-1, -2)
+        pairs[:, np.arange(number), np.arange(number)] = 0
+        ordered = number * (number - 1)
+        sums = pairs[0].sum(axis=1)
+        self._ceilings = pairs.sum(axis=(1, 2)) / ordered  # of each part
+        self._without = (pairs[0].sum() - 2 * sums) / (ordered - 2 * (number - 1))  # each mouse
+        spread = float((sums / (number - 1)).std(ddof=1))
+        self.ceiling = float(self._ceilings[0])
+        self.bound = self.ceiling - student(number - 1, WORSE) * math.sqrt(1 + 1 / number) * spread
+
+    def compare(self, models: ArrayLike) -> BesideMice:
+        """Compare models, given as RDMs (model, layer, 15); a layer with a NaN takes no part."""
+        vectors = self._vectors(np.asarray(models, dtype=np.float64))
+        fits = np.einsum("pmlk,pnk->pmln", vectors, self._targets)
+        there = np.isfinite(fits).all(axis=(0, 3))[..., None]
+        _, chosen = held_out(np.where(there, fits[0], NO_FIT))
+        fits = np.take_along_axis(fits, chosen[None, :, None, :], axis=2)[:, :, 0]
+        number = fits.shape[-1]
+        fit = fits[0].mean(axis=-1)
+        # Jackknives: the difference from the ceiling, without each mouse and without each stimulus.
+        less = (fits[0].sum(axis=-1, keepdims=True) - fits[0]) / (number - 1) - self._without
+        parts = fits[1:].mean(axis=-1) - self._ceilings[1:, None]
+        error = np.sqrt((number - 1) * less.var(axis=-1) + (N - 1) * parts.var(axis=0))
+        return BesideMice(
+            fits=fits[0],
+            fit=fit,
+            error=error,
+            floor=fit - student(min(number, N) - 1, SURE) * error,
+            ceiling=self.ceiling,
+            bound=self.bound,
+        )
+
+    def power(self, seed: int = 0) -> Power:
+        """Take each mouse for a model of the others, whole and damaged; needs four mice or more."""
+        rng = np.random.default_rng(seed)
+        number = len(self.rdms)
+        passes, fails = 0, np.zeros((len(LOST), DRAWS))
+        for i in range(number):
+            others = np.arange(number) != i
+            rest = Mice(self.rdms[others], self.factors[others])
+            whole = rest.compare(self.rdms[i][None, None])
+            passes += int((whole.within & ~whole.worse)[0])
+            strangers = self.rdms[others][rng.integers(number - 1, size=DRAWS)]
+            for k, lost in enumerate(LOST):
+                damaged = _damaged(self.rdms[i], strangers, lost, rng)
+                fails[k] += rest.compare(damaged[:, None]).worse
+        shares = fails.mean(axis=1) / number
+        return Power(passes / number, dict(zip(LOST, shares.tolist(), strict=True)))
+
+    def _vectors(self, rdms: Floats) -> Floats:
+        """Weighted, centred and of length one, for each part: (part, ..., 15); NaN if constant."""
+        values = np.tensordot(rdms, self._maps, axes=(-1, 1))  # (..., part, 15)
+        length = np.sqrt((values**2).sum(axis=-1, keepdims=True))
+        size = np.sqrt((rdms**2).sum(axis=-1))[..., None, None]
+        unit = values / np.where(length > 1e-12 * size, length, np.nan)
+        return np.asarray(np.moveaxis(unit, -2, 0))
+
+
+def _weights(rdm: Floats) -> Floats:
+    """Maps (part, 15, 15) of RDMs to vectors whose product is the weighted covariance."""
+    shared = CONTRASTS @ _gram(rdm) @ CONTRASTS.T
+    own = CONTRASTS @ CONTRASTS.T
+    covariance = shared * own / np.trace(shared * own) + OWN * own**2 / np.trace(own**2)
+    maps = np.zeros((len(PARTS), len(PAIRS), len(PAIRS)))
+    for part, entries in zip(maps, PARTS, strict=True):
+        values, vectors = np.linalg.eigh(covariance[np.ix_(entries, entries)])
+        root = (vectors / np.sqrt(values)) @ vectors.T
+        constant = root.sum(axis=0)
+        constant /= np.sqrt(constant @ constant)
+        part[np.ix_(entries, entries)] = root - np.outer(root @ constant, constant)
+    return maps
+
+
+def _gram(rdm: Floats) -> Floats:
+    """Products (6, 6) of the centred features that an RDM is the squared distances of.
+
+    What all distances have in common, the noise of the units included, is taken away as far as the
+    others allow: no weighted correlation sees it.
+    """
+    products = -0.5 * CENTRE @ square(rdm) @ CENTRE
+    values, vectors = np.linalg.eigh(products)
+    order = np.argsort(np.abs(vectors.sum(axis=0)))  # the constant one is last
+    values, vectors = values[order[:-1]], vectors[:, order[:-1]]
+    return np.asarray((vectors * (values - values.min())) @ vectors.T)
+
+
+def _damaged(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
+    """RDMs (draw, 15) of a geometry that lost a share to strangers (draw, 15)."""
+    made = np.empty_like(strangers)
+    own = _features(rdm)
+    for k, other in enumerate(strangers):
+        other = _features(other[relabellings()[rng.integers(len(relabellings()))]])
+        turned, _ = np.linalg.qr(rng.normal(size=(N, N)))
+        features = math.sqrt(1 - lost) * own + math.sqrt(lost) * other @ turned
+        made[k] = ((CONTRASTS @ features) ** 2).sum(axis=-1)
+    return made
+
+
+def _features(rdm: Floats) -> Floats:
+    """Features (6, 6) of an RDM, of mean square one."""
+    values, vectors = np.linalg.eigh(_gram(rdm))
+    features = vectors * np.sqrt(np.maximum(values, 0))
+    return np.asarray(features / np.sqrt((features**2).mean()))
+
 
 PASS, FAIL, INCONCLUSIVE, INPUT_ERROR = 0, 1, 2, 3  # exit codes
 LEAST_ANIMALS = 5
@@ -42,12 +241,7 @@ LARGEST_DROP = 0.05  # of the noise ceiling
 
 @dataclass(frozen=True)
 class Check:
-    """One test and how it went.
-
-    Attributes:
-        code: The outcome of the test: `PASS`, `FAIL` or `INCONCLUSIVE`.
-        why: The reason for the outcome, in a line with the figures.
-    """
+    """One test and how it went."""
 
     name: str
     code: int
@@ -105,9 +299,6 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
 
     That takes a fit within the margin of the noise ceiling, and a p of the maximum below
     `LARGEST_P`. What is neither worse nor shown to be like one is inconclusive.
-
-    Args:
-        power: of the test in this benchmark, to be told beside the verdict.
     """
     found = mice.compare(score.rdms[None])
     fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling

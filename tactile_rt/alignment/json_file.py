@@ -26,7 +26,7 @@ else:
 
 def encode(value: Any) -> bytes:
     """Encode structs as JSON: arrays as lists, null for what is not finite."""
-    return msgspec.json.encode(value, enc_hook=_to_plain)
+    return msgspec.json.encode(value, enc_hook=lambda array: array.tolist())
 
 
 def write_json(value: Any, path: Path) -> None:
@@ -36,11 +36,7 @@ def write_json(value: Any, path: Path) -> None:
 
 
 def read_json(path: Path, kind: type[T], made_by: str) -> T:
-    """Read what `write_json` wrote of a struct whose tag names its kind and version.
-
-    Raises:
-        ConfigError: not there, damaged, or of another kind or version.
-    """
+    """Read what `write_json` wrote of a struct whose tag names its kind and version."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_from_plain)
     except OSError as error:
@@ -49,10 +45,6 @@ def read_json(path: Path, kind: type[T], made_by: str) -> T:
         raise ConfigError(
             f"{path} is damaged, or not of `{made_by}` of this release: {error}"
         ) from None
-
-
-def _to_plain(value: np.ndarray | np.generic) -> Any:
-    return value.tolist()
 
 
 def _from_plain(kind: Any, value: Any) -> Any:

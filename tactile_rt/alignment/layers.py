@@ -21,11 +21,7 @@ class Layers:
         traces: The responses of each layer, by name: (6, step, unit) float32.
         first: The first step that input can reach, by the name of the layer.
         logits: (6, step, class) The model's output, float32.
-        parameters: The count of numbers that the model is made of.
-        precision: The number format of the weights, such as ``fp32`` or ``int8``.
         sha256: The SHA-256 sum of the model's file, hex; empty for a network in memory.
-        network: The configuration of the network, as far as it is known.
-        training: The configuration of the training, as far as it is known.
     """
 
     name: str

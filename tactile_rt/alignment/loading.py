@@ -9,20 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.alignment.layers import PARTS, Layers
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 
-__all__ = [
-    "RESPONSES",
-    "check_models",
-    "load_layers",
-    "load_untrained",
-    "responses_layers",
-    "told_apart",
-]
+__all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
 
 CHECKPOINT, BEST = ".pt", "best.pt"
 OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
@@ -36,13 +29,13 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
         What to call each: what a file calls itself; a training run by its folder, one of a grid by
         its task, and where runs are alike in that, by as many folders as tell them apart. What is
         called alike all the same is told apart as `told_apart` has it.
-
-    Raises:
-        ModelError, ConfigError: one is not such a file.
     """
     names: list[str] = []
     runs = {path: path.resolve().parent for path in paths if path.name == BEST}
-    called = {folder: _run_name(folder) for folder in runs.values()}
+    called = {
+        folder: folder.parent.name if (folder / OF_GRID).exists() else folder.name
+        for folder in runs.values()
+    }
     depth = 1
     while len(set(called.values())) < len(called):
         depth += 1
@@ -72,10 +65,6 @@ def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _run_name(folder: Path) -> str:
-    return folder.parent.name if (folder / OF_GRID).exists() else folder.name
-
-
 def _own_name(path: Path) -> str:
     if path.suffix == RESPONSES:
         return responses_layers(path).name
@@ -91,7 +80,6 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
     """Layers, and the model's accuracy on its task with what it was measured on, where known.
 
     Raises:
-        ModelError: not such a file.
         ConfigError: the stimuli are of another array.
     """
     if path.suffix == CHECKPOINT:
@@ -114,17 +102,13 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
     card that does not name its network.
 
     Raises:
-        ModelError: not such a file.
         ConfigError: a seed below 0.
     """
     if path.suffix == RESPONSES:
         return None
     if seed < 0:
         raise ConfigError(f"a seed is at least 0, not {seed}")
-    from tactile_rt.alignment.activations import (
-        untrained_card_layers,
-        untrained_layers,
-    )
+    from tactile_rt.alignment.activations import untrained_card_layers, untrained_layers
 
     if path.suffix == CHECKPOINT:
         from tactile_rt.models.checkpoints import load_checkpoint

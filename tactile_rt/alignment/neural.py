@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "Animal",
@@ -156,9 +156,6 @@ def read_published(path: Path) -> dict[str, Floats]:
     animal: it is passed over, and nothing is ever unpickled.
 
     The stimulus axis has no names in such a file, so only protocol paper-code can use it.
-
-    Raises:
-        ConfigError: not such a file.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -38,10 +38,11 @@ from tactile_rt.alignment.nwb_parts import (
     trial_columns,
     unit_column,
 )
-from tactile_rt.alignment.rdm import DISTANCES, SHAPES, stimulus_index
+from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.packages import lacking
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
 if TYPE_CHECKING:
     import h5py
@@ -61,7 +62,6 @@ class Reading(NamedTuple):
     """What a file holds.
 
     Attributes:
-        task: The task of the mouse, ``discrimination`` or ``detection``.
         response: The change of the rates with contact; None without contacts to tell by.
     """
 
@@ -75,9 +75,6 @@ def find_nwb(paths: Iterable[Path]) -> list[Path]:
     """Files named, and those in folders named.
 
     Of a folder, files with ``ecephys`` in their names if there are any: others have no spikes.
-
-    Raises:
-        ConfigError: nothing there.
     """
     found = []
     for path in paths:
@@ -105,16 +102,10 @@ def read_nwb(
 
     Args:
         window: rates count from first ``contact`` or from the ``start`` of the trial, to choice.
-        progress: called with the share done, 0 to 1, after every unit.
-        clock: spike times are on the ``session``'s clock, or the ``recording``'s.
-        selection: which sessions and units are kept; None for all.
 
     Returns:
         What was read of the sessions that are selected, and notes on what was left out, sessions
         that cannot be read among these.
-
-    Raises:
-        ConfigError: no session is left; why, of each.
     """
     _h5py()
     wanted = selection or Selection()
@@ -153,11 +144,7 @@ def read_session(
     clock: str = "session",
     selection: Selection | None = None,
 ) -> Reading:
-    """One NWB file; see `read_nwb`.
-
-    Raises:
-        ConfigError: naming the file, which cannot be read as one of these recordings, and why.
-    """
+    """One NWB file; see `read_nwb`."""
     for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")

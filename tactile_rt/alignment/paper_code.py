@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import pad, rates_sha256
-from tactile_rt.alignment.rdm import STIMULI, pearson, rdm
+from tactile_rt.alignment.rdm import pearson, rdm
 from tactile_rt.alignment.reliability import (
     BOOTSTRAPS,
     SEED,
@@ -38,6 +38,7 @@ from tactile_rt.alignment.reliability import (
     trial_mean,
 )
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["POOLED", "freeze_paper_code"]
 
@@ -56,7 +57,6 @@ def freeze_paper_code(
 
     Args:
         rates: (row, 6, unit) per animal, in the published layout.
-        progress: called with the share done, 0 to 1.
 
     Raises:
         ConfigError: no animal has a mean response that makes an RDM; one of several is left out.

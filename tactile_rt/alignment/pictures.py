@@ -26,14 +26,7 @@ MAPS_A_ROW = 4
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar, hatched where its value is NaN.
-
-    Attributes:
-        part: The part of the model, which gives the bar its colour.
-        dots: The values of single animals.
-        mark: The value of a control.
-        ring: Whether the bar counts in the score, and is framed.
-    """
+    """One bar, hatched where its value is NaN."""
 
     name: str
     value: float

@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 __all__ = [
     "CONSTANT",
-    "DISTANCES",
     "PAIRS",
-    "SHAPES",
-    "STIMULI",
     "UPPER",
     "normalised",
     "pearson",
@@ -31,10 +29,6 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
-SHAPES = ("convex", "concave")
-DISTANCES = ("close", "medium", "far")
-# The named axis of everything here. The simulator's stimuli have these names and this order.
-STIMULI = tuple(f"{shape}-{distance}" for shape in SHAPES for distance in DISTANCES)
 PAIRS = tuple(combinations(range(len(STIMULI)), 2))
 # The paper says near where the recordings say close.
 SYNONYMS = {"near": "close"}
@@ -45,11 +39,7 @@ UPPER = np.triu_indices(len(STIMULI), k=1)
 
 
 def stimulus_index(shape: str, distance: str) -> int:
-    """Place of a stimulus on the named axis; ``near`` is ``close``.
-
-    Raises:
-        ConfigError: no such shape or distance.
-    """
+    """Place of a stimulus on the named axis; ``near`` is ``close``."""
     distance = SYNONYMS.get(distance, distance)
     if shape not in SHAPES:
         raise ConfigError(f"no shape {shape!r}: there are {', '.join(SHAPES)}")

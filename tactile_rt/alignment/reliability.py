@@ -94,9 +94,6 @@ def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
 
     Returns:
         (bootstrap, 2, 15). A bootstrap with a half-mean that is not finite is NaN throughout.
-
-    Raises:
-        ConfigError: shapes that do not fit.
     """
     rates = np.asarray(rates, dtype=np.float64)
     if rates.ndim != 3 or first.ndim != 2 or rates.shape[0] != first.shape[1]:

@@ -16,9 +16,9 @@ from tactile_rt.alignment.pictures import (
     draw_profiles,
     draw_scatter,
 )
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.results import ModelResult, Results
 from tactile_rt.alignment.scoring import Score
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["report_page"]
 

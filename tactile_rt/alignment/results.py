@@ -12,10 +12,11 @@ from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_be
 from tactile_rt.alignment.gate import neural_checks
 from tactile_rt.alignment.json_file import Floats, Number, read_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.rdm import PAIRS, STIMULI, normalised
+from tactile_rt.alignment.rdm import PAIRS, normalised
 from tactile_rt.alignment.scoring import Score, score
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["ModelResult", "Results", "baseline_of", "model_result", "read_results", "results_of"]
 
@@ -25,13 +26,10 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
 
     Attributes:
         performance: The accuracy on the task, 0 to 1; NaN if no accuracy is known.
-        performance_of: The words that say what that accuracy was measured on.
-        untrained: The score of the network before its training, where there is one.
         groups: The groups that the model belongs to, by what they divide models by: encoder,
             attender, objective, augmentation, masking; without those that are not known.
         turing: The verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty
             under paper-code.
-        turing_why: The reason for that verdict, and what the test would find in this benchmark.
     """
 
     name: str
@@ -52,12 +50,7 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
 class Results(
     msgspec.Struct, frozen=True, eq=False, tag_field="kind", tag="tactile_rt alignment scores 2"
 ):
-    """One file of scores.
-
-    Attributes:
-        raw: The control that no model is needed for: the readings of the sensors themselves.
-        input: The file name and the SHA-256 sum of the stimuli's loads.
-    """
+    """One file of scores."""
 
     benchmark: Benchmark
     models: tuple[ModelResult, ...]
@@ -121,11 +114,7 @@ def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
 
 
 def read_results(path: Path) -> Results:
-    """Read scores from the JSON that `tactile-rt align score` writes.
-
-    Raises:
-        ConfigError: not there, damaged, or of another version.
-    """
+    """Read scores from the JSON that `tactile-rt align score` writes."""
     results = read_json(path, Results, "tactile-rt align score --json")
     check_benchmark(results.benchmark, path)
     targets = tuple(t.name for t in results.benchmark.all_targets)

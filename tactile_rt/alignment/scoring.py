@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from tactile_rt.alignment.benchmark import Benchmark
 from tactile_rt.alignment.json_file import Floats, Number
-from tactile_rt.alignment.rdm import PAIRS, STIMULI, pearson, rdm
+from tactile_rt.alignment.rdm import PAIRS, pearson, rdm
 from tactile_rt.alignment.statistics import (
     held_out,
     highest,
@@ -17,6 +17,7 @@ from tactile_rt.alignment.statistics import (
     standard_error,
 )
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["Score", "layer_rdms", "score", "score_rdms"]
 
@@ -37,10 +38,8 @@ class Score(msgspec.Struct, frozen=True, eq=False):
         per_target: (target,) The chosen layer's corrected correlation; NaN for unreliable targets.
         score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
             `corrected`.
-        sem: The standard error of the score over targets.
         p: The share of the 720 relabellings of the stimuli, layers chosen anew, that reach the
             score, at least 1/720.
-        null_95: The 95th percentile of their scores, which chance exceeds once in twenty times.
     """
 
     protocol: str
@@ -60,11 +59,7 @@ class Score(msgspec.Struct, frozen=True, eq=False):
 
 
 def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
-    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`; NaN of a single unit's.
-
-    Raises:
-        ConfigError: a layer of another shape.
-    """
+    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`; NaN of a single unit's."""
     rdms = np.empty((len(layers), len(PAIRS)))
     for i, (name, values) in enumerate(layers.items()):
         patterns = np.asarray(values, dtype=np.float64)
@@ -77,20 +72,12 @@ def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
 
 
 def score(benchmark: Benchmark, layers: Mapping[str, ArrayLike]) -> Score:
-    """Score layers, given as responses (6, unit) in the order of `STIMULI`.
-
-    Raises:
-        ConfigError: no layer, or one of another shape.
-    """
+    """Score layers, given as responses (6, unit) in the order of `STIMULI`."""
     return score_rdms(benchmark, tuple(layers), layer_rdms(layers))
 
 
 def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> Score:
-    """Score layers, given as RDMs (layer, 15); a layer with a NaN scores NaN.
-
-    Raises:
-        ConfigError: no layer, or names and RDMs that do not fit.
-    """
+    """Score layers, given as RDMs (layer, 15); a layer with a NaN scores NaN."""
     rdms = np.asarray(rdms, dtype=np.float64)
     if not names or rdms.shape != (len(names), len(PAIRS)):
         raise ConfigError(f"{len(names)} layers and RDMs {rdms.shape} do not fit")

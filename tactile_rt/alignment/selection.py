@@ -74,7 +74,6 @@ class Selection:
         Args:
             depth: (unit,) in um below the pia, or None.
             inhibitory: (unit,) or None.
-            number: of units.
 
         Raises:
             ConfigError: what is asked for is not known of the session's units.
@@ -125,9 +124,6 @@ def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
 
     A mouse's borders differ from those of `LAYERS_UM`, and what lies at a border is what its depth
     says.
-
-    Raises:
-        ConfigError: no such part.
     """
     if part not in TARGET_PARTS:
         raise ConfigError(no_such("part of cortex", part, TARGET_PARTS))

@@ -12,15 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.rdm import normalised, relabellings
 
-__all__ = [
-    "Permutations",
-    "held_out",
-    "highest",
-    "max_statistic",
-    "mean_held_out",
-    "standard_error",
-    "student",
-]
+__all__ = ["held_out", "highest", "max_statistic", "mean_held_out", "standard_error", "student"]
 
 Floats = NDArray[np.float64]
 
@@ -48,7 +40,6 @@ class Permutations:
         statistic: The statistic of the stimuli as they are; NaN if there is none.
         null: (720,) The statistics of all relabellings, the identity first.
         p: The share of relabellings that reach the statistic, at least 1/720.
-        percentile_95: The 95th percentile of the null distribution.
     """
 
     statistic: float

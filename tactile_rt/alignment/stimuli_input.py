@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["SHIPPED", "STEPS", "SUBSTEPS", "StimuliInput", "read_stimuli"]
 
@@ -33,7 +33,6 @@ class StimuliInput:
         sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
             assumed of a sensor. The baseline is zero, for the whiskers rest before they whisk.
         elements, channels, units: Names along the last two axes, and the unit of each channel.
-        sha256: The SHA-256 sum of the samples, hex.
     """
 
     samples: NDArray[np.float32]
@@ -55,7 +54,6 @@ class StimuliInput:
         """Hold the input against what a model was trained on.
 
         Args:
-            model: what messages call it.
             period_ns: of its samples, ns; None where that is not known.
 
         Raises:
@@ -91,11 +89,7 @@ class StimuliInput:
 
 
 def read_stimuli(path: Path | None = None) -> StimuliInput:
-    """Read what `tactile-rt whisk` wrote; without a path, the input that ships.
-
-    Raises:
-        ConfigError: not there, not such a file, or not all six stimuli.
-    """
+    """Read what `tactile-rt whisk` wrote; without a path, the input that ships."""
     path = SHIPPED if path is None else path
     try:
         with np.load(path, allow_pickle=False) as file:

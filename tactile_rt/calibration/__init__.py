@@ -11,11 +11,7 @@ fitting            tables of known loads, and the matrix that they give
 
 from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declared
 from tactile_rt.calibration.correction import Calibration, Mirror
-from tactile_rt.calibration.files import (
-    calibration_path,
-    load_calibration,
-    save_calibration,
-)
+from tactile_rt.calibration.files import calibration_path, load_calibration, save_calibration
 from tactile_rt.calibration.fitting import Fit, LoadTable, calibrate, raw_readings, read_loads
 from tactile_rt.calibration.taring import Tare, tare
 

@@ -36,13 +36,7 @@ from tactile_rt.classifier.model_card import (
     one_line,
     parse_card,
 )
-from tactile_rt.classifier.onnx_check import (
-    MAX_BYTES,
-    BadModel,
-    Contents,
-    graph_sha256,
-    read_onnx,
-)
+from tactile_rt.classifier.onnx_check import MAX_BYTES, BadModel, Contents, graph_sha256, read_onnx
 from tactile_rt.classifier.runtime import FlushDenormals
 from tactile_rt.core.errors import ConfigError, ModelError
 

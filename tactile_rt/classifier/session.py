@@ -35,7 +35,9 @@ class Session:
     def __init__(self, source: Source, classifier: Classifier, queue_chunks: int = 256) -> None:
         self.source = source
         self.classifier = classifier
-        self._queue = BoundedQueue[Chunk](queue_chunks, measure=_samples, kinds=("samples",))
+        self._queue = BoundedQueue[Chunk](
+            queue_chunks, measure=lambda chunk: ("samples", len(chunk), 0), kinds=("samples",)
+        )
         self._stopping = False
         self._ending: Exception | None = None
         self._reader: threading.Thread | None = None
@@ -113,7 +115,3 @@ class Session:
                 return
             if chunk is not None and not self._stopping:
                 self._queue.put(chunk)
-
-
-def _samples(chunk: Chunk) -> tuple[str, int, int]:
-    return "samples", len(chunk), 0

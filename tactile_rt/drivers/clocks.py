@@ -61,10 +61,8 @@ class Stamper:
 
     Args:
         codec: The codec of the device, which says what counter and clock there are.
-        stats: The account in which losses are counted; deliveries are the reader's to count.
 
     Attributes:
-        sequencer: Numbers the samples by the device's counter.
         clock: The clock that dates the samples; None for a device that sends neither time nor
             count.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
@@ -148,7 +146,6 @@ class DeviceClock:
         """(n,) host times of samples, ns: strictly increasing, none after its arrival if possible.
 
         Args:
-            ticks: The device's clock as it came, (n,).
             arrived_ns: Host times of arrival, (n,), ns, never decreasing.
         """
         told: list[int] = []
@@ -275,10 +272,6 @@ class DeviceTime:
     one that goes back or begins anew goes on from the last sample's time after the time that passed
     on the host's clock.
 
-    Args:
-        tick_ns: Length of a tick, ns.
-        bits: Width of the device's clock, which wraps at 2^bits.
-
     Attributes:
         drift_ppm: Always 0, since no other clock is compared with this one.
         steps: Number of times that the clock went back or began anew.
@@ -295,12 +288,7 @@ class DeviceTime:
         self._ticks, self._origin = 0, 0  # since the clock began, and its time then, ns
 
     def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n,) device times of samples, ns: strictly increasing.
-
-        Args:
-            ticks: The device's clock as it came, (n,).
-            arrived_ns: Host times of arrival, (n,), ns, never decreasing.
-        """
+        """(n,) device times of samples, ns: strictly increasing."""
         told = np.empty(len(ticks), np.int64)
         for i, (tick, arrived) in enumerate(zip(ticks.tolist(), arrived_ns.tolist(), strict=True)):
             if self._tick is None:

@@ -76,7 +76,6 @@ class Step(Generic[Packet]):
         timeout_s: Longest time that the answer may take, s; a device that does not answer in time
             counts as not there.
         pause_s: Time to wait before the next step, answer or not, s.
-        what: The step in words, for the message when no answer comes.
     """
 
     send: Packet
@@ -146,7 +145,6 @@ class Codec(abc.ABC, Generic[Packet]):
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
-        greeting: What the device says when it is switched on, before anything else.
         measures: Whether the device measures although no host has asked for samples. The device's
             side.
         newest: The newest sample of a device that measures and does not send, None if there is
@@ -193,9 +191,6 @@ class Codec(abc.ABC, Generic[Packet]):
         Args:
             chunk: Samples of `spec`; `seq` is the device's counter and `t_ns` its clock, neither
                 wrapped.
-
-        Returns:
-            One packet per sample.
         """
 
     @classmethod
@@ -203,9 +198,6 @@ class Codec(abc.ABC, Generic[Packet]):
         """Options that a device may have besides the defaults, of those that change its frames.
 
         For whoever must find out what a device is.
-
-        Args:
-            identifiers: The CAN identifiers of 11 bits that there are.
         """
         return []
 
@@ -304,11 +296,7 @@ def six_axis(name: str, rate_hz: float) -> ArraySpec:
 
 
 def codec_class(wire: str, name: str) -> type[Codec[Any]]:
-    """The codec of this name for ``serial`` or ``can``.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """The codec of this name for ``serial`` or ``can``."""
     if (wire, name) in CODECS:
         module, attribute, _ = CODECS[wire, name]
         there = import_module(module)

@@ -67,7 +67,6 @@ class DeviceSource(Source):
 
     Args:
         connect: Opens the line; called again after the line was lost.
-        options: How long to wait for what, and what to do when the line is lost.
         codec_options: Options of the codec as the user wrote them, for a recording to tell.
 
     Raises:

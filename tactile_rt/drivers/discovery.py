@@ -50,7 +50,6 @@ class Port:
             one.
         usb: Vendor and product numbers on USB; None for a port that is not on USB.
         serial_number: Serial number that the USB device reports; empty if none.
-        likely: What the device on this port is likely to be, in words.
         url: The URL to begin with; the codec in it is a guess.
     """
 
@@ -79,11 +78,7 @@ class CanBus:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at.
-
-    Attributes:
-        do: What the user should do about it; empty when all is good.
-    """
+    """One thing looked at."""
 
     what: str
     good: bool

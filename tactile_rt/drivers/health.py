@@ -29,8 +29,6 @@ class Health:
             device that tells no time.
         clock_steps: Number of times that the device's clock jumped or began anew.
         counter_resets: Number of times that the device's sample counter began anew.
-        status: What the status bits of the newest sample mean, in words.
-        wire: Counts of the frames that came, and of what was wrong with them.
     """
 
     state: State

@@ -20,11 +20,7 @@ WAIT_S = 0.05  # how soon a line without a descriptor looks for the end of the w
 
 
 class Link(abc.ABC, Generic[Packet]):
-    """A line to a device; opened when made.
-
-    Raises:
-        SourceError: it cannot be opened: what and why.
-    """
+    """A line to a device; opened when made."""
 
     name: str
     can_errors = 0
@@ -59,7 +55,6 @@ class SerialLink(Link[bytes]):
 
     Args:
         baud: Speed of the line, bit/s.
-        parity: Parity of the line: ``N``, ``E`` or ``O``.
         dtr: Whether to assert DTR; boards that reset when DTR rises are left alone with False.
     """
 
@@ -241,9 +236,6 @@ class SlcanLink(Link[Sequence[CanFrame]]):
     """A CAN adapter that speaks slcan (LAWICEL) over a serial port.
 
     python-can speaks it too, byte by byte: 5,500 frames/s where a saturated bus carries 9,000.
-
-    Args:
-        bitrate: Speed of the bus, bit/s.
     """
 
     def __init__(self, port: str, bitrate: int, fd: bool = False) -> None:

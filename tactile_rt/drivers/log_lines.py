@@ -9,14 +9,7 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 
-__all__ = [
-    "Found",
-    "of_candump",
-    "of_gvret",
-    "of_heard",
-    "of_hex",
-    "of_slcan",
-]
+__all__ = ["Found", "of_candump", "of_gvret", "of_heard", "of_hex", "of_slcan"]
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"

@@ -21,14 +21,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.log_lines import (
-    Found,
-    of_candump,
-    of_gvret,
-    of_heard,
-    of_hex,
-    of_slcan,
-)
+from tactile_rt.drivers.log_lines import Found, of_candump, of_gvret, of_heard, of_hex, of_slcan
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
@@ -198,10 +191,6 @@ def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
 
     Args:
         form: one of `FORMS`; empty: as it begins.
-        bus: of a CAN log with several, the one to take; empty for all.
-
-    Raises:
-        ConfigError: no such file, or form.
     """
     if form and form not in FORMS:
         raise ConfigError(f"no form {form!r} of a log: there are {', '.join(FORMS)}")

@@ -59,11 +59,7 @@ class Prepared:
         return Prepared(spec, opened, self.told)
 
     def declared(self, array: ArraySpec) -> "Prepared":
-        """The same as a source of this array, see `calibration.declare`.
-
-        Raises:
-            SpecMismatch: it cannot be of it.
-        """
+        """The same as a source of this array, see `calibration.declare`."""
         if self.told:
             return self
         known = self.spec
@@ -126,11 +122,7 @@ class CanOptions(DeviceOptions):
 
 
 def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
-    """A codec from its options as written.
-
-    Raises:
-        ConfigError: no such codec or option.
-    """
+    """A codec from its options as written."""
     kind = codec_class(wire, name)
     (options,) = take_options(f"codec {name}", fields, kind.Options)
     made: Codec[Any] = kind(options)
@@ -139,9 +131,6 @@ def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
 
 def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:
     """What opens the device on a serial port.
-
-    Args:
-        array: of a device that would be asked what it is; it is not asked then.
 
     Raises:
         ConfigError: wrong options. To open what is returned raises `SourceError` if the port
@@ -167,12 +156,10 @@ def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = N
 
     Args:
         target: interface and channel, ``socketcan:can0``.
-        array: of a device that would be asked what it is; it is not asked then.
 
     Raises:
         ConfigError: wrong options. To open what is returned raises `SourceError` if the bus cannot
             be opened, or the device does not send.
-        SpecMismatch: the calibration is of another device.
     """
     from can import VALID_INTERFACES
 

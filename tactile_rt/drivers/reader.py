@@ -72,9 +72,6 @@ class Reader:
     def wait(self, timeout: float | None = None) -> list[Source]:
         """Sources whose `read` may have something now; none if the time is over, or it was woken.
         Ten times a second all of them are.
-
-        Args:
-            timeout: how long to wait, s; None: for ever.
         """
         if self._blind:
             for source in [s for s in self._blind if s.fileno() >= 0]:
@@ -115,9 +112,6 @@ class Reader:
     def read(self, timeout: float | None = None) -> list[tuple[Source, Chunk]]:
         """What has come of any of them since the last call; nothing when the time is over, or no
         source is left.
-
-        Args:
-            timeout: how long to wait for the first sample, s; None: for ever.
 
         Raises:
             SourceError: a device broke; it is among the sources no longer.

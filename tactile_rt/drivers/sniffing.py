@@ -69,11 +69,9 @@ class CodecFit:
     """A codec that fits.
 
     Attributes:
-        options: The codec's options besides their defaults.
         samples: Number of samples; of a device that has not described itself 0.
         explained: Part of the bytes, or of the bus's frames, that is of this device's frames.
         proof: Part of damaged frames that the codec notices, 0 to 1.
-        likely: Whether there are frames and, of a device that has told all that it must, samples.
     """
 
     wire: str
@@ -99,9 +97,6 @@ def sniff_bytes(data: bytes, further: Sequence[Tried] = ()) -> list[CodecFit]:
     Args:
         data: bytes as they came, cut anywhere; the first 64 kB are looked at, and where nothing
             fits them, the second half of these.
-
-    Raises:
-        ConfigError: one of `further` cannot be.
     """
     data = data[:LOOK_BYTES]
     # what comes first may be a device that starts, or the line before it was plugged in
@@ -131,9 +126,6 @@ def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> l
 
     Args:
         frames: as they came; other devices may be on the bus.
-
-    Raises:
-        ConfigError: one of `further` cannot be.
     """
     frames = frames[:LOOK_FRAMES]
     packets = [[frame] for frame in frames]
@@ -246,9 +238,6 @@ def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Itera
     Args:
         seconds: how long to listen at each, s.
         speeds: (baud, parity) of each.
-
-    Raises:
-        SourceError: it cannot be opened, or is gone.
     """
     link = SerialLink(port, *speeds[0])
     try:
@@ -273,7 +262,6 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
 
     Args:
         url: ``can:INTERFACE:CHANNEL``, with the bus's options.
-        seconds: how long to listen, s.
     """
     link: Link[Any] = open_line(url)
     frames: list[CanFrame] = []

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, rotation_matrices
 
 __all__ = ["Symmetry", "compose", "symmetries"]
 
@@ -111,7 +111,7 @@ def _reflection(normal: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _symmetry(spec: ArraySpec, source: NDArray[np.int64], image: NDArray[np.float64]) -> Symmetry:
-    frames = np.array([_matrix(q) for q in spec.orientations])
+    frames = rotation_matrices(spec.orientations)
     polar = np.empty_like(frames)
     for j, i in enumerate(source):
         seen = image @ frames[i]
@@ -154,14 +154,3 @@ def _smallest_rotation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArra
     k = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
     rotation: NDArray[np.float64] = np.eye(3) + k + k @ k / (1 + c)
     return rotation
-
-
-def _matrix(q: tuple[float, float, float, float]) -> NDArray[np.float64]:
-    w, x, y, z = np.array(q) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

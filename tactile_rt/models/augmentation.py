@@ -28,14 +28,7 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.models import published_pictures
 from tactile_rt.models.array_symmetries import compose, symmetries
 
-__all__ = [
-    "Augmentation",
-    "as_published",
-    "build",
-    "image",
-    "mask_steps",
-    "tactile_paper",
-]
+__all__ = ["Augmentation", "as_published", "build", "image", "mask_steps", "tactile_paper"]
 
 HALF = 0.5
 JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's, and a noise of the log
@@ -64,7 +57,6 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
     """An augmentation by name.
 
     Args:
-        name: one of `training.config.AUGMENTATIONS`.
         masking: share of steps that are blanked, too.
 
     Raises:
@@ -155,7 +147,6 @@ def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Te
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).
-        channels: of a sub-step.
     """
 
     def draw(below: int) -> int:
@@ -176,7 +167,6 @@ def as_published(
         mirrored: the axis that is flipped, -1 or -2; 0: none.
         turns: quarter turns, counter-clockwise; what leaves the grid is lost.
         reverse: run all sub-steps backwards, with the other sign.
-        channels: of a sub-step.
     """
     if mirrored:
         frames = frames.flip(mirrored)
@@ -205,7 +195,6 @@ def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
 
     Args:
         frames: (batch, step, sub-step * colour, row, column).
-        colours: channels of a sub-step.
     """
     n, device = len(frames), frames.device
     x = frames.unflatten(2, (-1, colours))  # (batch, step, sub-step, colour, row, column)

@@ -152,11 +152,7 @@ def make(
     """The decoder of that name.
 
     Args:
-        name: one of `DECODERS`.
         steps: an episode's steps, which "mlp-all" has weights for.
-
-    Raises:
-        ConfigError: no decoder has that name.
     """
     if name == "linear":
         return LinearDecoder(features, classes)

@@ -31,15 +31,7 @@ from tactile_rt.models.ead_config import (
 )
 from tactile_rt.models.encoders.cells import Cell
 
-__all__ = [
-    "ATTENDERS",
-    "DECODERS",
-    "EAD",
-    "ENCODERS",
-    "READOUTS",
-    "EADConfig",
-    "count_parameters",
-]
+__all__ = ["ATTENDERS", "DECODERS", "EAD", "ENCODERS", "READOUTS", "EADConfig", "count_parameters"]
 
 GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and only there
 
@@ -145,7 +137,7 @@ def _encoder(config: EADConfig) -> Any:
     module, name = encoder_class(config.encoder)
     kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
     if config.encoder == "graph":
-        from tactile_rt.models.encoders.graph_files import parse_graph
+        from tactile_rt.models.encoders.graph import parse_graph
 
         graph = parse_graph(config.graph)
         read = graph.frame

@@ -65,11 +65,7 @@ def _encoders(asked: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class EADConfig:
-    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters.
-
-    Raises:
-        ConfigError: a field that names or measures nothing possible.
-    """
+    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters."""
 
     classes: int
     encoder: str = "zhuang-intersection-ln"
@@ -81,7 +77,7 @@ class EADConfig:
     readout: str = "last"
     dropout: float = 0.1
     max_steps: int = 22  # an episode; the GPT's positions end here
-    graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph_files`
+    graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph`
     frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of what it reads
     norm_epsilon: float = 0.0  # of the cells' layer norms; 0: each cell's own, see `cells`
     preprocessing: str = "log"  # of the input stage, see `inputs`

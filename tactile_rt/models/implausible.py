@@ -47,7 +47,9 @@ def _amplified(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> S
     """All is several times too large, or too small."""
     n, (least, most) = len(samples), np.log(GAINS)
     factor = np.exp(rng.uniform(least, most, n) * rng.choice([-1, 1], n))
-    return _over(samples, factor)
+    each = factor.reshape(-1, *(1,) * (samples.ndim - 1))
+    amplified: Samples = (samples * each).astype(np.float32)
+    return amplified
 
 
 def _missing(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
@@ -90,7 +92,3 @@ def _vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
 def _some(vectors: list[tuple[int, ...]], rng: np.random.Generator) -> list[tuple[int, ...]]:
     """All of them, or one."""
     return vectors if rng.random() < 0.5 else [vectors[rng.integers(len(vectors))]]
-
-
-def _over(samples: Samples, factor: NDArray[np.float64]) -> Samples:
-    return (samples * factor.reshape(-1, *(1,) * (samples.ndim - 1))).astype(np.float32)

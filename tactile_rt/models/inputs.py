@@ -36,7 +36,6 @@ class InputStage(nn.Module):
         clip: per channel, the largest magnitude that is believed (channel,), SI.
         scale: per channel, the floor of the logarithm's scale (channel,), SI; without a logarithm,
             the unit.
-        preprocessing: one of `ead_config.PREPROCESSINGS`.
 
     Raises:
         ConfigError: clip and scale of unlike lengths or not positive, two elements in one place,

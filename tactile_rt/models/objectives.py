@@ -88,7 +88,6 @@ class Objective(nn.Module):
 
         Args:
             views: `self.views` batches of loads, SI.
-            generator: on the loads' device; the augmentation of frames draws from it.
         """
         return [self.frames(view, generator) for view in views]
 
@@ -162,9 +161,6 @@ class SimCLR(Objective):
     """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is thrown away afterwards.
 
     Both views are one batch, to batch norms in the network, too.
-
-    Args:
-        temperature: as `nt_xent` takes it.
     """
 
     views = 2

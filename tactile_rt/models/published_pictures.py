@@ -47,11 +47,9 @@ class Draw:
     """What is done to a batch.
 
     Attributes:
-        mirrored: Whether columns are flipped.
         order: The order in which brightness, contrast, saturation and hue are changed, by their
             numbers from 0; empty: they stay.
         by: The factors of the first three, and the turns that are added to the hue.
-        grey: Whether all colours become their luminance.
         sigma: The width of the blur, in cells; 0: none.
     """
 
@@ -101,12 +99,7 @@ def as_drawn(frames: Tensor, done: Draw) -> Tensor:
 
 
 def jittered(x: Tensor, order: Sequence[int], by: tuple[float, float, float, float]) -> Tensor:
-    """Pictures (..., colour, row, column) with other brightness, contrast, saturation and hue.
-
-    Args:
-        order: in which the four are changed, by their places in `by`.
-        by: factors of the first three, and turns that are added to the hue.
-    """
+    """Pictures (..., colour, row, column) with other brightness, contrast, saturation and hue."""
     brightness, contrast, saturation, hue = by
     for what in order:
         if what == 0:

@@ -32,12 +32,7 @@ from tactile_rt.core.files import whole_folder, write_whole
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.recording.description import RECOVERED, Description, seal
-from tactile_rt.recording.layout import (
-    SAMPLES,
-    WIRE,
-    Raw,
-    decode_samples,
-)
+from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2_form import CHANNELS, TEXTS, WRENCH, FileForm

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.settings import take_options
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
@@ -121,7 +120,8 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
     same = options.codec in ("", about.codec)
     if same:
         own = {**about.codec_options, **own}
-    array = _array_of(own.pop("array", ""))
+    told = own.pop("array", "")  # what the device was said to be when it was recorded
+    array = ArraySpec.from_json(told) if told else None
 
     def new_codec() -> Codec[Any]:
         codec = make_codec(about.wire, options.codec or about.codec, own)
@@ -143,13 +143,6 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         prepared = prepared.calibrated(about.calibration)
     # What a device said of itself is among the packets.
     return replace(prepared, spec=about.spec) if same and not prepared.spec else prepared
-
-
-def _array_of(text: str) -> ArraySpec | None:
-    """What a device was said to be when it was recorded: JSON; of earlier releases, its file."""
-    if not text:
-        return None
-    return ArraySpec.from_json(text) if text.startswith("{") else read_array(Path(text))
 
 
 def _check_file(path: Path) -> None:

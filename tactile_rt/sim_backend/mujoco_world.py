@@ -129,11 +129,7 @@ def sweep_model(
     pieces: Sequence[trimesh.Trimesh],
     profile: Profile,
 ) -> mujoco.MjModel:
-    """The model of a sweep.
-
-    Args:
-        pieces: convex, of the object, mm, about its place.
-    """
+    """The model of a sweep."""
     world = empty_world(profile)
     for animal in animals:
         some = tuple(w for w in animal.whiskers if w.name in names)

@@ -112,11 +112,7 @@ class PacedSource(Source):
 
     @abc.abstractmethod
     def _simulate(self, start_ns: int) -> Chunk | None:
-        """The next samples; None when all of them are dropped.
-
-        Raises:
-            EndOfStream: there are no more.
-        """
+        """The next samples; None when all of them are dropped."""
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         if self._start_ns is None:

@@ -28,15 +28,13 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.packages import VERSION
 from tactile_rt.core.stream import ArraySpec, Chunk
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = ["DISTANCES", "SHAPES", "STIMULI", "Surface", "whisk_against", "write_input"]
+__all__ = ["Surface", "whisk_against", "write_input"]
 
-SHAPES = ("convex", "concave")
-DISTANCES = ("close", "medium", "far")
-STIMULI = tuple(f"{shape}-{distance}" for shape in SHAPES for distance in DISTANCES)
 # Middle of the close surfaces' faces, from the array's origin (see `whisking.HEAD`), mm.
 CLOSE = {"convex": (17.26, 0.68, 1.46), "concave": (24.27, -5.37, 1.46)}
 PERIOD_NS = 9_000_000  # of the model input
@@ -56,9 +54,6 @@ class Surface:
         chord_mm, height_mm: The straight width and height of the face, mm.
         thickness_mm: The thickness of the sheet, behind the face, mm.
         facets: The number of flat strips that the face is made of; their edges lie on the arc.
-
-    Raises:
-        ConfigError: no such shape, or an impossible size.
     """
 
     shape: str
@@ -218,9 +213,6 @@ def write_input(
     Args:
         path: ends in .npz; both files appear whole or not at all.
         angles: (sample, element, 3) base angles theta, phi, zeta at 1 kHz, rad.
-
-    Raises:
-        ConfigError: a stimulus is not touched, or for too short a time.
     """
     windows = []
     for name, what in felt.items():

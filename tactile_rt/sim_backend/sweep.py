@@ -260,11 +260,7 @@ def draw_sweep(
     distance_mm: float = Sweep.distance_mm,
     chosen: Mapping[str, float] = NOTHING,
 ) -> Sweep:
-    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds.
-
-    Args:
-        distance_mm: about which distances spread, see `usual_distance`.
-    """
+    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds."""
     drawn = {
         "speed_mm_s": float(rng.uniform(28, 40)),
         "yaw_deg": float(rng.uniform(0, 360)),

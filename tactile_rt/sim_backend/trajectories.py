@@ -93,9 +93,7 @@ class Recorded:
     """A recorded trajectory, interpolated by a cubic spline: see `read_trajectory`.
 
     Attributes:
-        times_s: The (sample,) times from 0 on, s.
         turns: The (sample, whisker, 3) turn from the resting angles, rad.
-        names: The names of the whiskers of `turns`, in their order.
     """
 
     times_s: NDArray[np.float64]

@@ -133,11 +133,7 @@ class WhiskSimulation:
         return turns.reshape(len(times), -1)
 
     def _prescribe(self, turns: NDArray[np.float64]) -> None:
-        """Put the bases where they belong, with the force that takes them a step further.
-
-        Args:
-            turns: from the step before on, that after it included, for the acceleration.
-        """
+        """Put the bases where they belong, with the force that takes them a step further."""
         h = self.model.opt.timestep
         before, now, after = turns[:3]
         self.data.qpos[self._positions] = now

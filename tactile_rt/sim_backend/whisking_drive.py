@@ -90,7 +90,6 @@ class _Segment:
     """From one command to the next.
 
     Attributes:
-        start_s: The time at which the segment begins, s.
         aim: The (3,) frequency, amplitude and offset commanded.
         away: The (lag, 3) distance of each lag's output from the aim at the start, the last lag
             last.

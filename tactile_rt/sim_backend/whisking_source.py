@@ -50,11 +50,7 @@ class Placing:
         parse_point(self.position_mm, "position_mm")
 
     def place(self, thing: TactileObject, left: bool) -> tuple[NDArray[np.float64], ...]:
-        """Return the (points, 3) corners of the object's convex pieces in the world, mm.
-
-        Args:
-            left: whether it stands on the left, as the mirror image has it.
-        """
+        """Return the (points, 3) corners of the object's convex pieces in the world, mm."""
         at = np.array(parse_point(self.position_mm, "position_mm")) * (1 - 2 * left, 1, 1)
         turn = rotation("z", np.radians(self.yaw_deg))
         return tuple(p.vertices * self.size_mm @ turn.T + at for p in thing.pieces)

@@ -173,12 +173,7 @@ def add_whiskers(
     mount: Mount = MOUNT,
     head: str = "head",
 ) -> mujoco.MjsBody:
-    """Add an array to a world, with force and torque sensors at every whisker's base.
-
-    Args:
-        whiskers: the array; names of all whiskers in one world differ.
-        head: name of the head's body, which is returned.
-    """
+    """Add an array to a world, with force and torque sensors at every whisker's base."""
     body = world.worldbody.add_body(name=head, pos=mount.position, quat=quaternion(mount.rotation))
     for whisker in whiskers:
         _add_whisker(world, body, whisker, profile)

@@ -20,7 +20,6 @@ import time
 from collections.abc import Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,7 +30,14 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError, SourceError, TactileError
 from tactile_rt.core.settings import convert, read_toml, refusal
-from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
+from tactile_rt.core.stream import (
+    NS_PER_S,
+    ArraySpec,
+    Chunk,
+    EndOfStream,
+    Source,
+    rotation_matrices,
+)
 from tactile_rt.drivers.opening import Prepared
 from tactile_rt.sources.opening import check_source, open_source
 
@@ -132,7 +138,7 @@ def combine_specs(
         turn = np.array(part.orientation)
         if abs(np.linalg.norm(turn) - 1) > 1e-6:
             raise ConfigError(f"{part.name}: orientation {part.orientation} is no unit quaternion")
-        positions += [tuple(_turned(turn, p) + part.position) for p in spec.positions]
+        positions += [tuple(rotation_matrices(turn) @ p + part.position) for p in spec.positions]
         orientations += [tuple(_product(turn, q)) for q in spec.orientations]
     return replace(
         specs[0],
@@ -277,9 +283,3 @@ def _product(a: NDArray[Any], b: tuple[float, ...]) -> NDArray[Any]:
     """Hamilton product of two quaternions (w, x, y, z)."""
     w, x, y, z = a
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b
-
-
-def _turned(turn: NDArray[Any], point: tuple[float, float, float]) -> NDArray[Any]:
-    """A vector turned by a unit quaternion."""
-    conjugate = turn * (1, -1, -1, -1)
-    return _product(_product(turn, tuple(chain((0.0,), point))), tuple(conjugate))[1:]

@@ -16,10 +16,11 @@ from tactile_rt.alignment.activations import (  # noqa: E402
 from tactile_rt.alignment.layers import first_difference  # noqa: E402
 from tactile_rt.alignment.loading import load_untrained  # noqa: E402
 from tactile_rt.alignment.onnx_activations import onnx_layers  # noqa: E402
-from tactile_rt.alignment.rdm import STIMULI, rdm  # noqa: E402
+from tactile_rt.alignment.rdm import rdm  # noqa: E402
 from tactile_rt.alignment.stimuli_input import SHIPPED, read_stimuli  # noqa: E402
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model  # noqa: E402
 from tactile_rt.core.errors import ConfigError  # noqa: E402
+from tactile_rt.core.stream.stimuli import STIMULI  # noqa: E402
 from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
 from tactile_rt.models.ead import EADConfig  # noqa: E402
 from tactile_rt.models.encoders.graph_encoder import draw_as_published  # noqa: E402

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_rt.alignment import another_mouse
-from tactile_rt.alignment.another_mouse import MARGIN, Mice
+from tactile_rt.alignment import gate
 from tactile_rt.alignment.example import Brain
+from tactile_rt.alignment.gate import MARGIN, Mice
 from tactile_rt.alignment.rdm import rdm
 from tactile_rt.alignment.statistics import student
 
@@ -60,7 +60,7 @@ def test_entries_vary_as_the_weights_say():
 
 
 def test_fits_are_weighted_correlations(monkeypatch):
-    monkeypatch.setattr(another_mouse, "OWN", 0.3)
+    monkeypatch.setattr(gate, "OWN", 0.3)
     rng = np.random.default_rng(1)
     mice = distances(rng.normal(size=(6, 5)) + 0.3 * rng.normal(size=(4, 6, 5)))
     square = np.zeros((6, 6))

@@ -8,8 +8,8 @@ import pytest
 
 from tactile_rt.alignment import build, nwb
 from tactile_rt.alignment.clock import CLOCKS
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 pynwb = pytest.importorskip("pynwb", reason="pynwb writes the files and is the oracle")

@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from tactile_rt.alignment.benchmark import load_benchmark, save_benchmark
-from tactile_rt.alignment.canonical import canonical
 from tactile_rt.alignment.example import Brain
 from tactile_rt.alignment.neural import Animal, NeuralSession, pad, published_layout
 from tactile_rt.alignment.paper_code import freeze_paper_code
 from tactile_rt.alignment.scoring import score, score_rdms
-from tactile_rt.alignment.strict import divided, freeze_strict
+from tactile_rt.alignment.strict import canonical, divided, freeze_strict
 from tactile_rt.core.errors import ConfigError
 from tests.helpers.brains import animals, geometry, loop, padded, responses, session
 

@@ -3,16 +3,9 @@
 import numpy as np
 import pytest
 
-from tactile_rt.alignment.rdm import (
-    STIMULI,
-    pearson,
-    rdm,
-    relabellings,
-    rsa,
-    square,
-    stimulus_index,
-)
+from tactile_rt.alignment.rdm import pearson, rdm, relabellings, rsa, square, stimulus_index
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 
 def test_an_rdm_is_one_minus_the_correlations_above_the_diagonal():
@@ -74,8 +67,3 @@ def test_near_in_simulation_is_close_in_the_recordings():
         stimulus_index("convex", "nearby")
     with pytest.raises(ConfigError, match="no shape 'nothing'"):
         stimulus_index("nothing", "far")
-
-
-def test_the_simulator_names_its_stimuli_alike():
-    stimuli = pytest.importorskip("tactile_rt.sim_backend.stimuli", exc_type=ImportError)
-    assert stimuli.STIMULI == STIMULI

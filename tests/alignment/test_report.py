@@ -16,7 +16,6 @@ from tactile_rt.alignment.pictures import (
     draw_profiles,
     draw_scatter,
 )
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.report import report_page
 from tactile_rt.alignment.results import (
     baseline_of,
@@ -27,6 +26,7 @@ from tactile_rt.alignment.results import (
 from tactile_rt.alignment.stimuli_input import read_stimuli
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 from tests.helpers import brains
 from tests.helpers.pages import check_page
 

@@ -31,7 +31,7 @@ def trained(call, tmp_path):
 
 def felt(path, spec, seed=0):
     """What `tactile-rt whisk` would write of this array."""
-    from tactile_rt.alignment.rdm import STIMULI
+    from tactile_rt.core.stream.stimuli import STIMULI
 
     values = np.random.default_rng(seed).normal(size=(6, 110, *spec.shape)) * 1e-4
     np.savez(

@@ -29,7 +29,7 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.export import onnx_step, streaming, streaming_gpt
+from tactile_rt.export import onnx_step, streaming
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
@@ -185,7 +185,7 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(streaming, "LARGE", 0)
-    monkeypatch.setattr(streaming_gpt, "WIDE", 0)
+    monkeypatch.setattr(streaming, "WIDE", 0)
     path = tmp_path / "wide.onnx"
     export_step(exported.model, exported.card, path)
     operators = [node.op_type for node in onnx.load(path).graph.node]

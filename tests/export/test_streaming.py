@@ -11,7 +11,6 @@ import torch
 
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.export import streaming as streaming_module
-from tactile_rt.export import streaming_gpt
 from tactile_rt.export.products import Pointwise
 from tactile_rt.export.streaming import (
     streaming,
@@ -64,7 +63,7 @@ def test_steps_give_the_window_s_logits(encoder: str, attender: str, decoder: st
 def as_if_wide(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small networks take the forms of wide ones."""
     monkeypatch.setattr(streaming_module, "LARGE", 0)
-    monkeypatch.setattr(streaming_gpt, "WIDE", 0)
+    monkeypatch.setattr(streaming_module, "WIDE", 0)
 
 
 @pytest.mark.usefixtures("as_if_wide")

@@ -7,7 +7,7 @@ recording begins. Spikes follow contact by a few ms, and the stimulus from conta
 
 import numpy as np
 
-from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.core.stream.stimuli import STIMULI
 
 ORIGIN_S = 10.03
 STRINGS = ("outcome", "stimulus", "servo_position")

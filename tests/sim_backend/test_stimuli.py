@@ -11,10 +11,10 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.stimuli import (
     PERIOD_NS,
-    STIMULI,
     Surface,
     Touch,
     model_input,

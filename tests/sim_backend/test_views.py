@@ -23,6 +23,7 @@ from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.views.film import (
     Film,
+    Stage,
     camera_of,
     check_suffix,
     write_image,
@@ -30,7 +31,6 @@ from tactile_rt.sim_backend.views.film import (
 )
 from tactile_rt.sim_backend.views.footage import VIEWS, Camera, Footage, framing, record
 from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign
-from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
 
 SCALE = ForceScale(1.0, 10.0)

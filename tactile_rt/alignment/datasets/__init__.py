@@ -13,11 +13,11 @@ from importlib import import_module
 from pathlib import Path
 
 from tactile_rt.alignment.neural import Animal
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import added, added_names
 from tactile_rt.core.settings import no_such
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
 
@@ -46,10 +46,7 @@ class NeuralDataset:
     """A public set of recordings, and how to read it.
 
     Attributes:
-        name: The name that a user gives, such as the number of a DANDI set.
         license: The SPDX name of its license; empty for a set of the user's own.
-        url: The address of its page; empty if there is none.
-        size: The size and the number of its files, in words.
         conditions: The names of its six conditions, in the order of the stimulus axis.
         about: Sentences on what is compared and what that leaves out.
         read: The function that reads downloaded files or folders. It takes them, the input of the
@@ -87,11 +84,7 @@ def dataset_names() -> tuple[str, ...]:
 
 
 def find_dataset(name: str) -> NeuralDataset:
-    """A dataset by its name.
-
-    Raises:
-        ConfigError: no such dataset, or it cannot be loaded.
-    """
+    """A dataset by its name."""
     if name in DATASETS:
         module, _, attribute = DATASETS[name].partition(":")
         ours: NeuralDataset = getattr(import_module(module), attribute)

@@ -34,15 +34,7 @@ from tactile_rt.core.files import write_whole
 if TYPE_CHECKING:
     import urllib3
 
-__all__ = [
-    "Fetched",
-    "PublishedFile",
-    "RangeFile",
-    "connections",
-    "counted",
-    "fetch",
-    "published_files",
-]
+__all__ = ["connections", "counted", "fetch", "published_files"]
 
 UNITS = ("spike_times", "spike_times_index", "depth", "inhibitory")
 BLOCK = 1 << 16  # bytes
@@ -53,11 +45,7 @@ BUSY = (429, 500, 502, 503, 504)
 
 
 def connections() -> "urllib3.PoolManager":
-    """Connections to servers, kept open from request to request, through the proxy that is set.
-
-    Raises:
-        ModuleNotFoundError: urllib3 is not installed.
-    """
+    """Connections to servers, kept open from request to request, through the proxy that is set."""
     import urllib3
 
     again = urllib3.Retry(AGAIN, backoff_factor=0.5, status_forcelist=BUSY, raise_on_status=False)
@@ -75,8 +63,6 @@ class RangeFile(io.RawIOBase):
     h5py swallows what its file raises and says something else; the first error stays in `error`.
 
     Args:
-        pool: of `connections`.
-        url: of the file.
         size: in bytes; a server that has another size has another file.
 
     Attributes:
@@ -121,11 +107,7 @@ class RangeFile(io.RawIOBase):
         return end - begin
 
     def _fetch(self, first: int, last: int) -> None:
-        """Get blocks, all between them included.
-
-        Raises:
-            ConfigError: the server did not give them.
-        """
+        """Get blocks, all between them included."""
         import urllib3
 
         begin, end = first * BLOCK, min((last + 1) * BLOCK, self._size)
@@ -167,7 +149,6 @@ class PublishedFile:
     Attributes:
         path: The path in the dataset, ``sub-231CR/sub-231CR_ses-20190921T144923_....nwb``.
         size: Bytes.
-        sha256: The checksum of the whole file, hexadecimal.
     """
 
     path: str
@@ -214,14 +195,9 @@ def fetch(
 
     What is there already stays, so that a fetch that broke off goes on.
 
-    Args:
-        folder: is made if it is not there.
-        progress: called with the share done, 0 to 1.
-
     Raises:
         ConfigError: a file cannot be had, or is not the one that was published; those before it
             are in the folder.
-        ModuleNotFoundError: h5py or urllib3 is not installed.
     """
     pool = connections()
     new = transferred = 0
@@ -237,11 +213,7 @@ def fetch(
 
 
 def counted(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
-    """Mice and units of sessions with valid trials, and notes on what was left out.
-
-    Raises:
-        ConfigError: none can be read.
-    """
+    """Mice and units of sessions with valid trials, and notes on what was left out."""
     readings, notes = read_nwb(paths, "start")
     mice = {reading.session.animal for reading in readings}
     return len(mice), sum(r.session.rates.shape[1] for r in readings), notes

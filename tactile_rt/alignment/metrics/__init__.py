@@ -88,11 +88,7 @@ def metric_names() -> tuple[str, ...]:
 
 
 def find_metric(name: str) -> Metric:
-    """The function of a metric.
-
-    Raises:
-        ConfigError: no such metric, or it cannot be loaded.
-    """
+    """The function of a metric."""
     if name in METRICS:
         module, _, function = METRICS[name][0].partition(":")
         ours: Metric = getattr(import_module(module), function)

@@ -16,7 +16,8 @@ from tactile_rt.alignment.metrics import Measure
 from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
 from tactile_rt.alignment.metrics.halves import ceiling_of, divisions, sessions_of
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import STIMULI, UPPER, pearson
+from tactile_rt.alignment.rdm import UPPER, pearson
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["crossnobis", "distances", "shrunk_covariance"]
 
@@ -50,7 +51,6 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
 
     Args:
         white: (trial, unit), whitened.
-        stimulus: (trial,) of each.
         chosen: (division, trial), which trials count; at least two of every stimulus.
 
     Returns:
@@ -70,12 +70,7 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
 
 
 def shrunk_covariance(residuals: Floats, freedom: int) -> Floats:
-    """Covariance of (trial, unit) about zero, its correlations shrunk towards none.
-
-    Args:
-        residuals: about the mean of each trial's stimulus.
-        freedom: the number of trials less that of the means.
-    """
+    """Covariance of (trial, unit) about zero, its correlations shrunk towards none."""
     n = len(residuals)
     products = residuals.T @ residuals
     squares = (residuals**2).T @ residuals**2

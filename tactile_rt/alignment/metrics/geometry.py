@@ -12,6 +12,7 @@ The ceiling is the root of the Spearman-Brown reliability of the animal's own ge
 """
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +28,7 @@ from tactile_rt.alignment.metrics.halves import (
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import UPPER, pearson, rdm
 
-__all__ = [
-    "NOTHING",
-    "cka",
-    "cosine",
-    "mean_pattern",
-    "rsa",
-    "rsa_time",
-    "time_course",
-    "u_centred",
-]
+__all__ = ["NOTHING", "cka", "cosine", "mean_pattern", "rsa", "rsa_time", "time_course"]
 
 Floats = NDArray[np.float64]
 
@@ -45,15 +37,7 @@ NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # of an animal that
 
 def rsa(animal: Animal) -> Measure:
     """Representational similarity of mean responses."""
-    sessions = sessions_of(animal)
-    if not sessions:
-        return NOTHING
-    goal = rdm(means_of(sessions, 0)[:, 0])
-    halves = rdm(np.concatenate([half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
-    return Measure(
-        ceiling_of(pearson(halves[:, 0], halves[:, 1])),
-        lambda layer: float(pearson(rdm(mean_pattern(layer)), goal)),
-    )
+    return _compare_means(animal, rdm, pearson)
 
 
 def rsa_time(animal: Animal) -> Measure:
@@ -93,14 +77,21 @@ def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
 
 def cka(animal: Animal) -> Measure:
     """Centred kernel alignment of mean responses, U-centred."""
+    return _compare_means(animal, u_centred, cosine)
+
+
+def _compare_means(
+    animal: Animal, form: Callable[[Floats], Floats], agree: Callable[[Floats, Floats], Floats]
+) -> Measure:
+    """Measure how mean responses agree in a form such as their RDM."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING
-    goal = u_centred(means_of(sessions, 0)[:, 0])
-    halves = u_centred(np.concatenate([half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
+    goal = form(means_of(sessions, 0)[:, 0])
+    halves = form(np.concatenate([half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
     return Measure(
-        ceiling_of(cosine(halves[:, 0], halves[:, 1])),
-        lambda layer: float(cosine(u_centred(mean_pattern(layer)), goal)),
+        ceiling_of(agree(halves[:, 0], halves[:, 1])),
+        lambda layer: float(agree(form(mean_pattern(layer)), goal)),
     )
 
 

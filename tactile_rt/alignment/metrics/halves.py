@@ -4,14 +4,12 @@ Halves are drawn within every session and stimulus; how two halves agree says ho
 can be relied on (Spearman-Brown). Bins that some trials do not reach are means over those that do.
 """
 
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import STIMULI
 from tactile_rt.alignment.reliability import spearman_brown
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
     "DIVISIONS",
@@ -110,14 +108,10 @@ def _means(values: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_
     there = np.asarray(np.isfinite(values).all(axis=2), dtype=np.float64)  # (trial, bin)
     flat = np.nan_to_num(values).reshape(trials, -1)
     out = np.empty((len(chosen), len(STIMULI), bins, units))
-    for k, rows in _by_stimulus(stimulus):
+    for k in range(len(STIMULI)):
+        rows = np.flatnonzero(stimulus == k)
         weights = chosen[:, rows].astype(np.float64)
         number = weights @ there[rows]
         total = (weights @ flat[rows]).reshape(-1, bins, units)
         out[:, k] = total / np.where(number > 0, number, np.nan)[..., None]
     return out
-
-
-def _by_stimulus(stimulus: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.intp]]]:
-    for k in range(len(STIMULI)):
-        yield k, np.flatnonzero(stimulus == k)

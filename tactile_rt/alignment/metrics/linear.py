@@ -20,7 +20,7 @@ from tactile_rt.alignment.metrics import MINIMUM_CEILING, Measure
 from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
 from tactile_rt.alignment.metrics.halves import bins_of, means_of, sessions_of, values_of
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import STIMULI
+from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["PENALTIES", "linear", "predicted"]
 

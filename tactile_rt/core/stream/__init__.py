@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.core.errors import ConfigError
 
@@ -30,6 +30,7 @@ __all__ = [
     "SourceStats",
     "Timing",
     "concatenate",
+    "rotation_matrices",
 ]
 
 NS_PER_S = 1_000_000_000
@@ -302,3 +303,15 @@ class Timing:
 
 
 MOUSE = Timing()  # 22 steps of five 9 ms samples
+
+
+def rotation_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
+    """Turn unit quaternions (..., 4), w first, into rotation matrices (..., 3, 3)."""
+    q = np.asarray(quaternions, dtype=np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

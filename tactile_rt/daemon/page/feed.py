@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, message_of
 
@@ -150,19 +150,7 @@ def map_axes(spec: ArraySpec) -> NDArray[np.float64]:
     right = right / lengths[0]
     down = down - right * (right @ down)  # the map's axes stand at right angles
     axes = np.stack([right, down / np.linalg.norm(down)])
-    return np.stack([(axes @ _matrix(q)).round(4) for q in spec.orientations])
-
-
-def _matrix(q: tuple[float, float, float, float]) -> NDArray[np.float64]:
-    """(3, 3) rotation of a unit quaternion."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.asarray((axes @ rotation_matrices(spec.orientations)).round(4))
 
 
 def _text(values: NDArray[np.float32]) -> str:

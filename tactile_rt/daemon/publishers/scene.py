@@ -22,9 +22,9 @@ from foxglove.messages import (
 )
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, rotation_matrices
 
-__all__ = ["Scene", "force_columns", "rotate", "turn_x_to"]
+__all__ = ["Scene", "force_columns", "turn_x_to"]
 
 FORCES = ("fx", "fy", "fz")
 SINGLE_M = 0.05  # extent of an array of one element
@@ -48,7 +48,7 @@ class Scene:
         self._source, self._spec, self._m_per_n = source, spec, m_per_n
         self._largest = 0.0
         self._at = np.array(spec.positions)
-        self._turns = np.array(spec.orientations)
+        self._turns = rotation_matrices(spec.orientations)
         self._columns = force_columns(spec)
         extent = float(np.ptp(self._at, axis=0).max())
         self._extent = extent if extent > 0 else SINGLE_M
@@ -56,7 +56,7 @@ class Scene:
 
     def bases(self, utc_ns: int) -> SceneUpdate:
         """Where the elements are, and along what they stand: their own x axis."""
-        ends = self._at + 0.5 * self._spacing * rotate(self._turns, np.array([1.0, 0.0, 0.0]))
+        ends = self._at + 0.5 * self._spacing * self._turns[:, :, 0]
         size = 0.15 * self._spacing
         spheres = [
             SpherePrimitive(
@@ -92,7 +92,7 @@ class Scene:
         for axis, column in self._columns.items():
             own[:, axis] = values[:, column]
         own[~valid | ~np.isfinite(own).all(axis=1)] = 0.0
-        force = rotate(self._turns, own)
+        force = (self._turns @ own[:, :, None])[:, :, 0]
         size = np.linalg.norm(force, axis=1)
         self._largest = max(FORGET * self._largest, float(size.max()))
         scale = self._m_per_n or (self._extent / 3 / self._largest if self._largest > 0 else 0.0)
@@ -137,14 +137,6 @@ def force_columns(spec: ArraySpec) -> dict[int, int]:
         for axis, name in enumerate(FORCES)
         if name in spec.channels and spec.units[spec.channels.index(name)] == "N"
     }
-
-
-def rotate(quaternions: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn vectors (..., 3) by unit quaternions (n, 4), w first; (n, 3)."""
-    w, axis = quaternions[:, :1], quaternions[:, 1:]
-    twice = 2 * np.cross(axis, vectors)
-    turned: NDArray[np.float64] = vectors + w * twice + np.cross(axis, twice)
-    return turned
 
 
 def turn_x_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -70,11 +70,7 @@ class AsciiLineOptions:
 
 
 class AsciiLine(SerialCodec):
-    """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter.
-
-    Raises:
-        ConfigError: the file or a column is wrong.
-    """
+    """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter."""
 
     Options = AsciiLineOptions
     baud = 115200

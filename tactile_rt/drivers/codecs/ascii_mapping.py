@@ -131,8 +131,6 @@ class Column:
         kind: What the column is: ``value``, ``count``, ``s`` (decimal time), ``iso`` (a date),
             ``ms``, ``us``, ``ns`` or ``-``.
         bits: Width of a counter or of a whole-numbered time, in bits.
-        element: Name of the element that was measured; empty for other columns.
-        channel: Name of the channel that was measured; empty for other columns.
         unit: SI unit of the measured value.
         label: Name that stands before the number; empty where places tell.
     """
@@ -155,11 +153,7 @@ class Column:
 
 
 def read_mapping(path: str) -> LineMapping:
-    """Read a mapping file.
-
-    Raises:
-        ConfigError: it cannot be read or is none; names the file and the key or line.
-    """
+    """Read a mapping file."""
     mapping: LineMapping = convert(read_toml(Path(path)), LineMapping)
     if mapping.version != VERSION:
         raise ConfigError(f"{path}: version {mapping.version}; this release reads {VERSION}")
@@ -168,9 +162,6 @@ def read_mapping(path: str) -> LineMapping:
 
 def parse_column(word: str, where: str) -> Column:
     """One column from its word.
-
-    Args:
-        word: The column as a user writes it; see the module's docstring.
 
     Raises:
         ConfigError: not of that form, an unknown unit, a scale that is none.

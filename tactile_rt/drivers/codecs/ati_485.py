@@ -15,7 +15,6 @@ public firmware for the sensor.
 """
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -245,8 +244,8 @@ class Ati485(SerialCodec):
 
     def respond(self, packet: bytes) -> bytes:
         answer = b""
-        for byte in _bytes(packet):
-            self._heard = (self._heard + byte)[-len(JAM) :]
+        for byte in packet:
+            self._heard = (self._heard + bytes((byte,)))[-len(JAM) :]
             if self._heard == JAM:
                 self.streaming, self._heard = False, b""
             elif not self.streaming and self._heard.endswith(self._request):
@@ -255,20 +254,12 @@ class Ati485(SerialCodec):
         return answer
 
 
-def _bytes(packet: bytes) -> Iterator[bytes]:
-    return (packet[k : k + 1] for k in range(len(packet)))
-
-
 def _checked(message: bytes) -> bytes:
     return message + crc16_modbus(message).to_bytes(2, "little")
 
 
 def _matrix(path: str) -> NDArray[np.float64] | None:
-    """The 6 x 6 numbers of a file; None without a path.
-
-    Raises:
-        ConfigError: it cannot be read, or they are not so many, or no load follows from them.
-    """
+    """The 6 x 6 numbers of a file; None without a path."""
     if not path:
         return None
     try:

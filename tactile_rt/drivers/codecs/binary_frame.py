@@ -69,9 +69,6 @@ class DescribedFrame(SerialCodec):
 
     Args:
         rate_hz: rate at which the device sends, or is asked, Hz; 0 for that of the description.
-
-    Raises:
-        ConfigError: the frame cannot be so; names place and key.
     """
 
     cannot_detect = (

@@ -39,9 +39,6 @@ class CanDbc(CanCodec):
     A sample ends with its last frame, or when a frame comes that belongs to the next one: one that
     is not after the frame before, or whose counter differs. Elements of which a signal did not
     come are invalid; a sample without its counter, time or status is not delivered.
-
-    Raises:
-        ConfigError: a file is missing or wrong, or names a message or signal that does not exist.
     """
 
     Options = CanDbcOptions

@@ -74,7 +74,6 @@ def guess_columns(
     """A word for each column, as `ascii_mapping` has them, and whether one is a time.
 
     Args:
-        names: what stands above the columns; empty without.
         rows: cells of some rows, None for what is no number.
     """
     width = len(names) or max((len(r) for r in rows), default=0)

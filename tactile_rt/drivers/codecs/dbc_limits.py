@@ -26,11 +26,7 @@ _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
 
 def check_dbc(file: str, text: str) -> None:
-    """Refuse what no CAN bus can carry, and more than a sensor has.
-
-    Raises:
-        ConfigError: one line with the file and the message or signal.
-    """
+    """Refuse what no CAN bus can carry, and more than a sensor has."""
     messages = signals = 0
     for found in _MESSAGE.finditer(text):
         messages += 1

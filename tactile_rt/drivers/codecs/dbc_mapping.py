@@ -41,8 +41,6 @@ class Signal:
         start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
             bit, counted from the highest of byte 0.
         length: Width of the signal, in bits.
-        signed: Whether the number is in two's complement.
-        real: Whether the number is an IEEE 754 floating-point number.
     """
 
     message: str
@@ -83,10 +81,8 @@ class FramePart:
     """A frame that every sample has: a message, with these values of its multiplexers.
 
     Attributes:
-        extended: Whether the identifier has 29 bits.
         length: Length of the message's data, bytes.
         when: The multiplexers in the message, and the values of each that make a frame this part.
-        message: The message as cantools read it, which encodes the data of an emulated device.
     """
 
     id: int
@@ -178,11 +174,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_mapping(path: Path) -> DbcMapping:
-    """Read a mapping and the DBC file that it names.
-
-    Raises:
-        ConfigError: one line that names the file, the message or signal, and the nearest name.
-    """
+    """Read a mapping and the DBC file that it names."""
     file: _File = convert(read_toml(path), _File)
     return _Reader(path, file).mapping()
 

@@ -35,7 +35,6 @@ class EndFinder:
 
     Args:
         size: length of a frame with its ending, bytes.
-        stats: the account in which frames and bytes are counted.
     """
 
     def __init__(self, end: bytes, size: int, stats: WireStats) -> None:
@@ -95,9 +94,7 @@ class StrideFinder:
     can measure.
 
     Args:
-        size: length of a frame with its ending, bytes.
         possible: of (n, size) bytes, which of these n the device can have sent.
-        stats: the account in which frames and bytes are counted.
     """
 
     def __init__(

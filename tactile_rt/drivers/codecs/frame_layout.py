@@ -143,16 +143,10 @@ def _within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_]:
 class FrameLayout:
     """A mapping, checked, as a codec wants it.
 
-    Raises:
-        ConfigError: the frame cannot be so; names file and key.
-
     Attributes:
         sync, ends: The bytes with which a frame begins and ends.
-        between: A pattern of what else comes between frames.
         count, time, status: The place of each of these; None without it.
-        meanings: What the bits of the status mean, by their number.
         check_at, check_first: Offsets of the checksum, and of the first byte that it covers.
-        begun, ended_otherwise: Numbers of beginnings found, and of those without the ending.
     """
 
     def __init__(self, mapping: FrameMapping, path: str) -> None:

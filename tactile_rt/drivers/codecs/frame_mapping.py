@@ -173,11 +173,7 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def read_frame_mapping(path: str) -> FrameMapping:
-    """Read a mapping file.
-
-    Raises:
-        ConfigError: it cannot be read, or is not such a file; names file and key or line.
-    """
+    """Read a mapping file."""
     nodes = read_toml(Path(path))
     mapping: FrameMapping = convert(nodes, FrameMapping)
     if mapping.version != VERSION:

@@ -104,8 +104,6 @@ class FrameFinder:
     Args:
         size: Length of a frame, bytes.
         good: Tells of `size` bytes that begin with `sync` whether they are an intact frame.
-        between: What else the device sends between frames.
-        stats: The account in which frames and bytes are counted.
         parts: Whether frames come in parts of which one can be missing (a CAN bus): such a frame is
             incomplete, not corrupt, zeros may fill its last part, and the bytes beside frames are
             not counted.

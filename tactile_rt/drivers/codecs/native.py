@@ -167,7 +167,7 @@ class NativeSerial(SerialCodec):
                 bits = -(-shape[0] // 8)
                 part: NDArray[Any] = np.ndarray((1, *shape), _TYPES[head[2]], payload, bits)
                 if head[2] == FORMATS["int16"]:
-                    part = (part * self._scale()).astype(np.float32)
+                    part = (part * np.array(self._description().scale)).astype(np.float32)
                 parts.append(part)
                 flags += payload[:bits]
                 rows.append((t_ns, self._damaged, head[5], head[6], head[4]))
@@ -194,9 +194,8 @@ class NativeSerial(SerialCodec):
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         if command == Command.START:
-            ask = Step(
-                frame(MessageType.DESCRIBE), _reply(MessageType.DESCRIPTION), what="its description"
-            )
+            reply = SYNC + bytes((VERSION << 4 | MessageType.DESCRIPTION,))
+            ask = Step(frame(MessageType.DESCRIBE), reply, what="its description")
             start = Step(frame(MessageType.START))
             return (start,) if self.spec and not self._described else (ask, start)
         return (Step(frame(MessageType.STOP)),) if command == Command.STOP else ()
@@ -273,10 +272,6 @@ class NativeSerial(SerialCodec):
             self._described = DeviceDescription.of(self.spec, *self._ranges)
         return self._described
 
-    def _scale(self) -> NDArray[np.float64]:
-        """(channel,) SI units per count of int16."""
-        return np.array(self._description().scale)
-
     def _valid_of(self, flags: bytes, n: int) -> NDArray[np.bool_]:
         """(n, element) from the validity bits of n samples, which hardly ever change."""
         if flags != self._flags:
@@ -345,10 +340,6 @@ class NativeSerial(SerialCodec):
     def _refuse(self) -> None:
         self.stats.corrupt += 1
         self._damaged += 1
-
-
-def _reply(kind: int) -> bytes:
-    return SYNC + bytes((VERSION << 4 | kind,))
 
 
 def _fits(head: tuple[Any, ...]) -> bool:

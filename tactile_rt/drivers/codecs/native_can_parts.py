@@ -26,12 +26,7 @@ def head_of(seq: int, time_us: int, flags: int) -> bytes:
 
 
 def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
-    """The data of the frames after the header; None if there would be too many.
-
-    Args:
-        head: The header of the sample, as `head_of` packs it.
-        body: Validity bits and values of the sample, packed.
-    """
+    """The data of the frames after the header; None if there would be too many."""
     size = 62 if head[7] & LONG else 6
     body += crc16_xmodem(head + body).to_bytes(CHECK, "little")
     if len(body) > MOST_PARTS * size:
@@ -188,11 +183,7 @@ class DescriptionParts:
 
 
 def cut_description(kind: int, text: bytes, size: int) -> list[bytes]:
-    """The data of the frames that carry a description.
-
-    Args:
-        size: The most data that a frame carries, bytes.
-    """
+    """The data of the frames that carry a description."""
     whole = len(text).to_bytes(2, "little") + text + zlib.crc32(text).to_bytes(4, "little")
     starts = range(0, len(whole), size - PIECE.size)
     return [PIECE.pack(kind, i) + whole[at : at + size - PIECE.size] for i, at in enumerate(starts)]

@@ -32,11 +32,7 @@ class EmulatedDevice:
     """An emulated device on a line that exists; a context manager, plugged in while entered.
 
     Attributes:
-        codec: The codec that the device speaks; it also remembers what hosts have commanded.
         emulator: The emulator behind the line; its `log` tells what it did with each sample.
-
-    Raises:
-        ConfigError: The codec or one of its options is unknown.
     """
 
     wire: ClassVar[str]
@@ -126,7 +122,6 @@ class EmulatedSerial(EmulatedDevice):
     Args:
         link: A symbolic link to the port, so that the port has the same name when it is plugged
             in again; None: /dev/pts/N.
-        options: Options of the codec, and ``baud``, as in a URL.
         pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read, over a line
             without a speed.
     """

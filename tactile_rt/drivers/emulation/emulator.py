@@ -17,12 +17,7 @@ from tactile_rt.core.stream import NS_PER_S, Chunk, EndOfStream, Source
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedule
-from tactile_rt.drivers.emulation.transmitter import (
-    EmulatedClock,
-    RateConverter,
-    Transmitter,
-    fit,
-)
+from tactile_rt.drivers.emulation.transmitter import EmulatedClock, RateConverter, Transmitter, fit
 
 __all__ = ["PACES", "Emulator"]
 
@@ -57,12 +52,6 @@ class Emulator:
         start_tick: First value of the device's clock, in ticks.
         drift_ppm: How much faster than true the device's clock runs, parts per million.
         settle_s: How long after a host has come a device begins that sends unasked, s.
-
-    Attributes:
-        log: What was done to each sample: a record of each (17 bytes) if asked for, else counts
-            only.
-        codec: The codec that the device speaks. Without a `spec` it takes that of the source; else
-            see `fit`. It also remembers what hosts have commanded.
 
     Raises:
         ConfigError: codec and endpoint are of different wires, or a fault cannot happen there.
@@ -129,11 +118,7 @@ class Emulator:
         return self._done and (not self.endpoint.backlog or not self.endpoint.heard)
 
     def start(self) -> None:
-        """Appear and begin.
-
-        Raises:
-            ConfigError: the endpoint cannot be plugged in.
-        """
+        """Appear and begin."""
         self.endpoint.plug()
         for work in (self._listen, self._measure):
             thread = threading.Thread(target=work, name=f"emulator-{work.__name__[1:]}")

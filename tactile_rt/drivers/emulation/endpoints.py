@@ -12,8 +12,7 @@ from typing import Any, ClassVar, Generic
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame, Packet
-from tactile_rt.drivers.emulation.pseudo_terminal import Pty
-from tactile_rt.drivers.emulation.wire import Wire, bytes_s, frames_s
+from tactile_rt.drivers.emulation.pseudo_terminal import Pty, Wire, bytes_s, frames_s
 from tactile_rt.drivers.slcan import SlcanAdapter
 
 __all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
@@ -44,11 +43,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def plug(self) -> None:
-        """Appear.
-
-        Raises:
-            ConfigError: it cannot: what and why.
-        """
+        """Appear."""
 
     @abc.abstractmethod
     def pull(self) -> None:
@@ -126,7 +121,6 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
         fifo_bytes: How many bytes the port holds for a host that does not read.
         baud: Speed of the line, bit/s: what is sent takes its time, and a host with another one
             hears nonsense; 0 for a line without a speed, as USB is.
-        parity: Parity of the line: ``N``, ``E`` or ``O``.
     """
 
     wire = "serial"
@@ -159,10 +153,8 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
     """A device on a CAN bus with an slcan adapter on a pty: frames come once the channel is open.
 
     Args:
-        link: A name under which the port appears, besides /dev/pts/N.
         bitrate: Speed of the bus, bit/s; a host that chooses another one hears nothing. None
             accepts any.
-        fifo_bytes: How many bytes the port holds for a host that does not read.
         paced: Whether frames take the time that they take on a bus of the host's bit rate.
     """
 
@@ -213,14 +205,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
 
 
 class BusEndpoint(Endpoint[Sequence[CanFrame]]):
-    """A device on a bus of python-can.
-
-    Args:
-        bitrate: Speed of the bus, bit/s, where the interface sets it.
-
-    Raises:
-        ConfigError: not such a name.
-    """
+    """A device on a bus of python-can."""
 
     wire = "can"
 

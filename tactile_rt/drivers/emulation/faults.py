@@ -92,9 +92,6 @@ class Fault:
         duration_s: Length of the fault, s, for ``stall``, ``unplug``, ``clock_drift`` and
             ``gather`` (these two, 0: to the end).
         amount: Size of the fault, in the unit that `KINDS` tells; None for the default of its kind.
-
-    Raises:
-        ConfigError: which field, and what it can be.
     """
 
     kind: str
@@ -281,11 +278,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_faults(path: Path | str) -> FaultSchedule:
-    """Read a schedule; see the head of this module.
-
-    Raises:
-        ConfigError: one line that names the file, the fault, the key, and what to do.
-    """
+    """Read a schedule; see the head of this module."""
     path = Path(path)
     file: _File = convert(read_toml(path), _File)
     if not file.fault:

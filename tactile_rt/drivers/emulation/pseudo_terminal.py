@@ -1,7 +1,13 @@
-"""A pseudo-terminal as a device's port: raw, named, never blocking, and it can be pulled out."""
+"""A pseudo-terminal as a device's port: raw, named, never blocking, and it can be pulled out.
+
+What is written is heard when a line of its speed would have carried it. Sources: the frame of a
+UART (a start bit, eight bits, the lowest first, a parity bit if there is one, a stop bit); ISO
+11898-1 for the bits of a CAN frame, without stuff bits, as in docs/reference/native-protocol.md.
+"""
 
 import fcntl
 import itertools
+import math
 import os
 import pty
 import select
@@ -12,13 +18,86 @@ import threading
 import time
 import tty
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.drivers.emulation.wire import Wire, misheard
+from tactile_rt.drivers.codec import CanFrame
 
-__all__ = ["Pty"]
+__all__ = ["Pty", "Wire", "bytes_s", "frames_s", "misheard"]
+
+STANDARD, EXTENDED = 47, 67  # bits of a frame beside its data, the gap to the next one included
+FD_SLOW, FD_SLOW_EXTENDED = 30, 49  # of CAN FD, at the speed of the arbitration
+FD_FAST, FD_FAST_LONG = 31, 36  # at that of the data: up to 16 bytes, and more
+LONG: Final = 16
+
+
+class Wire:
+    """A line on which one thing follows the other.
+
+    Attributes:
+        gather_s: Time for which an adapter gathers what has come before it hands it on, s: 1 ms by
+            USB, 16 ms by FTDI's as they are delivered.
+    """
+
+    def __init__(self) -> None:
+        self.gather_s = 0.0
+        self._free_at = -math.inf
+
+    def heard_at(self, takes_s: float, now: float) -> float:
+        """When something is at the other end that is sent now and takes so long.
+
+        Args:
+            now: the present, s, on a clock that never goes back.
+        """
+        self._free_at = max(self._free_at, now) + takes_s
+        if self.gather_s:
+            return math.ceil(self._free_at / self.gather_s) * self.gather_s
+        return self._free_at
+
+
+def bytes_s(n: int, baud: int, parity: str = "N") -> float:
+    """The time that bytes take on a serial line, s."""
+    return n * (10 if parity == "N" else 11) / baud
+
+
+def frames_s(frames: Sequence[CanFrame], bitrate: int, data_bitrate: int | None = None) -> float:
+    """The time that frames take on a CAN bus, s."""
+    slow = fast = 0
+    for frame in frames:
+        n = 0 if frame.remote else len(frame.data)
+        if frame.fd:
+            slow += FD_SLOW_EXTENDED if frame.extended else FD_SLOW
+            fast += (FD_FAST if n <= LONG else FD_FAST_LONG) + 8 * n
+        else:
+            slow += (EXTENDED if frame.extended else STANDARD) + 8 * n
+    return slow / bitrate + fast / (data_bitrate or bitrate)
+
+
+def misheard(data: bytes, spoken: int, heard: int) -> bytes:
+    """What a receiver makes of bytes that follow each other at another speed than its own.
+
+    It looks at the line in the middle of its own bits, from the edge of each start bit on.
+
+    Args:
+        spoken: the speed at which it is sent, bit/s.
+        heard: the speed that the receiver is set to, bit/s.
+    """
+    line = [bit for byte in data for bit in (0, *(byte >> k & 1 for k in range(8)), 1)]
+    line += [1] * 20
+    step = spoken / heard
+    found, at = bytearray(), 0.0
+    while at < len(line) - 20:
+        if line[int(at)]:  # idle: until the next edge
+            at = math.floor(at) + 1.0
+            continue
+        places = [int(at + (k + 1.5) * step) for k in range(8)]
+        bits = [line[p] if p < len(line) else 1 for p in places]
+        found.append(sum(bit << k for k, bit in enumerate(bits)))
+        at += 9.5 * step
+    return bytes(found)
+
 
 LOOK_S = 0.005  # how often a port that nobody has open is looked at
 READ_BYTES = 65_536
@@ -43,10 +122,6 @@ class Pty:
         wire: The line's speed; None: whatever is written is there at once.
         baud: Speed at which bytes are sent, bit/s: a host with another one hears nonsense; 0: any
             hears it.
-
-    Attributes:
-        queued: Number of bytes written and not yet passed on.
-        lock: The lock that is held wherever the terminal's state is used.
     """
 
     def __init__(
@@ -128,7 +203,6 @@ class Pty:
         """Queue all of these bytes, or none: nobody has it open, or there is no room.
 
         Args:
-            answer: Whether this answers a command, for which there is more room.
             takes_s: The time that they take on the wire, s.
         """
         with self.lock:

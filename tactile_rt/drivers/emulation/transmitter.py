@@ -26,9 +26,6 @@ SAME = 1e-3  # relative: rates that differ by less are one
 class Transmitter:
     """Samples to packets to an endpoint, with faults on the way; in one thread at a time.
 
-    Args:
-        faults: What goes wrong; None for nothing.
-
     Attributes:
         end_ns: Time at which the stream ends, on the source's clock, ns; nothing goes wrong just
             before.
@@ -234,7 +231,6 @@ class RateConverter:
 
     Args:
         source_hz: rate of the source, Hz.
-        codec: the device's, which knows its rate and what a host has commanded.
     """
 
     def __init__(self, source_hz: float, codec: Codec[Any]) -> None:

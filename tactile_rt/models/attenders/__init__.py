@@ -9,16 +9,7 @@ from torch import Tensor, nn
 from tactile_rt.models.attenders.gpt import BLOCK, GPT, HEADS, LAYERS, MAX_STEPS, TOKENS
 from tactile_rt.models.attenders.mamba import MambaAttender
 
-__all__ = [
-    "BLOCK",
-    "GPT",
-    "HEADS",
-    "LAYERS",
-    "MAX_STEPS",
-    "TOKENS",
-    "MambaAttender",
-    "NoAttender",
-]
+__all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "MambaAttender", "NoAttender"]
 
 
 class NoAttender(nn.Module):

@@ -257,9 +257,6 @@ def make_cell(name: str, channels: int) -> Cell:
 
     Args:
         name: of the cell; of an added one as its entry point is called, or with "-ln" after it.
-
-    Raises:
-        ConfigError: there is none, or what the package adds is no `Cell`.
     """
     if name in CELLS:
         return CELLS[name](channels)

@@ -2,16 +2,36 @@
 
 Time is unrolled as in biology: a step costs every edge the same delay, so at step t a node reads
 what its predecessors put out at step t-1 (nothing at t = 0); only the frame is read at step t.
+
+`parse_graph` reads one from TOML::
+
+    readout = "fc"
+    [inputs.frame]
+    channels = 30
+    rows = 5
+    columns = 7
+    [nodes.conv1]
+    kind = "valid"
+    channels = 96
+    reads = ["frame"]
+    cell = "gru-ln"
+    [nodes.fc]
+    kind = "dense"
+    channels = 512
+    reads = ["conv1"]
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import msgspec
+
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.settings import convert, parse_toml
 from tactile_rt.models.ead_config import CELLS, added_cells
 
-__all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node"]
+__all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node", "parse_graph"]
 
 FUSIONS = ("concatenate", "sum", "gate")
 KINDS = ("valid", "same", "dense")
@@ -63,11 +83,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """The frame, nodes, and the dense node that is read out.
-
-    Raises:
-        ConfigError: from the constructor, in one line that names the node and what is wrong.
-    """
+    """The frame, nodes, and the dense node that is read out."""
 
     frame: Input
     nodes: tuple[Node, ...]
@@ -113,7 +129,9 @@ class Graph:
             maps = {sizes[e.source] for e in node.reads} - {(1, 1)}
             fits = node.kind == "dense" or {_less(node, *m) for m in maps} == {sizes[node.name]}
             if len(maps) > 1 or not fits:
-                found = ", ".join(f"{e.source} {_by(sizes[e.source])}" for e in node.reads)
+                found = ", ".join(
+                    f"{e.source} {sizes[e.source][0]}x{sizes[e.source][1]}" for e in node.reads
+                )
                 raise ConfigError(f"{node.name}: the maps that it reads differ in size ({found})")
             if min(sizes[node.name]) < 1:
                 raise ConfigError(f"{node.name}: no site is left for a 'valid' convolution")
@@ -188,5 +206,42 @@ def _less(node: Node, rows: int, columns: int) -> tuple[int, int]:
     return (rows - 1, columns - 1) if node.kind == "valid" else (rows, columns)
 
 
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
+class _Input(msgspec.Struct):
+    channels: int
+    rows: int = Input.rows
+    columns: int = Input.columns
+
+
+class _Node(msgspec.Struct):
+    channels: int
+    reads: tuple[str | Edge, ...]
+    kind: str = Node.kind
+    cell: str = Node.cell
+
+
+class _File(msgspec.Struct):
+    inputs: dict[str, _Input] = {}
+    nodes: dict[str, _Node] = {}
+    readout: str = ""
+
+
+def parse_graph(text: str, where: str = "graph") -> Graph:
+    """Read a graph from TOML, as in the module's docstring."""
+    tree = parse_toml(text, where)
+    file: _File = convert(tree, _File)
+    for table in ("inputs", "nodes"):
+        if not getattr(file, table):
+            raise ConfigError(f"{tree.where}: {table} must be tables, [{table}.NAME]")
+    if len(file.inputs) > 1:
+        raise ConfigError(
+            f"{tree.where}: a graph has one input, the frame, not {', '.join(file.inputs)}"
+        )
+    (frame,) = (Input(name, **msgspec.structs.asdict(i)) for name, i in file.inputs.items())
+    nodes = []
+    for name, node in file.nodes.items():
+        reads = tuple(Edge(edge) if isinstance(edge, str) else edge for edge in node.reads)
+        nodes.append(Node(name, node.channels, reads, node.kind, node.cell))
+    try:
+        return Graph(frame, tuple(nodes), file.readout)
+    except ConfigError as error:  # how its parts fit together
+        raise ConfigError(f"{tree.where}: {error}") from None

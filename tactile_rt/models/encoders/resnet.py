@@ -103,7 +103,29 @@ class ResidualBlock(nn.Module):
         return out
 
 
-class ResNet18Encoder(nn.Module):
+class _FrameEncoder(nn.Module):
+    """Each frame on its own, by `_encode`."""
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
+        features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
+        return features
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step: frame (batch, channel, row, column) to features (batch, feature), {}"""
+        return self._encode(frame), {}
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        """Encode (frame, channel, row, column) as (frame, feature)."""
+        raise NotImplementedError
+
+
+class ResNet18Encoder(_FrameEncoder):
     """Frames `(batch, step, channel, row, column)` to `(batch, step, 512 * width)`; no memory."""
 
     lag = 0
@@ -124,26 +146,11 @@ class ResNet18Encoder(nn.Module):
         self.blocks = nn.ModuleList(blocks)
         self.fc = nn.Linear(inputs, self.features)
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
-        features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-        return features
-
-    def initial_state(self, batch: int) -> dict[str, Tensor]:
-        return {}
-
-    def step(
-        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), {}"""
-        return self._encode(frame), {}
-
     def deployed(self) -> FoldedResNet18:
         """The same outputs from only the taps that matter, batch norm folded in; for inference."""
         return FoldedResNet18(self)
 
     def _encode(self, frames: Tensor) -> Tensor:
-        """frames (frame, channel, row, column) -> (frame, feature)"""
         x = maximum(F.relu(self.stem(sites_first(frames))), self.stem.shape)  # (frame, site * c)
         for block in self.blocks:
             x = block(x)
@@ -151,7 +158,7 @@ class ResNet18Encoder(nn.Module):
         return features
 
 
-class FoldedResNet18(nn.Module):
+class FoldedResNet18(_FrameEncoder):
     """A trained `ResNet18Encoder` as plain products: 2 M numbers at width 1 instead of 11.5 M."""
 
     lag = 0
@@ -169,20 +176,6 @@ class FoldedResNet18(nn.Module):
             if block.shortcut is not None:
                 self._add(f"{i}_shortcut", block.shortcut)
         self.layers["fc"] = _linear(encoder.fc.weight, encoder.fc.bias)
-
-    def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
-        features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
-        return features
-
-    def initial_state(self, batch: int) -> dict[str, Tensor]:
-        return {}
-
-    def step(
-        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), {}"""
-        return self._encode(frame), {}
 
     def _encode(self, frames: Tensor) -> Tensor:
         layers = self.layers

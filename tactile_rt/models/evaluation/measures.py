@@ -103,9 +103,6 @@ def predict(
 def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
     """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected,
     or the network overflows.
-
-    Args:
-        run: as `predict` takes it.
     """
     logits, found = run_over(cut, run)
     with np.errstate(invalid="ignore"):
@@ -118,12 +115,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
 def cut_windows(
     data: SweepSet, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
 ) -> Iterator[CutWindows]:
-    """The windows of all sweeps as the robot would cut them, so many at a time.
-
-    Args:
-        data, seed, disturbance: as `predict` takes them.
-        batch: sweeps whose windows come together.
-    """
+    """The windows of all sweeps as the robot would cut them, so many at a time."""
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]

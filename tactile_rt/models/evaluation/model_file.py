@@ -50,7 +50,6 @@ def evaluate_model(
     """Measure a model on the test split of a sweep set.
 
     Args:
-        model: the ``.onnx`` file.
         svm: fit an RBF support vector machine on the same windows to compare with.
         pictures: folder for ``confusion.png`` and ``accuracy_over_time.png``.
         quick: take two sweeps of each object: enough to compare by, not to quote.
@@ -59,7 +58,6 @@ def evaluate_model(
         ConfigError: the model was trained on some of the test objects, does not know all of their
             categories, or another sample period.
         SpecMismatch: the model was made for another array than a set's.
-        ModelError, RecordingError: a file cannot be read.
     """
     session, card = load_model(model)
     run = stepped(session, card)
@@ -291,11 +289,7 @@ def _first_of_each(data: SweepSet, sweeps: int) -> SweepSet:
 def _compare_svm(
     data: Path, card: ModelCard, test: SweepSet, network: NDArray[np.bool_]
 ) -> list[Record]:
-    """A network (sweep,), right or not, beside an RBF support vector machine on the same windows.
-
-    Raises:
-        RecordingError: the set's training or validation split cannot be read.
-    """
+    """A network (sweep,), right or not, beside an RBF SVM on the same windows."""
     from tactile_rt.models.evaluation.svm import fit_svm  # scikit-learn takes a second to import
 
     learnt_from = (  # by the labels that the test's have here, the model's

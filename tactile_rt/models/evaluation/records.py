@@ -20,9 +20,6 @@ class Record:
     """One measured figure.
 
     Attributes:
-        name: The name of what was measured, ``area.what``.
-        value: The measured figure, in `unit`.
-        unit: The unit of the figure, e.g. ``ms``.
         bar: The limit that the figure must meet, e.g. ``>= 91``; empty: it is only reported.
         anchor: What the bar or figure is compared to, or where the bar comes from.
         how: The conditions of the measurement: sample, interval, machine.

@@ -10,13 +10,7 @@ from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = [
-    "Robustness",
-    "conditions",
-    "measure_robustness",
-    "rated_amount",
-    "robustness_records",
-]
+__all__ = ["Robustness", "conditions", "measure_robustness", "rated_amount", "robustness_records"]
 
 
 REST = 80  # samples: 0.7 s of a mouse's, which a baseline can be taken from
@@ -72,7 +66,6 @@ def measure_robustness(
     """Accuracy under every condition, the first without any.
 
     Args:
-        run: as `measures.predict` takes it.
         clean: (sweep, class) final posteriors of the same sweeps, undisturbed.
     """
     labels, objects = test.sweeps.labels, test.sweeps.objects
@@ -88,11 +81,7 @@ def measure_robustness(
 
 
 def robustness_records(found: list[Robustness], how: str) -> list[Record]:
-    """One figure per condition.
-
-    Args:
-        found: as `measure_robustness` gives it.
-    """
+    """One figure per condition."""
     return [
         Record(
             f"models.top-1, {r.name}",

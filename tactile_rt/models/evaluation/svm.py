@@ -33,12 +33,7 @@ PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
 
 @dataclass(frozen=True)
 class FittedSVM:
-    """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels.
-
-    Attributes:
-        kernel: The map of (sweep, feature) values to what the machine takes.
-        how: A sentence for reports that says how the machine was made.
-    """
+    """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels."""
 
     machine: SVC
     kernel: Callable[[NDArray[np.float32]], NDArray[np.float32]]
@@ -110,11 +105,7 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
 def window_features(
     data: "SweepSet", disturbance: "Disturbance | None" = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(sweep, step * element * channel) compressed loads, and whether there was an onset.
-
-    Args:
-        disturbance: what is wrong with the sensor; None: nothing.
-    """
+    """(sweep, step * element * channel) compressed loads, and whether there was an onset."""
     # Imported here: it brings torch, which whoever only writes a set's card does without.
     from tactile_rt.models.disturbances import CLEAN
     from tactile_rt.models.evaluation.measures import cut_windows, run_over

@@ -15,7 +15,6 @@ def stepped(session: ort.InferenceSession, card: ModelCard, refusals: bool = Fal
     """A model file, as `load_model` gives it, as a function of windows.
 
     Args:
-        session, card: the model, of kind "step".
         refusals: whether the logits are to have those of the refusals, too. Without, a posterior is
             what the model would say had it to name a class.
 

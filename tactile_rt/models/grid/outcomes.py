@@ -47,7 +47,6 @@ class Training(msgspec.Struct, frozen=True, omit_defaults=True):
             self-supervised network by its probe. 0 if it diverged.
         seconds: The CPU time of its updates, and of what it was validated by, s; 0 if something
             else than a CPU trained it, or it was interrupted.
-        diverged: Whether the gradients became no numbers, so that nothing was learnt.
         key: The settings that it depends on, as JSON; in its own folder alone.
     """
 
@@ -61,11 +60,7 @@ class Training(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Tested(msgspec.Struct, frozen=True):
-    """What a grid's outcomes are of: enough to tell of them where its sweeps are not.
-
-    Attributes:
-        objects: The (name, sweeps) of each test object, in the order of the hits.
-    """
+    """What a grid's outcomes are of: enough to tell of them where its sweeps are not."""
 
     objects: tuple[tuple[str, int], ...]
     classes: int
@@ -85,7 +80,6 @@ class Outcome(msgspec.Struct, frozen=True):
             at the rated noise.
         seconds: The CPU time of the training that was scored, s, as in `Training`.
         trials, growth: What chose rate and warm-up, then the updates; of the first seed alone.
-        failed: The reason why there is no figure; empty if there is one.
     """
 
     name: str
@@ -154,11 +148,7 @@ def read_point(path: Path, key: str) -> Training | None:
 
 
 def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
-    """What a task found, if it is done.
-
-    Raises:
-        ConfigError: it was done with other settings.
-    """
+    """What a task found, if it is done."""
     path = outcome_path(folder, task)
     if not path.exists():
         return None

@@ -57,7 +57,6 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         begin: The name of a cell whose trained network, of the same seed, this one begins with;
             empty begins with nothing.
         seeds: The number of seeds of this cell; 0 takes the grid's.
-        options: Further fields of `TrainingConfig`.
     """
 
     encoder: str
@@ -171,10 +170,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole grid.
 
     Attributes:
-        cells: The cells, in the order in which they are trained.
         width, seeds: The width and the number of seeds of a cell that has none of its own.
-        supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
-        probe: Fields of `ProbeConfig` for cells whose features a probe reads.
     """
 
     data: str
@@ -193,9 +189,6 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
         """How a task is trained on the sweep set at `data`.
-
-        Args:
-            chosen: what its trials and its growth have found, by the names of `TrainingConfig`.
 
         Raises:
             ConfigError: an option that there is not, or a value that it cannot have.
@@ -269,11 +262,7 @@ def shipped_grids() -> tuple[str, ...]:
 
 
 def read_grid(name: str | Path) -> Grid:
-    """Read a grid file, or a shipped one by name; check every cell.
-
-    Raises:
-        ConfigError: there is none, or it is not such a file.
-    """
+    """Read a grid file, or a shipped one by name; check every cell."""
     if str(name) in shipped_grids():
         nodes = parse_toml((SHIPPED / f"{name}.toml").read_text(), str(name))
     elif Path(name).exists():

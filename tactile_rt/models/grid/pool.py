@@ -38,14 +38,11 @@ def run_grid(
     """Do everything that a grid has not done yet.
 
     Args:
-        folder: where its sweeps, runs and outcomes go.
         processes: to share the tasks; one works in this process.
         report: called with each outcome as it comes, and how many of all there are.
-        accelerator: what trains, as `train` takes it.
 
     Raises:
         ConfigError: the folder holds outcomes of another grid, or another process works in it.
-        RecordingError: the sweep set cannot be read.
     """
     with alone_in(folder):
         _run(grid, folder, processes, report, accelerator)
@@ -113,12 +110,7 @@ def prepare(grid: Grid, folder: Path) -> None:
 
 
 def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
-    """Write, or go on writing, the first sweeps of every object of a set.
-
-    Raises:
-        RecordingError: the source cannot be read.
-        ConfigError: the folder holds another set.
-    """
+    """Write, or go on writing, the first sweeps of every object of a set."""
     manifest = SweepManifest.read(source)
     taken = {split: getattr(sweeps, split) for split in SPLITS}
     recipe = {key: value for key, value in manifest.recipe.items() if key != "contacts"}

@@ -26,9 +26,7 @@ class Row:
             noise. None where there is no figure.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
         seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
-        share: The share of the training objects that it learnt from.
         flat: Whether the last of these gained less than the grid asks for.
-        failed: The reason why seeds are missing; empty if none failed.
     """
 
     name: str
@@ -77,11 +75,7 @@ class GridResults:
 
 
 def gather(grid: Grid, folder: Path) -> GridResults:
-    """Read the outcomes that there are.
-
-    Raises:
-        ConfigError: there is none yet, or those of another grid or of other sweeps.
-    """
+    """Read the outcomes that there are."""
     found: dict[str, list[Outcome]] = {}
     for task in grid.tasks():
         outcome = read_outcome(grid, folder, task)

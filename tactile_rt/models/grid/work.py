@@ -49,11 +49,7 @@ BATCH = 128
 
 
 class Workbench:
-    """What the tasks of one process share: the test windows as the robot would cut them.
-
-    Args:
-        accelerator: what trains, as `train` takes it.
-    """
+    """What the tasks of one process share: the test windows as the robot would cut them."""
 
     def __init__(self, grid: Grid, folder: Path, accelerator: str = "cpu") -> None:
         self.grid, self.folder, self.accelerator = grid, folder, accelerator
@@ -84,11 +80,7 @@ class Workbench:
             pass
 
     def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:
-        """Do a task and keep its outcome; a network that diverges is an outcome too.
-
-        Args:
-            report: called with `training.config.Progress` after every update.
-        """
+        """Do a task and keep its outcome; a network that diverges is an outcome too."""
         found = Outcome(task.name, task.seed, settings_of(self.grid, task))
         try:
             if task.cell is None:

@@ -72,11 +72,7 @@ class BagTopic:
 
 @dataclass
 class OpenBag:
-    """A bag that is open.
-
-    Attributes:
-        notes: What could not be read, a sentence each.
-    """
+    """A bag that is open."""
 
     reader: Any
     notes: list[str] = field(default_factory=list)
@@ -105,7 +101,6 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     """Open a bag of ROS 1 or ROS 2.
 
     Raises:
-        ConfigError: the extra is not installed.
         RecordingError: it is damaged, or has lost its end.
     """
     try:
@@ -150,11 +145,7 @@ def is_bag(path: Path) -> bool:
 
 
 def bag_topics(path: Path) -> list[BagTopic]:
-    """The topics of a bag that hold messages.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
+    """The topics of a bag that hold messages."""
     found = []
     with open_bag(path) as bag:
         for name, about in sorted(bag.reader.topics.items()):

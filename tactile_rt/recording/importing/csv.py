@@ -45,8 +45,6 @@ class CsvForm:
 
     Attributes:
         delimiter: What stands between cells; a space stands for any of spaces and tabs.
-        names: Names of the columns; empty for a table without.
-        units: What stands below the names, a unit each; empty for a table without.
     """
 
     delimiter: str
@@ -145,7 +143,7 @@ def _joined(text: TextIOWrapper, skip: int, lines: int) -> Iterator[str]:
 
 def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
     if delimiter == " ":
-        cells = fields(_points(line) if comma else line)
+        cells = fields(re.sub(r"(?<=\d),(?=\d)", ".", line) if comma else line)
     elif '"' in line:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     else:
@@ -154,10 +152,6 @@ def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
         del cells[-1]  # a delimiter at the end of each line
     return [c.replace(",", ".") if _NUMBER_COMMA.fullmatch(c.strip()) else c for c in cells] \
         if comma else cells  # fmt: skip
-
-
-def _points(line: str) -> str:
-    return re.sub(r"(?<=\d),(?=\d)", ".", line)
 
 
 def _is_there(cell: str) -> bool:

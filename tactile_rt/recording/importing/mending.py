@@ -103,8 +103,6 @@ class Import:
 
     Attributes:
         missing: The number of samples that never came, by the device's counter.
-        seconds: The time from the first sample to the last, s.
-        rate_hz: The nominal sample rate of the recording, Hz.
     """
 
     samples: int = 0

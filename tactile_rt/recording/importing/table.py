@@ -50,7 +50,6 @@ class Table:
     """Rows as they are read.
 
     Attributes:
-        names: Names of the columns; empty for a table without.
         rows: The rows, each with as many cells as there are columns: texts or numbers.
         times_ns: The times of the rows that were read so far, ns, of a table that has times beside
             its columns; None for one that has not.
@@ -71,11 +70,7 @@ def shown_names(names: Sequence[str]) -> str:
 
 
 def mapping_of(columns: str, name: str) -> LineMapping:
-    """What a user says of the columns: words, or a TOML file as docs/codecs/ascii_line.toml.
-
-    Raises:
-        ConfigError: the file cannot be read or is none.
-    """
+    """What a user says of the columns: words, or a TOML file as docs/codecs/ascii_line.toml."""
     if columns.endswith(".toml"):
         return read_mapping(columns)
     return LineMapping(columns=(columns,), name=name)
@@ -123,7 +118,6 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
 
     Raises:
         ConfigError: the columns cannot be, or nothing tells the time.
-        RecordingError: there is no row of numbers.
     """
     mapping = mapping_of(columns, table.path.stem)
     where = columns if columns.endswith(".toml") else "--columns"

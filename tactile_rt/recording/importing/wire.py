@@ -45,7 +45,6 @@ def import_wire(
 
     Raises:
         ConfigError: no such codec or option, or a device that describes itself did not.
-        RecordingError: there is no whole sample.
     """
     codec, about = _prepared(log, fields, rate_hz)
     if log.form == "raw":
@@ -134,11 +133,7 @@ def _bytes_of_a_sample(log: LineLog, codec: Codec[Any]) -> int:
 
 
 class _Decoded:
-    """(packet, when it came, the samples that it completes) of a log, one after the other.
-
-    Raises:
-        ConfigError: the device did not describe itself.
-    """
+    """(packet, when it came, the samples that it completes) of a log, one after the other."""
 
     def __init__(
         self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats

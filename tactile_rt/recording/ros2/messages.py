@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.recording.ros2 import cdr
 
 __all__ = [
@@ -179,7 +179,7 @@ def wrenches_of(spec: ArraySpec, values: NDArray[np.float32]) -> NDArray[np.floa
         return None
     at = {c: k for k, c in enumerate(spec.channels)}
     rows = values[:, 0].astype(np.float64)
-    turn, base = _matrix(spec.orientations[0]), np.array(spec.positions[0])
+    turn, base = rotation_matrices(spec.orientations[0]), np.array(spec.positions[0])
     force = rows[:, [at[c] for c in FORCE]] @ turn.T
     torque = np.cross(base, force)
     if set(TORQUE) <= set(at):
@@ -191,17 +191,6 @@ def wrench_message(wrench: Sequence[float], utc_ns: int, frame: str) -> bytes:
     """A row of `wrenches_of`, taken at this time, in the mount frame."""
     parts = {"force": _vector(wrench[:3]), "torque": _vector(wrench[3:])}
     return cdr.encode(WRENCH, {"header": _header(utc_ns, frame), "wrench": parts})
-
-
-def _matrix(quaternion: tuple[float, float, float, float]) -> NDArray[np.float64]:
-    w, x, y, z = np.array(quaternion) / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _vector(numbers: Any) -> Mapping[str, float]:

@@ -185,9 +185,6 @@ def load_array(name: str) -> WhiskerArray:
     Args:
         name: of an animal and side, see `species_array`, of a robot, see `ROBOTS`, or of another
             package's array; or a path to a .csv or .toml file.
-
-    Raises:
-        ConfigError: no such array, several, or a file with a mistake.
     """
     arrays = load_animals(name)
     if len(arrays) > 1:
@@ -211,9 +208,6 @@ def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...
 
     Args:
         text: what is about to be written to it, of a .toml file; None: what is in it.
-
-    Raises:
-        ConfigError: one line that names the file, the line or whisker, the column, and what to do.
     """
     if path.suffix.lower() == ".csv":
         whiskers = _csv_whiskers(path)

@@ -15,15 +15,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
-__all__ = [
-    "MOUNT",
-    "Mount",
-    "WhiskerArray",
-    "both_sides",
-    "centred_mount",
-    "mirrored",
-    "place",
-]
+__all__ = ["MOUNT", "Mount", "WhiskerArray", "both_sides", "centred_mount", "mirrored", "place"]
 
 Point = tuple[float, float, float]
 
@@ -63,7 +55,6 @@ class WhiskerArray:
     """Whiskers on one head.
 
     Attributes:
-        name: The name that the array is called by, e.g. ``mouse-right``.
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
         sensor: What reads the whiskers; None: the base loads are read as they are.
 

@@ -32,14 +32,7 @@ PAPER = (
 
 
 def write_card(folder: Path, fit: Fit) -> Card:
-    """Write the card of a set, or of what there is of it, into its folder.
-
-    Args:
-        fit: fits a support vector machine, as `models.svm.fit`.
-
-    Raises:
-        RecordingError: no such set, nothing in it, or an object is damaged.
-    """
+    """Write the card of a set, or of what there is of it, into its folder."""
     manifest = SweepManifest.read(folder)
     card, examples = survey(folder, fit)
     write_whole(folder / "card.png", lambda file: _draw_card(card, examples, manifest, file))

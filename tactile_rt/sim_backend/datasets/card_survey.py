@@ -54,11 +54,7 @@ Fit = Callable[
 
 @dataclass(frozen=True)
 class Features:
-    """What a machine sees of some sweeps.
-
-    Attributes:
-        values: The (sweep, feature) features, see `window_features`.
-    """
+    """What a machine sees of some sweeps."""
 
     values: NDArray[np.float32]
     categories: NDArray[np.str_]
@@ -69,7 +65,6 @@ class Separability:
     """The accuracy on some classes, on objects that were not trained on.
 
     Attributes:
-        classes: The names of the classes.
         accuracy: The mean over classes of the share of sweeps that are decided rightly, 0 to 1.
     """
 
@@ -83,27 +78,13 @@ class Card:
 
     Attributes:
         sweeps, objects: The counts of sweeps and of objects, by split and category.
-        skipped: The names of objects that could not be made, and why each could not.
-        parameters: The least, mean and greatest value of each sweep parameter.
         unit: The unit of what counts as load: the force, N, if it is measured, else all channels
             that have the first one's unit.
-        clip: The largest load that networks believe.
         load_edges: The (bin + 1,) edges of the histogram of the largest load of every touched
             whisker in every sweep.
         load_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
-        median_load: The median of the loads in that histogram.
         coverage: The share of the sweeps in which each whisker is touched, 0 to 1, by its name.
         whiskers_touched: The mean number of whiskers touched by a sweep that touches.
-        samples: The number of values in all sweeps, of every channel of every element at every
-            time.
-        clips: The number of values that exceed a limit, by the name of the limit.
-        largest: The largest load, and the sweep in which it occurs.
-        without_touch: The number of sweeps in which nothing is felt.
-        misses: The number of sweeps known to pass beside the array.
-        unstable: The number of sweeps that could not be simulated at the set's profile, and are
-            empty.
-        not_finite: The number of sweeps with a value that is not a finite number.
-        separability: What support vector machines make of few classes.
     """
 
     sweeps: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -145,14 +126,8 @@ class _Findings:
 def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]]:
     """Measure a set: the objects that are there.
 
-    Args:
-        fit: fits a support vector machine, as `models.svm.fit`.
-
     Returns:
         The card, and the load (sample, element) of one sweep of some categories.
-
-    Raises:
-        RecordingError: no such set, nothing in it, or an object is damaged.
     """
     manifest = SweepManifest.read(folder)
     units = manifest.spec.units
@@ -255,8 +230,6 @@ def window_features(
     Args:
         values: (sample, element, channel) SI.
         start: sample of first contact.
-        period_ms: of the samples, ms.
-        limits: what is believed of the channels.
     """
     edges = start + np.arange(STEPS + 1) * STEP_MS / period_ms
     edges = np.minimum(edges.round().astype(int), len(values) - 1)
@@ -272,7 +245,6 @@ def check_separability(train: Features, test: Features, fit: Fit) -> list[Separa
 
     Args:
         train, test: sweeps of different objects.
-        fit: fits a machine.
     """
     known = sorted(set(train.categories) & set(test.categories))
     nearest = [next((c for c in names if c in known), None) for names in PUBLISHED]

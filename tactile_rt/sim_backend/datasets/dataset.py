@@ -98,9 +98,7 @@ def make_sweeps(
     Args:
         folder: where; on a cluster, a file system that all of its machines share.
         processes: how many at a time; None: one per core.
-        splits: only these; none for all.
         engine: "processes" of this machine, or "ray".
-        address: of the Ray cluster, see `engines.run_ray`.
 
     Raises:
         ConfigError: no such split or engine, or the folder holds another set, or sweeps of who
@@ -170,8 +168,6 @@ class SweepRecord:
 
     Attributes:
         values: The (sample, element, channel) loads of the sweep, SI.
-        parameters: The parameters that the sweep was made with, by name.
-        contacts: The (sample, element) contacts, see `Sweeps`; None when they are not kept.
     """
 
     values: NDArray[np.float32]

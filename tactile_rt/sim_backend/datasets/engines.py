@@ -39,7 +39,6 @@ def run_processes(work: Work, names: Sequence[str], processes: int) -> Iterator[
 
     Args:
         work: can be pickled.
-        names: what to do, in this order.
         processes: at least 1.
     """
     waiting = deque((name, 1) for name in names)
@@ -143,14 +142,12 @@ def run_ray(
     Args:
         work: can be pickled; runs on any node, so that files it writes must be on a file system
             that all of them share.
-        names: what to do, in this order.
         processes: tasks at a time; None for one per CPU of the cluster.
         address: of the cluster; None for the one that RAY_ADDRESS names or that runs on this
             machine, or else a new one of this machine alone.
 
     Raises:
         ConfigError: Ray is not installed, or there is no cluster at the address.
-        TactileError: as the work raises it.
     """
     try:
         import ray

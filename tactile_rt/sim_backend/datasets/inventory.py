@@ -16,15 +16,7 @@ from tactile_rt.core.files import write_whole
 from tactile_rt.sets.manifest import MANIFEST, SKIPPED, SweepManifest, has_object, object_path
 from tactile_rt.sets.objects import read_skipped
 
-__all__ = [
-    "SUMS",
-    "Tally",
-    "check_sums",
-    "remove_leftovers",
-    "tally",
-    "write_sums",
-    "written_sum",
-]
+__all__ = ["SUMS", "Tally", "check_sums", "remove_leftovers", "tally", "write_sums", "written_sum"]
 
 SUMS = "SHA256SUMS"
 STALE_S = 60  # no file of a set takes as long to write
@@ -32,15 +24,7 @@ STALE_S = 60  # no file of a set takes as long to write
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of a set.
-
-    Attributes:
-        sweeps: The number of sweeps that are there.
-        misses: The number of these sweeps that pass beside the array.
-        unstable: The number of these sweeps that could not be simulated at the set's profile, and
-            are empty.
-        skipped: The number of objects that could not be made.
-    """
+    """Counts of a set."""
 
     sweeps: int = 0
     misses: int = 0
@@ -59,14 +43,7 @@ class Tally:
 
 
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
-    """Count what there is of these objects.
-
-    Args:
-        sweeps: of each of them.
-
-    Raises:
-        RecordingError: an object's file is damaged.
-    """
+    """Count what there is of these objects."""
     there = [name for name in names if has_object(folder, name)]
     misses = unstable = 0
     for name in there:

@@ -28,13 +28,7 @@ from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = [
-    "DEFAULT_RECIPE",
-    "read_recipe",
-    "recipe_from_dict",
-    "recipe_of_set",
-    "shipped_recipes",
-]
+__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_from_dict", "recipe_of_set", "shipped_recipes"]
 
 DEFAULT_RECIPE = "wide24"
 
@@ -49,13 +43,9 @@ def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ())
     """The recipe of this name that ships with the package, or the one in a TOML file.
 
     Args:
-        name: of the recipe, or its file.
         folder: where folders and files in it are found from; None: the working directory, as they
             are on a command line.
         sets: ``key=value`` each, of which ``objects.test=3`` is one of a table.
-
-    Raises:
-        ConfigError: no such recipe, or something in it is wrong.
     """
     if Path(name).suffix == ".toml":
         return _recipe(set_keys(read_toml(Path(name)), sets, SweepRecipe), folder)
@@ -70,9 +60,6 @@ def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ())
 def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepRecipe:
     """The recipe that a set's manifest or a model's card holds.
 
-    Args:
-        sets: ``key=value`` each, as `read_recipe` takes them.
-
     Raises:
         ConfigError: it is not one that this release knows.
     """
@@ -81,10 +68,6 @@ def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepReci
 
 def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
     """Read what a recipe file holds.
-
-    Args:
-        raw: the file's tables.
-        where: the file, for complaints.
 
     Raises:
         ConfigError: a key is unknown or of the wrong kind, or a value out of range: one line

@@ -222,11 +222,7 @@ class MeshObjects:
         return dict(self._set.skipped)
 
     def load(self, name: str) -> TactileObject:
-        """An object by its name.
-
-        Raises:
-            ConfigError: its mesh is broken.
-        """
+        """An object by its name."""
         return self._set.load(self._names[name])
 
     def target(self, name: str) -> str:

@@ -151,9 +151,6 @@ class ObjectChoice(msgspec.Struct, frozen=True):
         only_source: Objects of a folder from this source only, all of them held out for a test,
             without those that are like one from elsewhere; empty: of all sources.
         surface_error_mm, max_pieces, hull, up: The settings of `MeshDetail`, for a folder.
-
-    Raises:
-        ConfigError: values that cannot be, or contradict each other.
     """
 
     source: Text = msgspec.field(name="from", default=SHAPES)
@@ -277,8 +274,6 @@ class SweepChoice:
         """Draw the parameters of sweep `index`.
 
         Args:
-            rng: of this sweep.
-            index: of the object's sweeps.
             shared: in the same state for all sweeps of a draw, see `Range.once`.
         """
         values = self.combinations()[index // (self.draws + self.held_out_draws)]
@@ -315,9 +310,6 @@ class SweepRecipe:
             unless it says so.
         faults: What training draws to be wrong with the sensor, each time that it takes a sweep; no
             file of the set has any of it.
-
-    Raises:
-        ConfigError: values that cannot be, or contradict each other.
     """
 
     name: Text = "unnamed"
@@ -376,8 +368,6 @@ class SweepRecipe:
         """What the random numbers of a sweep are seeded with.
 
         Args:
-            name: the object.
-            index: the sweep.
             stream: 0 for the sweep's parameters; others are for what may be added to them, so
                 that a sensor model changes no sweep.
         """

@@ -63,11 +63,7 @@ def whisker_nodes(head: WhiskingHead) -> list[Floats]:
 
 
 def picture(head: WhiskingHead) -> NDArray[np.uint8]:
-    """(320, 640, 3) the array, red where whiskers touch, and the object.
-
-    Raises:
-        ModuleNotFoundError: without Pillow (extra ``view``).
-    """
+    """(320, 640, 3) the array, red where whiskers touch, and the object."""
     from PIL import Image, ImageDraw
 
     placed = head.placed
@@ -135,14 +131,12 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     simulation fails. Given the same seed and actions it is the same on every machine.
 
     Args:
-        array: which array, see `files.load_array`.
         whiskers: the names of those of the array that there are; none: all.
         kinds: categories of objects, see `objects.catalogue`; a label is an index into them.
         instances: the first number of an object of a kind, and the one after the last.
         touches: how many touches end an episode; 0: none do.
         step_ms: how long a step lasts, a multiple of 5 ms.
         noise: of the sensor, in multiples of the rated noise of 10 uN and 0.05 uN m a sample.
-        profile: how finely to simulate, one of `world.PROFILES`.
         render_mode: ``rgb_array`` for pictures (extra ``view``).
 
     Attributes:

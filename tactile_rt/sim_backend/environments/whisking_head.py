@@ -86,9 +86,6 @@ def place_beside(
 ) -> Placed | None:
     """Stand an object ahead of an array, to the side to which its whiskers reach.
 
-    Args:
-        size_mm, yaw_deg, height_mm, distance_mm, gap_mm: as in `Sweep`.
-
     Returns:
         Where it stands; None if the head would go past it without a touch.
     """
@@ -126,7 +123,6 @@ class WhiskingHead:
         profile: how finely to simulate; by `rods`, whatever the profile's engine.
 
     Attributes:
-        samples: The number of samples of 1 ms simulated so far.
         position, velocity: The (3,) place of the head from where it started, mm, and its velocity,
             mm/s, in the world.
     """

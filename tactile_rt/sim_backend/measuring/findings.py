@@ -91,10 +91,7 @@ class ArrayFinding:
 
     Attributes:
         what: The name of the quantity, e.g. ``noise density of mz``.
-        unit: The SI unit of the quantity; empty: it has none.
         described: The value that the array's file gives; None: it gives none.
-        measured: The value that was measured; None: it could not be.
-        edits: The changes of the array's file that bring it to what was measured.
     """
 
     what: str

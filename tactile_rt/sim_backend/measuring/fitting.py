@@ -48,7 +48,6 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
 
     Raises:
         ConfigError: no such file, a mistake in it, or it does not describe a sensor.
-        SpecMismatch: the recording is of another array.
     """
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"{path}: an array that says what reads it is a .toml file")
@@ -76,7 +75,6 @@ def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
     Raises:
         ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or as
             `read_described`.
-        SpecMismatch: as `read_described`.
     """
     array = read_described(path, spec)
     sensor = array.sensor
@@ -135,11 +133,7 @@ def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
 def _measure(
     spec: ArraySpec, recorded: Chunk, hz: float, bandwidth_hz: float
 ) -> tuple[dict[str, Rest], dict[str, list[Ring]]]:
-    """Find rest and free swings of each whisker, by its name.
-
-    Raises:
-        ConfigError: no whisker is at rest for 3 s.
-    """
+    """Find rest and free swings of each whisker, by its name."""
     rests: dict[str, Rest] = {}
     away: list[NDArray[np.float32]] = []
     for i, name in enumerate(spec.elements):

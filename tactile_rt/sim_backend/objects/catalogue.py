@@ -103,11 +103,7 @@ def added_categories() -> tuple[str, ...]:
 
 
 def make_object(category: str, index: int) -> TactileObject:
-    """Instance `index` (0 or more) of a category: the same one every time, everywhere.
-
-    Raises:
-        ConfigError: no such category, or a negative index.
-    """
+    """Instance `index` (0 or more) of a category: the same one every time, everywhere."""
     kind = _check(category, index)
     # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])

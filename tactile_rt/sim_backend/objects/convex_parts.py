@@ -208,11 +208,7 @@ def _outline(points: Floats, normal: Floats) -> ConvexHull | None:
 
 
 class SolidPieces:
-    """The pieces of a solid: `join` them, then ask for their `corners`.
-
-    Args:
-        solid: in the unit box.
-    """
+    """The pieces of a solid: `join` them, then ask for their `corners`."""
 
     def __init__(self, solid: Manifold) -> None:
         self._solid = solid

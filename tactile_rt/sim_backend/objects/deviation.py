@@ -177,7 +177,6 @@ def deviation(
     """Distance between a surface and convex pieces.
 
     Args:
-        drawn: of largest extent 1.
         solids: what the surface encloses. What of a piece lies inside them is not its outside.
     """
     made = TriangleSurface(_broad(np.concatenate([piece.triangles for piece in pieces])))

@@ -23,13 +23,7 @@ import trimesh
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "MESH_SUFFIXES",
-    "check_mesh_file",
-    "mesh_content",
-    "read_parts",
-    "read_triangles",
-]
+__all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
 
 MOST_UNPACKED: Final = 256 << 20  # bytes of an archive ...
 MOST_RATIO: Final = 100  # ... and times its own size; XML of numbers has 10
@@ -239,11 +233,7 @@ def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
 
 
 def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
-    """All triangles of the files of one object in one mesh, z up, in the unit of the files.
-
-    Args:
-        up: see `read_triangles`.
-    """
+    """All triangles of the files of one object in one mesh, z up, in the unit of the files."""
     parts = [_part(path, up) for path in paths]
     joined = trimesh.util.append_faces([m.vertices for m in parts], [m.faces for m in parts])
     mesh = trimesh.Trimesh(*joined, process=False)

@@ -45,11 +45,7 @@ from tactile_rt.sim_backend.objects.deviation import (
     surface_of,
 )
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM, STANDARD, MeshDetail
-from tactile_rt.sim_backend.objects.mesh_files import (
-    check_mesh_file,
-    mesh_content,
-    read_triangles,
-)
+from tactile_rt.sim_backend.objects.mesh_files import check_mesh_file, mesh_content, read_triangles
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
 __all__ = ["Pieces", "cache_key", "load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
@@ -84,7 +80,6 @@ class Pieces:
     Attributes:
         surface_error: The farthest that their surface is from the mesh's, in fractions of the
             largest extent.
-        made_by: The way in which the mesh became pieces, one of those that `meshes` lists.
     """
 
     meshes: tuple[trimesh.Trimesh, ...]
@@ -159,7 +154,6 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
     simplified farther than the tolerance.
 
     Args:
-        mesh: in the unit box.
         tolerance: how far the surface may move, in largest extents.
     """
     if len(mesh.faces) <= SHARES[0] * most:

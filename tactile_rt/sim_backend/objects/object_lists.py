@@ -126,7 +126,6 @@ def get_objects(
 
     Raises:
         ConfigError: the folder of clones is not there.
-        ModuleNotFoundError: trimesh is not installed, with which meshes are read.
     """
     from tactile_rt.sim_backend.objects import mesh_files  # noqa: F401
 

@@ -60,10 +60,8 @@ class SetReport:
     """What a folder's objects come to.
 
     Attributes:
-        made_by: The number of objects that became pieces in each way, see `meshes`.
         surface_error: The surface error of every usable object, by its name, in fractions of its
             largest extent.
-        skipped: The reason why each of the other objects cannot be used, by its name.
     """
 
     made_by: dict[str, int]
@@ -136,9 +134,6 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
 
     Args:
         detail: how meshes become pieces; in a ShapeNet folder y is up, unless it says otherwise.
-
-    Raises:
-        ConfigError: no such folder, or none of the two layouts.
     """
     folder = Path(where)
     if not folder.is_dir():

@@ -57,7 +57,6 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
 
     Args:
         links: how many cells; one more link.
-        steps_per_sample: the fewest steps in a sample.
     """
     s = link_nodes(whisker, links)
     nodes = whisker.centreline(s)
@@ -126,10 +125,6 @@ def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:
 
     The step x' = x + h v', m (v' - v) = -h (k x' + beta k v') multiplies the mode by two numbers;
     with more mass and less damping than the mode has they are exp(h lambda), lambda its own poles.
-
-    Args:
-        omega: the mode's natural angular frequency, rad/ms.
-        h: the step, ms.
 
     Returns:
         How much heavier, and beta (ms), which is negative where the step damps more than is wanted.

@@ -81,7 +81,6 @@ def advance(
 
     Args:
         steps: (whisker,) how many steps make a sample.
-        rows, chains, segments, thing: see there; the whiskers' rows stand one after the other.
         state, seen: see there; carried on. `travelled` and `soonest` are a row for each whisker.
         roots: (whisker, sample or 1, 4, 3) base point and, in the rows after it, the frame of the
             first link at rest, at the beginning of each sample; 1: it does not turn.

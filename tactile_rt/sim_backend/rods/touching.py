@@ -144,10 +144,8 @@ def find_near(
 
     Args:
         centre: (3,) where the object is, mm.
-        seen: see there; carried on.
         ends: (segment, 2, 3) scratch.
         now: (segment, 6) scratch: gap, place, direction, and whether it is more than a bound.
-        near: see there; filled.
     """
     travelled = seen.travelled[0]
     reach, planes = seen.reach, seen.planes

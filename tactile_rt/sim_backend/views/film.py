@@ -1,21 +1,252 @@
-"""Footage as pictures and videos: scene, map and traces in one picture for each moment."""
+"""Footage as pictures and videos: scene, map and traces in one picture for each moment.
 
+The scene is drawn offscreen on a copy of the simulation: nothing here touches the physics.
+"""
+
+import copy
+import importlib
+import os
+import sys
+import warnings
 from collections.abc import Iterable, Iterator
+from itertools import product
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import av
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sim_backend.views.footage import Camera, Footage, framing
 from tactile_rt.sim_backend.views.sheet import ForceScale, Sheet, scene_size
-from tactile_rt.sim_backend.views.stage import Dressed, Stage
+from tactile_rt.sim_backend.world import OBJECT_BIT
 
-__all__ = ["IMAGES", "VIDEOS", "Film", "camera_of", "check_suffix", "write_image", "write_video"]
+__all__ = [
+    "IMAGES",
+    "VIDEOS",
+    "Dressed",
+    "Film",
+    "Stage",
+    "camera_of",
+    "check_suffix",
+    "write_image",
+    "write_video",
+]
+
+OBJECT, HEAD = (0.62, 0.74, 0.82, 1.0), (0.86, 0.81, 0.76, 1.0)
+FINE = 2  # drawn finer by this factor, then averaged
+GHOST = 0.5  # how much of a whisker shows through what hides it
+# In the extent of the picture: what whiskers (0.02-0.1 mm thick) and their bases are drawn as
+THIN, BASE, SHAFT = 0.0018, 0.006, 0.005
+ROOM = 10  # half the side of what is around everything, in the camera's distance and more
+MOST_GEOMS = 20_000
+
+
+class Dressed:
+    """A copy of a simulation's model, and a state of it, made fit to be seen.
+
+    Attributes:
+        sites: The site at each element's base, by number, in the order of the elements.
+    """
+
+    def __init__(self, model: mujoco.MjModel, spec: ArraySpec) -> None:
+        self.model = copy.copy(model)
+        self.data = mujoco.MjData(self.model)
+        element = {name: i for i, name in enumerate(spec.elements)}
+        self.sites = [self.model.site(name).id for name in spec.elements]
+        self.links: list[list[int]] = [[] for _ in spec.elements]
+        for geom in range(model.ngeom):
+            body = model.geom_bodyid[geom]
+            while body and model.body(body).name not in element:
+                body = model.body_parentid[body]
+            if body:
+                self.links[element[model.body(body).name]].append(geom)
+        whiskers = [geom for geoms in self.links for geom in geoms]
+        self._others = np.setdiff1d(np.arange(model.ngeom), whiskers)
+        moved = (model.geom_contype[self._others] & OBJECT_BIT) > 0
+        self._moved = self._others[moved]
+        self._colours = np.where(moved[:, None], OBJECT, HEAD)
+        self._radii = model.geom_size[:, 0].copy()
+        self._whiskers = np.array(whiskers)
+        self.model.geom_rgba[self._others] = self._colours
+        visual = self.model.vis
+        visual.headlight.ambient[:] = 0.45
+        visual.headlight.diffuse[:] = 0.5
+        visual.headlight.specular[:] = 0.0
+        visual.quality.numslices, visual.quality.numstacks = 12, 6
+        visual.quality.offsamples = 0  # smooth edges come from drawing finer, at half the cost
+
+    def points(self) -> NDArray[np.float64]:
+        """(n, 3) both ends of all links in the world, mm, as posed."""
+        half = self.model.geom_size[self._whiskers, 1, None]
+        axes = self.data.geom_xmat[self._whiskers].reshape(-1, 3, 3)[:, :, 2]
+        middle = self.data.geom_xpos[self._whiskers]
+        return np.concatenate([middle - half * axes, middle + half * axes])
+
+    def object_points(self) -> NDArray[np.float64]:
+        """(n, 3) corners of boxes round what is swept past, in the world, mm, as posed."""
+        boxes = self.model.geom_aabb[self._moved].reshape(-1, 2, 3)
+        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+        local = boxes[:, 0, None] + corners * boxes[:, 1, None]
+        frames = self.data.geom_xmat[self._moved].reshape(-1, 3, 3)
+        places = np.einsum("nij,nkj->nki", frames, local) + self.data.geom_xpos[self._moved, None]
+        points: NDArray[np.float64] = places.reshape(-1, 3)
+        return points
+
+    def thicken(self, extent_mm: float) -> None:
+        """Draw whiskers thick enough for a picture of this height; thick ones as they are."""
+        radii = self._radii[self._whiskers]
+        self.model.geom_size[self._whiskers, 0] = np.hypot(radii, THIN * extent_mm)
+
+    def cover(self, opacity: float) -> None:
+        """Show everything that is not a whisker so far: 0 not at all, 1 fully."""
+        self.model.geom_rgba[self._others, 3] = opacity
+
+    def pose(self, footage: Footage, moment: int, scale: ForceScale) -> None:
+        """Place everything as it was, each whisker in the colour of its force."""
+        footage.restore(moment, self.data)
+        for geoms, force in zip(self.links, 1e3 * footage.forces[moment], strict=True):
+            self.model.geom_rgba[geoms] = scale.colour(force)
+
+
+def _add_forces(
+    scene: mujoco.MjvScene,
+    dressed: Dressed,
+    loads: NDArray[np.float64],
+    scale: ForceScale,
+    extent_mm: float,
+) -> None:
+    """Add a dot on every base and the arrow of its force to a scene.
+
+    Args:
+        loads: (element, 6) base loads in the element frames, N and N m.
+        extent_mm: height of the picture, mm.
+    """
+    for site, load in zip(dressed.sites, loads, strict=True):
+        base = dressed.data.site_xpos[site]
+        force = 1e3 * dressed.data.site_xmat[site].reshape(3, 3) @ load[:3]
+        size = float(np.linalg.norm(force))
+        rgba = np.array(scale.colour(size), dtype=np.float32)
+        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, BASE * extent_mm), base, rgba)
+        if scale.draws(size):
+            arrow = _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, np.ones(3), base, rgba)
+            end = base + force / size * scale.length(size)
+            shaft = SHAFT * extent_mm
+            mujoco.mjv_connector(arrow, mujoco.mjtGeom.mjGEOM_ARROW, shaft, base, end)
+            arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
+
+
+def _add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
+    """Add to a scene a white room around everything: MuJoCo's own background is black."""
+    white, far = np.ones(4, dtype=np.float32), ROOM * (camera.extent_mm + camera.distance_mm)
+    for axis in np.eye(3):
+        for side in (-far, far):
+            place, size = camera.lookat + side * axis, np.where(axis > 0, 1e-3 * far, 1.1 * far)
+            _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, place, white).emission = 1.0
+
+
+def _add(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    size: NDArray[np.float64],
+    place: NDArray[np.float64],
+    rgba: NDArray[np.float32],
+) -> mujoco.MjvGeom:
+    geom = scene.geoms[scene.ngeom]
+    mujoco.mjv_initGeom(geom, kind, size, place, np.eye(3).ravel(), rgba)
+    scene.ngeom += 1
+    return geom
+
+
+class Stage:
+    """Pictures of the states in footage, drawn offscreen; to be closed.
+
+    Args:
+        width, height: of the pictures, pixels.
+    """
+
+    def __init__(
+        self, footage: Footage, camera: Camera, scale: ForceScale, width: int, height: int
+    ) -> None:
+        self.footage, self.camera, self.scale = footage, camera, scale
+        self.dressed = Dressed(footage.model, footage.spec)
+        model = self.dressed.model
+        self._size = (FINE * width, FINE * height)
+        model.vis.global_.offwidth, model.vis.global_.offheight = self._size
+        self._view = mujoco.MjvCamera()
+        camera.aim(model, self._view)
+        self.dressed.thicken(camera.extent_mm)
+        self._scene = mujoco.MjvScene(model, MOST_GEOMS)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = 0
+        self._gl, self._painter = _painter(model, *self._size)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._painter)
+
+    def picture(self, moment: int) -> NDArray[np.uint8]:
+        """(height, width, 3) RGB picture of a moment."""
+        self.dressed.pose(self.footage, moment, self.scale)
+        loads = self.footage.loads[moment]
+        whole, bare = (self._draw(loads, opacity) for opacity in (1.0, 0.0))
+        # What hides whiskers is drawn as glass: as one body, not as the pieces it is made of.
+        return np.asarray(Image.blend(whole, bare, GHOST).reduce(FINE))
+
+    def _draw(self, loads: NDArray[np.float64], opacity: float) -> Image.Image:
+        """The scene in the fine size."""
+        model, data, scene = self.dressed.model, self.dressed.data, self._scene
+        self.dressed.cover(opacity)
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, self._view, everything, scene)
+        _add_forces(scene, self.dressed, loads, self.scale, self.camera.extent_mm)
+        _add_paper(scene, self.camera)
+        pixels = np.empty((self._size[1], self._size[0], 3), dtype=np.uint8)
+        area = mujoco.MjrRect(0, 0, *self._size)
+        self._gl.make_current()
+        mujoco.mjr_render(area, scene, self._painter)
+        mujoco.mjr_readPixels(pixels, None, area, self._painter)
+        return Image.fromarray(pixels[::-1])
+
+    def close(self) -> None:
+        """Free what the pictures were drawn with."""
+        if self._gl is not None:
+            self._gl.make_current()
+            self._painter.free()
+            self._gl.free()
+            self._gl = None
+
+
+def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
+    """An OpenGL context, and MuJoCo's in it: that of MUJOCO_GL if set, else the first that works.
+
+    Not mujoco.Renderer, whose choice is made when mujoco is first imported: too early for us.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if asked in ("egl", "osmesa", "glfw", "cgl"):
+        kinds = [asked]
+    elif sys.platform == "linux":
+        screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        kinds = ["egl", "glfw"] if screen else ["egl"]
+    else:
+        kinds = ["cgl", "glfw"] if sys.platform == "darwin" else ["glfw"]
+    failures = []
+    for kind in kinds:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of GLFW: its failure shows when it is used
+                context = importlib.import_module(f"mujoco.{kind}").GLContext(width, height)
+                context.make_current()
+            return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except Exception as error:  # each driver fails in its own way
+            failures.append(f"{kind}: {error or type(error).__name__}")
+    why = "; ".join(failures).replace("\n", " ")
+    raise ConfigError(
+        f"no OpenGL to draw with ({why}): install libegl1 and libgl1-mesa-dri, or set MUJOCO_GL"
+    )
+
 
 IMAGES = (".png", ".jpg")
 VIDEOS = (".mp4",)

@@ -91,9 +91,7 @@ def framing(
     """The camera of a named view, set so that all points are in the picture.
 
     Args:
-        view: one of `VIEWS`.
         points: (n, 3) world, mm: the whiskers at rest, and what they touch.
-        aspect: width of the picture over its height.
         left: whether these are whiskers of the animal's left side: the view's mirror image.
     """
     if view not in VIEWS:
@@ -115,7 +113,6 @@ class Footage:
     """A simulation as it went, moment by moment.
 
     Attributes:
-        period_ms: The time between moments, ms.
         loads: The (moment, element, 6) base loads, N and N m, each the mean over the period before.
         states: The (moment, n) places of everything at the end of each period.
     """
@@ -167,8 +164,6 @@ def record(
     Args:
         simulation: made with `whole=True`, so that it has all whiskers of the array; fresh or
             advanced, it goes on from where it is.
-        period_ms: between moments, whole ms.
-        progress: called with the share that is done, 0 to 1.
     """
     moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)

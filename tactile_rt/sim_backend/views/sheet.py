@@ -15,7 +15,7 @@ from matplotlib.patches import FancyArrowPatch, Rectangle
 from matplotlib.text import Text
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.sim_backend.views.footage import Camera, Footage
 
 __all__ = [
@@ -234,9 +234,7 @@ class ForceMap:
         self._scale = scale
         self._rostral = rostral_sign(spec)
         self._flip = -1.0 if mirrored else 1.0
-        self._turns = np.empty((len(spec.elements), 3, 3))
-        for turn, quaternion in zip(self._turns, spec.orientations, strict=True):
-            mujoco.mju_quat2Mat(turn.ravel(), np.array(quaternion))
+        self._turns = rotation_matrices(spec.orientations)
         rows, columns = spec.grid_shape
         x = [columns - 1 - column if mirrored else column for _, column in spec.grid]
         self._centres = np.array([(c, row) for c, (row, _) in zip(x, spec.grid, strict=True)])

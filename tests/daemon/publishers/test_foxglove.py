@@ -16,8 +16,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from tactile_rt.core.errors import SourceError
+from tactile_rt.core.stream import rotation_matrices
 from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
-from tactile_rt.daemon.publishers.scene import rotate, turn_x_to
+from tactile_rt.daemon.publishers.scene import turn_x_to
 from tactile_rt.daemon.publishers.sending import Repeated
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
@@ -188,7 +189,7 @@ def test_forces_are_arrows_at_the_bases_in_the_mount_frame(served):
     # Arrows point along x. The second element is turned by a quarter about z: its x is our y.
     for arrow, along in ((first, (1, 0, 0)), (second, (0, 1, 0))):
         q = arrow.pose.orientation
-        turned = rotate(np.array([[q.w, q.x, q.y, q.z]]), np.array([[1.0, 0, 0]]))
+        turned = rotation_matrices([[q.w, q.x, q.y, q.z]])[:, :, 0]
         assert turned[0] == pytest.approx(along, abs=1e-6)
     ((_, body),) = [(t, b) for topic, t, b in found if topic == "/tactile/whiskers/values"]
     assert json.loads(body)["fx"] == {"B1": pytest.approx(0.01), "C2": pytest.approx(0.02)}
@@ -284,8 +285,8 @@ def test_turns_take_x_to_any_direction():
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     turns = turn_x_to(found)
     assert np.linalg.norm(turns, axis=1) == pytest.approx(1)
-    # By the matrix of a quaternion, not by `rotate`.
+    # By the matrix of a quaternion, not by `rotation_matrices`.
     w, x, y, z = turns.T
     column = np.stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
     assert np.allclose(column, found, atol=1e-9)
-    assert np.allclose(rotate(turns, np.array([1.0, 0, 0])), found, atol=1e-9)
+    assert np.allclose(rotation_matrices(turns)[:, :, 0], found, atol=1e-9)

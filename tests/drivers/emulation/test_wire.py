@@ -17,7 +17,7 @@ from tactile_rt.drivers.codec import CanFrame, codec_class
 from tactile_rt.drivers.codecs.ft300 import Ft300, Ft300Options
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.drivers.emulation.wire import Wire, bytes_s, frames_s, misheard
+from tactile_rt.drivers.emulation.pseudo_terminal import Wire, bytes_s, frames_s, misheard
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until

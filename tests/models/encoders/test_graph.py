@@ -4,9 +4,8 @@ import pytest
 import torch
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
+from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node, parse_graph
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
-from tactile_rt.models.encoders.graph_files import parse_graph
 from tactile_rt.models.encoders.zhuang import GRAPH
 from tests.helpers.small_networks import frames, stir
 

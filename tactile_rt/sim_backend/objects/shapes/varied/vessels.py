@@ -9,11 +9,6 @@ from tactile_rt.sim_backend.objects.solids import ROUND, hull, lathe, moved, rin
 __all__ = ["bottle", "bowl", "mug"]
 
 
-def _section(rng: Generator) -> int:
-    """The number of sides of what is turned: round mostly."""
-    return ROUND if rng.random() < 0.75 else int(rng.choice([5, 6, 8]))
-
-
 def bottle(rng: Generator) -> list[Trimesh]:
     """A body of any outline and section that draws in to a neck; a cork, a lip, a grip on some."""
     u = rng.uniform
@@ -28,7 +23,7 @@ def bottle(rng: Generator) -> list[Trimesh]:
         pieces.append(hull(moved(body, z=start), ring(neck, min(start + shoulder, top), 12)))
         pieces += lathe([(neck, min(start + shoulder, top) - 0.01), (neck, top + 0.01)], 16)
     else:
-        sides = _section(rng)
+        sides = ROUND if rng.random() < 0.75 else int(rng.choice([5, 6, 8]))  # round mostly
         foot, belly = u(0.5, 1.0), u(0.1, 0.8) * start
         if kind == 1:  # a flask: round below
             outline = [
