@@ -37,8 +37,7 @@ from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
 from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig
+from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig, TactileClassifier
 
 STREAM_BAR, DOUBLE_BAR = 2e-6, 1e-9  # some constants are single
 # What is measured, and the most that it may be; bit by bit is 0.

@@ -20,8 +20,7 @@ from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.export.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.export.precision import Precision
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead import EADConfig, TactileClassifier
 
 __all__ = ["full_size", "full_size_models", "random_model"]
 

@@ -37,8 +37,8 @@ from tactile_rt.core.packages import VERSION
 from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
-from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint
-from tactile_rt.models.data_checks import trained_on
+from tactile_rt.models.checkpoints import load_checkpoint, trained_on
+from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.sets.manifest import SweepManifest, join_manifests, trained_objects
 
 __all__ = [

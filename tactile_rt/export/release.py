@@ -15,9 +15,9 @@ from tactile_rt.core.files import write_whole
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
-from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on
-from tactile_rt.models.data_checks import trained_on
+from tactile_rt.models.checkpoints import load_checkpoint, trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
+from tactile_rt.models.ead import TactileClassifier, run_on
 from tactile_rt.models.evaluation.measures import Step, among, cut_windows, hits, predict, run_over
 from tactile_rt.sets.manifest import SweepManifest, join_manifests
 

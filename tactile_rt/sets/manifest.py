@@ -33,6 +33,7 @@ __all__ = [
     "has_object",
     "join_manifests",
     "object_path",
+    "read_manifests",
     "split_by_object",
     "trained_objects",
 ]
@@ -230,6 +231,28 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
         split={side: tuple(names) for side, names in split.items()},
         category_of={name: kind for m in manifests for name, kind in m.category_of.items()},
     )
+
+
+def read_manifests(
+    folders: Sequence[Path], labelled: bool
+) -> tuple[list[SweepManifest], SweepManifest]:
+    """Read what sets are that are learnt from together, each and all of them as one.
+
+    Args:
+        labelled: whether it is learnt from their labels.
+
+    Raises:
+        ConfigError: they cannot be joined, or one has no labels to learn from.
+        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+    """
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    whole = join_manifests(manifests)
+    for folder, manifest in zip(folders, manifests, strict=True):
+        if labelled:
+            check_labelled(folder, manifest)
+        check_split(folder, manifest)
+    check_split(folders[0], whole)
+    return manifests, whole
 
 
 def _differing(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:

@@ -20,8 +20,7 @@ from tactile_rt.alignment.rdm import STIMULI, rdm  # noqa: E402
 from tactile_rt.alignment.stimuli_input import SHIPPED, read_stimuli  # noqa: E402
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model  # noqa: E402
 from tactile_rt.core.errors import ConfigError  # noqa: E402
-from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
-from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tactile_rt.models.ead import EADConfig, TactileClassifier  # noqa: E402
 from tactile_rt.models.encoders.graph_encoder import draw_as_published  # noqa: E402
 from tactile_rt.models.encoders.zhuang import zhuang_graph  # noqa: E402
 from tests.helpers.source_tree import ROOT  # noqa: E402

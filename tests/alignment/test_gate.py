@@ -40,8 +40,7 @@ from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_m
 from tactile_rt.export.onnx_step import export_step  # noqa: E402
 from tactile_rt.export.precision import in_precision  # noqa: E402
 from tactile_rt.export.windows import window_graph  # noqa: E402
-from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
-from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tactile_rt.models.ead import EADConfig, TactileClassifier  # noqa: E402
 from tests.helpers.small_networks import stir  # noqa: E402
 
 FELT = read_stimuli()

@@ -214,8 +214,7 @@ def tiny_model(torch, tmp_path, sweep_set):
 
     from tactile_rt.classifier.model_file import METADATA_KEY
     from tactile_rt.export.onnx_step import export_checkpoint
-    from tactile_rt.models.checkpoints import TactileClassifier
-    from tactile_rt.models.ead import EADConfig
+    from tactile_rt.models.ead import EADConfig, TactileClassifier
     from tactile_rt.models.training.config import TrainingConfig
     from tactile_rt.sets.manifest import SweepManifest
 

@@ -38,9 +38,8 @@ from tactile_rt.export.onnx_step import (
     step_graph,
     write_model,
 )
-from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.datasets import windows
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead import EADConfig, TactileClassifier
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.testing import cut

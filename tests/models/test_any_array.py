@@ -11,8 +11,7 @@ import torch
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Timing
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
+from tactile_rt.models.ead import EAD, ENCODERS, EADConfig, TactileClassifier
 from tests.helpers.small_networks import TOLERANCE, build, stream
 from tests.helpers.tiny_sweeps import plate
 

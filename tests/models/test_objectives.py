@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig
-from tactile_rt.models.objectives import (
+from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig, TactileClassifier
+from tactile_rt.models.training.objectives import (
     Autoencoder,
     Predictive,
     SimCLR,
@@ -45,12 +44,13 @@ def classifier(encoder="gru", attender="none", width=1 / 32, **other):
 
 def objectives(model):
     plain, tactile = build("none", SPEC), build("tactile", SPEC)
+    masked = build("none", SPEC, 0.25)
     return (
         Supervised(model, plain, "anytime", 0.1),
         SimCLR(model, tactile, 0.1),
         SimSiam(model, tactile),
         Autoencoder(model, plain),
-        Predictive(model, plain, 0.25),
+        Predictive(model, masked),
     )
 
 
@@ -143,7 +143,7 @@ def test_each_step_tells_the_four_after_it_and_has_seen_none_of_them(encoder):
 
 def test_what_is_masked_is_predicted_all_the_same():
     """Of a network that is told nothing the loss is that of the untouched frames."""
-    objective = Predictive(classifier(), build("none", SPEC), masking=0.8).eval()
+    objective = Predictive(classifier(), build("none", SPEC, 0.8)).eval()
     with torch.no_grad():
         objective.head.weight.zero_()
         objective.head.bias.zero_()

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoints import load_checkpoint, run_on
-from tactile_rt.models.data_checks import check_sets
-from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
+from tactile_rt.models.checkpoints import load_checkpoint
+from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as, frame_of
 from tactile_rt.models.disturbances import CLEAN, RATED
-from tactile_rt.models.ead import count_parameters
+from tactile_rt.models.ead import count_parameters, run_on
 from tactile_rt.models.evaluation.measures import CutWindows, among, cut_windows, hits, posteriors
 from tactile_rt.models.grid.outcomes import (
     POINT,
@@ -38,8 +37,7 @@ from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.svm import fit_svm
 from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
-from tactile_rt.models.training.devices import launched
-from tactile_rt.models.training.loop import initialise, train
+from tactile_rt.models.training.loop import initialise, launched, train
 from tactile_rt.models.training.probing import probe
 from tactile_rt.sets.manifest import SweepManifest, check_split
 
