@@ -70,7 +70,7 @@ def random_model(
     """An untrained network for an array, and the card of a file of it."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        model = TactileClassifier(spec, config).eval()
+        model = TactileClassifier(spec, config, channel_limits(spec)).eval()
     return model, ModelCard(
         name=name,
         spec=spec.to_json(),

@@ -21,7 +21,6 @@ from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, Spec
 from tactile_rt.core.files import open_regular, replaced
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
-from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import EADConfig
 from tactile_rt.sets.manifest import SweepManifest, check_labelled, join_manifests
 
@@ -53,7 +52,7 @@ NETWORK = (
 
 
 def describe_checkpoint(path: Path) -> dict[str, Any]:
-    """What a `best.pt` holds; every tensor is None.
+    """Read what a `best.pt` holds; every tensor is None.
 
     Raises:
         ModelError: not there, or no such checkpoint, as far as can be told without its numbers.
@@ -79,7 +78,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def network_of(path: Path) -> dict[str, Any]:
-    """What a training configuration says of the network of a checkpoint."""
+    """Read what a training configuration says of the network of a checkpoint."""
     network = describe_checkpoint(path)["network"]
     return {key: value for key, value in network.items() if key in NETWORK}
 
@@ -120,7 +119,7 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
     if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
         raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
     channels = len(spec.channels)
-    taken, given = EADConfig(**saved["network"]).frame[0], frame_of(manifest)[0]
+    taken, given = EADConfig(**saved["network"]).frame[0], manifest.frame[0]
     if taken != given:
         raise SpecMismatch(
             f"{checkpoint} takes steps of {taken // channels} samples, and of the set, with one "

@@ -37,7 +37,6 @@ __all__ = [
     "SweepSet",
     "check_sets",
     "drawn_as",
-    "frame_of",
     "joined",
     "of_categories",
     "read_splits",
@@ -47,13 +46,6 @@ __all__ = [
 ]
 
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets
-
-
-def frame_of(manifest: SweepManifest) -> tuple[int, int, int]:
-    """Channels, rows and columns of what a network sees of a sweep set's array in a step."""
-    spec = manifest.spec
-    rows, columns = spec.grid_shape
-    return Timing.of(manifest.period_ns).substeps * len(spec.channels), rows, columns
 
 
 @dataclass(frozen=True)
@@ -220,12 +212,17 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
         return sets[0]
     manifest = join_manifests([one.manifest for one in sets])
     after = max(one.sweeps.values.shape[1] - one.manifest.lead for one in sets)
-    whole = Sweeps(
-        np.concatenate([_lengthened(one, manifest.lead, after) for one in sets]),
-        np.concatenate([relabelled(one, manifest.categories).sweeps.labels for one in sets]),
-        np.concatenate([one.sweeps.objects for one in sets]),
-        recorded=np.concatenate([one.recorded for one in sets]),
-    )
+    parts = [
+        (
+            _lengthened(one, manifest.lead, after),
+            relabelled(one, manifest.categories).sweeps.labels,
+            one.sweeps.objects,
+            one.recorded,
+        )
+        for one in sets
+    ]
+    values, labels, objects, recorded = map(np.concatenate, zip(*parts, strict=True))
+    whole = Sweeps(values, labels, objects, recorded=recorded)
     of = tuple(manifest for one in sets for manifest in one.manifests)
     return replace(sets[0], manifest=manifest, sweeps=whole, joined_of=of)
 

@@ -32,7 +32,7 @@ from torch.nn import functional as F
 
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream import ArraySpec, Timing
-from tactile_rt.core.stream.sensor_spec import ChannelLimits, channel_limits
+from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models import attenders, decoders
 from tactile_rt.models.ead_config import (
     ATTENDERS,
@@ -68,21 +68,17 @@ class TactileClassifier(nn.Module):
     """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
 
     Args:
-        limits: what is believed of the channels; None: what `channel_limits` says of an array
-            without a described sensor.
+        limits: what is believed of the channels.
 
     Raises:
         ConfigError: the network is for another array, or its preprocessing for other units.
     """
 
-    def __init__(
-        self, spec: ArraySpec, network: EADConfig, limits: ChannelLimits | None = None
-    ) -> None:
+    def __init__(self, spec: ArraySpec, network: EADConfig, limits: ChannelLimits) -> None:
         super().__init__()
         if network.preprocessing == "paper":
             clip, scale = paper_units(spec)
         else:
-            limits = limits or channel_limits(spec)
             clip, scale = limits.clip.tolist(), limits.scale.tolist()
         self.inputs = InputStage(spec.grid, spec.grid_shape, clip, scale, network.preprocessing)
         channels, *grid = network.frame
@@ -258,9 +254,8 @@ class EAD(nn.Module):
         else:
             self.attender = attenders.NoAttender()
         self.feature_size = width
-        self.decoder = decoders.make(
-            config.decoder, width, config.classes, config.width, config.max_steps
-        )
+        kind = decoders.KINDS[config.decoder]
+        self.decoder = kind(width, config.classes, config.width, config.max_steps)
 
     def features(self, frames: Tensor) -> Tensor:
         """What the decoder reads of frames, (batch, step, feature)."""
@@ -330,17 +325,7 @@ def _encoder(config: EADConfig) -> Any:
     module, name = encoder_class(config.encoder)
     kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
     if config.encoder == "graph":
-        from tactile_rt.models.encoders.graph_files import parse_graph
-
-        graph = parse_graph(config.graph)
-        read = graph.frame
-        if (found := (read.channels, read.rows, read.columns)) != config.frame:
-            sizes = (" x ".join(map(str, size)) for size in (found, config.frame))
-            raise ConfigError(
-                "the graph's {} has {} channels, rows and columns, the array's frames "
-                "{}: change the graph".format(read.name, *sizes)
-            )
-        return kind(graph.scaled(config.width))
+        return kind(config.graph, config.width, config.frame)
     if config.encoder.startswith("zhuang-"):
         channels, rows, columns = config.frame
         frame = (channels, rows, columns + int(_alone(config)))

@@ -16,7 +16,7 @@ import msgspec
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import write_whole
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, Timing
 from tactile_rt.core.stream.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.sets.sensor_faults import SensorFaults
 
@@ -105,6 +105,12 @@ class SweepManifest:
     def recorded(self) -> bool:
         """Whether its sweeps were recorded, with the noise of their sensor, not simulated."""
         return RECORDINGS in self.recipe
+
+    @property
+    def frame(self) -> tuple[int, int, int]:
+        """Channels, rows and columns of what a network sees of the array in a step."""
+        rows, columns = self.spec.grid_shape
+        return Timing.of(self.period_ns).substeps * len(self.spec.channels), rows, columns
 
     @property
     def limits(self) -> ChannelLimits:
@@ -236,7 +242,7 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
 def read_manifests(
     folders: Sequence[Path], labelled: bool
 ) -> tuple[list[SweepManifest], SweepManifest]:
-    """Read what sets are that are learnt from together, each and all of them as one.
+    """Read what sets are that are learnt from together: each, and all as one.
 
     Args:
         labelled: whether it is learnt from their labels.

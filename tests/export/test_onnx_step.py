@@ -28,7 +28,7 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.stream import MOUSE, ArraySpec
-from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
+from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR, channel_limits
 from tactile_rt.export import onnx_step, streaming, streaming_gpt
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
@@ -57,7 +57,7 @@ NETWORK = EADConfig(classes=len(CATEGORIES), attender="gpt", width=1 / 32, reado
 def build() -> TactileClassifier:
     """Untrained, but with no parameter at a value that hides a mistake, such as zero."""
     torch.manual_seed(0)
-    model = TactileClassifier(SPEC, NETWORK).eval()
+    model = TactileClassifier(SPEC, NETWORK, channel_limits(SPEC)).eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1 * torch.randn_like(parameter)

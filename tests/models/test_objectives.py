@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig, TactileClassifier
 from tactile_rt.models.training.objectives import (
@@ -39,7 +40,7 @@ def loads(n=4, seed=0):
 def classifier(encoder="gru", attender="none", width=1 / 32, **other):
     torch.manual_seed(0)
     config = EADConfig(3, encoder, attender, "linear", width, max_steps=STEPS, **other)
-    return TactileClassifier(SPEC, config)
+    return TactileClassifier(SPEC, config, channel_limits(SPEC))
 
 
 def objectives(model):

@@ -21,8 +21,9 @@ import msgspec
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import convert, parse_toml
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
+from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 
-__all__ = ["parse_graph"]
+__all__ = ["build_encoder", "parse_graph"]
 
 
 class _Input(msgspec.Struct):
@@ -42,6 +43,27 @@ class _File(msgspec.Struct):
     inputs: dict[str, _Input] = {}
     nodes: dict[str, _Node] = {}
     readout: str = ""
+
+
+def build_encoder(text: str, width: float, frame: tuple[int, int, int]) -> GraphEncoder:
+    """Build the encoder of a graph in TOML.
+
+    Args:
+        width: what its channel counts are multiplied by.
+        frame: channels, rows and columns of the array's frames.
+
+    Raises:
+        ConfigError: the text is no graph, or one of other frames.
+    """
+    graph = parse_graph(text)
+    read = graph.frame
+    if (found := (read.channels, read.rows, read.columns)) != frame:
+        sizes = (" x ".join(map(str, size)) for size in (found, frame))
+        raise ConfigError(
+            "the graph's {} has {} channels, rows and columns, the array's frames "
+            "{}: change the graph".format(read.name, *sizes)
+        )
+    return GraphEncoder(graph.scaled(width))
 
 
 def parse_graph(text: str, where: str = "graph") -> Graph:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint
-from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as, frame_of
+from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters, run_on
 from tactile_rt.models.evaluation.measures import CutWindows, among, cut_windows, hits, posteriors
@@ -72,7 +72,7 @@ class Workbench:
                 continue
             config = self.grid.config(task, self.data)
             build(config.augmentation, manifest.spec)
-            config.network(len(manifest.categories), frame_of(manifest))
+            config.network(len(manifest.categories), manifest.frame)
             sweeps = self.splits_of(task.cell.share)[0].sweeps
             pairs = config.pairs == TWO_SWEEPS
             check_batches(

@@ -14,7 +14,6 @@ import msgspec
 from tactile_rt.core.errors import ConfigError, ModelError, name_some
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.checkpoints import NETWORK
-from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
 from tactile_rt.sets.manifest import read_manifests
 from tactile_rt.sets.sensor_faults import SensorFaults
@@ -201,7 +200,7 @@ class TrainingConfig:
             RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
         """
         _, whole = read_manifests(self.folders, self.labelled)
-        self.network(len(whole.categories), frame_of(whole))
+        self.network(len(whole.categories), whole.frame)
 
     def network(self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME) -> EADConfig:
         """The network's configuration for so many classes and for frames of a size.
@@ -214,7 +213,7 @@ class TrainingConfig:
 
 
 def as_json(config: TrainingConfig) -> dict[str, Any]:
-    """As a file has it, which knows no tuples."""
+    """Turn it into what a file has, which knows no tuples."""
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(config)))
     return plain
 
@@ -252,7 +251,7 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
 
 
 def _same(key: str, one: Any, other: Any) -> bool:
-    """Whether two values of a key are; a path may be spelt in several ways."""
+    """Compare two values of a key; a path may be spelt in several ways."""
     if key in PATHS and one and other:
         names = [[value] if isinstance(value, str) else value for value in (one, other)]
         one, other = ([str(Path(name).resolve()) for name in some] for some in names)

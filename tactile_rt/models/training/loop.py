@@ -102,7 +102,7 @@ def _train(
     before = None
     if config.begin:
         before = begin_from(objective.model, Path(config.begin), training.classes)
-    settings, met = as_json(config), trained_objects(training.manifests, before)
+    met = trained_objects(training.manifests, before)
     share = Share(fabric.global_rank, fabric.world_size)
     two_sweeps = config.pairs == TWO_SWEEPS
     batches = TrainingBatches(
@@ -115,6 +115,7 @@ def _train(
     feed = BatchFeed(batches, augmentation, objective.views, config.seed, share, fabric.device)
     validate = Validation(config, validating, augmentation, share, fabric.device)
     run = RunState(objective, config, len(batches))
+    settings = as_json(config)
     if fabric.is_global_zero:
         begin_run(config, folder)  # when all that may be refused has been
     fabric.barrier()
@@ -210,7 +211,7 @@ def _mean(fabric: "Fabric", losses: list[float]) -> float:
 
 
 def _is_first() -> bool:
-    """Whether this process is the one that writes: of torchrun's it is the first."""
+    """Tell whether this process is the one that writes: of torchrun's it is the first."""
     return os.environ.get("RANK", "0") == "0"
 
 

@@ -31,7 +31,7 @@ from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.models.augmentation import Augmentation, Loads, build
-from tactile_rt.models.datasets import SweepSet, frame_of
+from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.training.config import TrainingConfig
@@ -66,7 +66,7 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
         ConfigError: there is no such network, or the array cannot be augmented so.
     """
     manifest = training.manifest
-    network = config.network(len(training.classes), frame_of(manifest))
+    network = config.network(len(training.classes), manifest.frame)
     model = TactileClassifier(manifest.spec, network, manifest.limits)
     if config.first_weights == "paper" and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)
@@ -111,7 +111,7 @@ class Objective(nn.Module):
         return features[:, -1]
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
-        """What `loss` takes of a batch: the augmented frames of every view.
+        """Make what `loss` takes of a batch: the augmented frames of every view.
 
         Args:
             views: `self.views` batches of loads, SI.
@@ -344,7 +344,7 @@ class Predictive(Objective):
 
 
 def _in_single_precision(like: Tensor) -> torch.autocast:
-    """Where losses are computed: mixed precision ends at the network's output."""
+    """Compute losses in it: mixed precision ends at the network's output."""
     return torch.autocast(like.device.type, enabled=False)
 
 

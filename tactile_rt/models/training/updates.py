@@ -77,7 +77,7 @@ class RunState:
         )
 
     def state(self) -> dict[str, Any]:
-        """What `last.pt` holds."""
+        """Gather what `last.pt` holds."""
         return {
             "model": self.objective.state_dict(),
             "optimizer": self.optimizer.state_dict(),
