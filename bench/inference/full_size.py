@@ -17,9 +17,9 @@ from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import channel_limits
+from tactile_rt.export.graph_forms import Precision
 from tactile_rt.export.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
-from tactile_rt.export.precision import Precision
 from tactile_rt.models.ead import EADConfig, TactileClassifier
 
 __all__ = ["full_size", "full_size_models", "random_model"]

@@ -21,8 +21,8 @@ from tactile_rt.export.release import fit_temperature
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.ead import run_on
 from tactile_rt.models.evaluation import measures
+from tactile_rt.models.evaluation.measures import run_on
 from tactile_rt.models.evaluation.promises import familiarity
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.svm import PENALTIES, fit, window_features

@@ -204,7 +204,7 @@ def export(
     check_output(model)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
     with needing("train"):
-        from tactile_rt.export.precision import PRECISIONS
+        from tactile_rt.export.graph_forms import PRECISIONS
     if precision not in PRECISIONS:
         raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
     if kind not in ("step", "window"):

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.export.products import Columns, Pointwise, Product
-from tactile_rt.export.streaming_gpt import StreamingGPT
+from tactile_rt.export.streaming_parts import Columns, Pointwise, Product, StreamingGPT
 from tactile_rt.models.attenders import GPT
 from tactile_rt.models.ead import EAD
 from tactile_rt.models.encoders.cells import FORGET_BIAS, Cell, IntersectionCell, State

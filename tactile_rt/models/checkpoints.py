@@ -130,8 +130,8 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
 
 def trained_on(
     checkpoint: Path, saved: Mapping[str, Any], data: Sequence[Path] = ()
-) -> tuple[Path, ...]:
-    """The sweep sets that a checkpoint was trained on: where they lie now.
+) -> list[tuple[Path, SweepManifest]]:
+    """The sweep sets that a checkpoint was trained on: where they lie now, and what they are.
 
     Args:
         data: the sets; default: where they lay when it was trained on.
@@ -148,7 +148,8 @@ def trained_on(
                 f"{folder}, a sweep set that {checkpoint} was trained on, is not here: name it by "
                 "--data"
             )
-    manifest = join_manifests([SweepManifest.read(folder) for folder in folders])
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    manifest = join_manifests(manifests)
     check_array(checkpoint, saved, manifest)
     held = list(manifest.categories)
     classes = saved["network"]["classes"] - len(saved["refusals"])
@@ -161,7 +162,7 @@ def trained_on(
             f"{checkpoint} tells other categories apart than {there} holds ({other}): name what "
             "it was trained on by --data"
         )
-    return folders
+    return list(zip(folders, manifests, strict=True))
 
 
 def probed_on(

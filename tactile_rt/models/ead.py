@@ -20,13 +20,11 @@ for streaming, and gives the same logits. The logits of a step use no later fram
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -55,7 +53,6 @@ __all__ = [
     "TactileClassifier",
     "count_parameters",
     "paper_units",
-    "run_on",
 ]
 
 PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
@@ -105,24 +102,6 @@ class TactileClassifier(nn.Module):
     def features(self, frames: Tensor) -> Tensor:
         """(batch, step, channel, row, column) -> (batch, step, feature): encoder and attender."""
         return self.network.features(frames)
-
-
-def run_on(
-    model: TactileClassifier,
-) -> Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]:
-    """The function that `evaluation.predict` wants, of a torch model."""
-
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        model.eval()
-        device = model.inputs.clip.device
-        with torch.inference_mode():
-            logits = model(*(torch.from_numpy(a).to(device) for a in (samples, offset, sigma)))
-        out: NDArray[np.float32] = logits.float().cpu().numpy()
-        return out
-
-    return run
 
 
 class InputStage(nn.Module):

@@ -38,9 +38,8 @@ from tactile_rt.alignment.onnx_activations import onnx_layers  # noqa: E402
 from tactile_rt.alignment.stimuli_input import read_stimuli  # noqa: E402
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model  # noqa: E402
 from tactile_rt.core.stream.sensor_spec import channel_limits  # noqa: E402
+from tactile_rt.export.graph_forms import in_precision, window_graph  # noqa: E402
 from tactile_rt.export.onnx_step import export_step  # noqa: E402
-from tactile_rt.export.precision import in_precision  # noqa: E402
-from tactile_rt.export.windows import window_graph  # noqa: E402
 from tactile_rt.models.ead import EADConfig, TactileClassifier  # noqa: E402
 from tests.helpers.small_networks import stir  # noqa: E402
 

@@ -29,7 +29,7 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR, channel_limits
-from tactile_rt.export import onnx_step, streaming, streaming_gpt
+from tactile_rt.export import onnx_step, streaming, streaming_parts
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
@@ -38,6 +38,7 @@ from tactile_rt.export.onnx_step import (
     step_graph,
     write_model,
 )
+from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig, TactileClassifier
 from tactile_rt.models.onsets import find_onsets
@@ -107,6 +108,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         patch.setattr(torch.onnx, "export", remember)
         card = export_checkpoint(
             checkpoint,
+            load_checkpoint(checkpoint),
+            [manifest],
             folder / "out" / "tiny.onnx",
             "tiny",
             temperature=1.25,
@@ -184,7 +187,7 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(streaming, "LARGE", 0)
-    monkeypatch.setattr(streaming_gpt, "WIDE", 0)
+    monkeypatch.setattr(streaming_parts, "WIDE", 0)
     path = tmp_path / "wide.onnx"
     export_step(exported.model, exported.card, path)
     operators = [node.op_type for node in onnx.load(path).graph.node]

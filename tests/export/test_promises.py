@@ -5,7 +5,7 @@ import pytest
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, mass_above
 from tactile_rt.core.errors import RecordingError
-from tactile_rt.export.promises import fit_candidates, fit_unknown
+from tactile_rt.export.release import fit_candidates, fit_unknown
 
 STEPS, CLASSES = 22, 10
 

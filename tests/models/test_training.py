@@ -17,8 +17,7 @@ from torch import nn
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, read_splits
-from tactile_rt.models.ead import run_on
-from tactile_rt.models.evaluation.measures import hits, predict
+from tactile_rt.models.evaluation.measures import hits, predict, run_on
 from tactile_rt.models.training.batches import TrainingBatches, prefetched
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 from tactile_rt.models.training.loop import initialise, train

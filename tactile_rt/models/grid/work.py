@@ -19,8 +19,15 @@ from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as
 from tactile_rt.models.disturbances import CLEAN, RATED
-from tactile_rt.models.ead import count_parameters, run_on
-from tactile_rt.models.evaluation.measures import CutWindows, among, cut_windows, hits, posteriors
+from tactile_rt.models.ead import count_parameters
+from tactile_rt.models.evaluation.measures import (
+    CutWindows,
+    among,
+    cut_windows,
+    hits,
+    posteriors,
+    run_on,
+)
 from tactile_rt.models.grid.outcomes import (
     POINT,
     SUBSET,

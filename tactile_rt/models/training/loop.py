@@ -28,8 +28,7 @@ from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import begin_from, fill_checkpoint, save_whole
 from tactile_rt.models.datasets import SweepSet, drawn_as, read_splits, windows
 from tactile_rt.models.disturbances import CLEAN, RATED
-from tactile_rt.models.ead import run_on
-from tactile_rt.models.evaluation.measures import among, cut_windows, hits, posteriors
+from tactile_rt.models.evaluation.measures import among, cut_windows, hits, posteriors, run_on
 from tactile_rt.models.training.batches import (
     BatchFeed,
     Share,

@@ -16,8 +16,8 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import alone_in
 from tactile_rt.models.checkpoints import fill_checkpoint, load_checkpoint, probed_on, save_whole
 from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as, of_categories, windows
-from tactile_rt.models.ead import TactileClassifier, run_on
-from tactile_rt.models.evaluation.measures import hits, predict
+from tactile_rt.models.ead import TactileClassifier
+from tactile_rt.models.evaluation.measures import hits, predict, run_on
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.updates import log_epoch
