@@ -131,7 +131,7 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
 def trained_on(
     checkpoint: Path, saved: Mapping[str, Any], data: Sequence[Path] = ()
 ) -> list[tuple[Path, SweepManifest]]:
-    """The sweep sets that a checkpoint was trained on: where they lie now, and what they are.
+    """Find the sweep sets that a checkpoint was trained on: folders and manifests.
 
     Args:
         data: the sets; default: where they lay when it was trained on.
