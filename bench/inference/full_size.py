@@ -18,11 +18,10 @@ from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.core.packages import VERSION
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import channel_limits
+from tactile_rt.export.graph_forms import Precision
 from tactile_rt.export.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
-from tactile_rt.export.precision import Precision
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead import EADConfig, TactileClassifier
 
 __all__ = ["full_size", "full_size_models", "random_model"]
 
@@ -72,7 +71,7 @@ def random_model(
     """An untrained network for an array, and the card of a file of it."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        model = TactileClassifier(spec, config).eval()
+        model = TactileClassifier(spec, config, channel_limits(spec)).eval()
     return model, ModelCard(
         name=name,
         spec=spec.to_json(),

@@ -27,7 +27,7 @@ from tactile_rt.core.packages import install_extra
 from tactile_rt.models.evaluation.records import Record
 
 if TYPE_CHECKING:  # a robot has no torch
-    from tactile_rt.models.checkpoints import TactileClassifier
+    from tactile_rt.models.ead import TactileClassifier
 
 __all__ = ["window_speed"]
 

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 
 from tactile_rt.models.augmentation import Augmentation, as_published
 from tactile_rt.models.encoders.cells import CELLS
-from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam
 from tactile_rt.models.published_pictures import Draw, as_drawn
 from tactile_rt.models.training.config import SCHEDULES, TrainingConfig
-from tactile_rt.models.training.optimizers import LARS, build_schedule
+from tactile_rt.models.training.objectives import Autoencoder, Objective, SimCLR, SimSiam
+from tactile_rt.models.training.updates import LARS, build_schedule
 
 __all__ = [
     "CELL_NAMES",
@@ -129,11 +129,8 @@ class _Known(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         config = SimpleNamespace(width=1.0, readout="last", frame=FRAME)
-        self.network = SimpleNamespace(config=config, lag=0)
+        self.network = SimpleNamespace(config=config, lag=0, feature_size=FEATURES)
         self.said: list[Tensor] = []
-
-    def feature_size(self) -> int:
-        return FEATURES
 
     def inputs(self, samples: Tensor, *_: Tensor) -> Tensor:
         return samples

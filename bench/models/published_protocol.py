@@ -30,8 +30,8 @@ from bench.models.protocol import (
     windows,
 )
 from bench.models.published import GATES, NORMS
-from tactile_rt.models.objectives import Objective
 from tactile_rt.models.published_pictures import Draw
+from tactile_rt.models.training.objectives import Objective
 
 __all__ = [
     "computed_by_theirs",

@@ -18,11 +18,12 @@ from bench.perception.data import Data
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.export.release import fit_temperature
-from tactile_rt.models.checkpoints import load_checkpoint, run_on
+from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.coverage import score_known
+from tactile_rt.models.evaluation.measures import run_on
 from tactile_rt.models.evaluation.svm import PENALTIES, fit, window_features
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.training.config import TrainingConfig

@@ -28,8 +28,8 @@ from tactile_rt.core.stream import ArraySpec, Timing
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
 from tactile_rt.models.attenders.mamba import MambaStack
-from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, untrained
-from tactile_rt.models.ead import EADConfig, count_parameters
+from tactile_rt.models.checkpoints import load_checkpoint, untrained
+from tactile_rt.models.ead import EADConfig, TactileClassifier, count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.encoders.gru import GRUEncoder

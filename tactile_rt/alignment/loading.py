@@ -13,7 +13,7 @@ from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.core.stream.stimuli import STIMULI
-from tactile_rt.models.checkpoint_files import describe_checkpoint
+from tactile_rt.models.checkpoints import describe_checkpoint
 
 __all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
 

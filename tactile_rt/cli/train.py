@@ -52,8 +52,7 @@ def train(
     json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
-    from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of
-    from tactile_rt.models.training.config import manifests_of
+    from tactile_rt.models.checkpoints import describe_checkpoint, network_of
     from tactile_rt.models.training.recipes import read_recipe
 
     asked = {"encoder": encoder, "epochs": epochs, "seed": seed}
@@ -67,7 +66,7 @@ def train(
     config = read_recipe(recipe, str(data), sets or (), **given)
     first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, or alone
     # What cannot be is refused before torch has taken its seconds.
-    manifests_of(config)
+    config.check_sets()
     if config.begin:
         describe_checkpoint(Path(config.begin))
     check_folder(folder)
@@ -151,8 +150,7 @@ def probe(
     json: Json = None,
 ) -> None:
     """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
-    from tactile_rt.models.checkpoint_files import describe_checkpoint
-    from tactile_rt.models.data_checks import probed_on
+    from tactile_rt.models.checkpoints import describe_checkpoint, probed_on
     from tactile_rt.models.training.config import ProbeConfig
 
     usual = {"data": str(data or ""), "epochs": epochs, "seed": seed}
@@ -201,13 +199,12 @@ def export(
     json: Json = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
-    from tactile_rt.models.checkpoint_files import describe_checkpoint
-    from tactile_rt.models.data_checks import trained_on
+    from tactile_rt.models.checkpoints import describe_checkpoint, trained_on
 
     check_output(model)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
     with needing("train"):
-        from tactile_rt.export.precision import PRECISIONS
+        from tactile_rt.export.graph_forms import PRECISIONS
     if precision not in PRECISIONS:
         raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
     if kind not in ("step", "window"):

@@ -34,11 +34,9 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.packages import VERSION
-from tactile_rt.export.precision import Precision, in_precision
+from tactile_rt.export.graph_forms import Precision, in_precision, window_graph
 from tactile_rt.export.streaming import streaming
-from tactile_rt.export.windows import window_graph
-from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint
-from tactile_rt.models.data_checks import trained_on
+from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.sets.manifest import SweepManifest, join_manifests, trained_objects
 
 __all__ = [
@@ -84,6 +82,8 @@ class StreamingStep(nn.Module):
 
 def export_checkpoint(
     checkpoint: Path,
+    trained: tuple[TactileClassifier, dict[str, Any]],
+    manifests: Sequence[SweepManifest],
     path: Path,
     name: str,
     temperature: float = 1.0,
@@ -92,24 +92,21 @@ def export_checkpoint(
     figures: dict[str, Any] | None = None,
     precision: Precision = "fp32",
     kind: Kind = "step",
-    data: Sequence[Path] = (),
     licence: str = "",
 ) -> ModelCard:
     """Export what `training.loop.train` saved.
 
     Args:
+        trained: the network of the checkpoint, and what the checkpoint holds.
+        manifests: of the sets that it was trained on.
         temperature: divides the logits at run time.
         rules: when the model refuses to name a class, and of its prediction sets.
         kind: "step" or "window".
-        data: where the sweep sets that it was trained on lie now; default: where they lay.
 
     Raises:
-        ModelError: the checkpoint cannot be read, or the exported graph misses the parity bar.
-        SpecMismatch: the set is of another array, or of other categories.
-        RecordingError: there is no set.
+        ModelError: the exported graph misses the parity bar.
     """
-    model, saved = load_checkpoint(checkpoint)
-    manifests = [SweepManifest.read(folder) for folder in trained_on(checkpoint, saved, data)]
+    model, saved = trained
     manifest = join_manifests(manifests)
     refusals = tuple(saved["refusals"])
     card = ModelCard(

@@ -7,16 +7,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tactile_rt.models.ead import EAD, count_parameters
+    from tactile_rt.models.ead import EAD, InputStage, count_parameters
     from tactile_rt.models.ead_config import EADConfig
-    from tactile_rt.models.inputs import InputStage
 
 __all__ = ["EAD", "EADConfig", "InputStage", "count_parameters"]
 
 _HOMES = {
     "EAD": "ead",
     "EADConfig": "ead_config",
-    "InputStage": "inputs",
+    "InputStage": "ead",
     "count_parameters": "ead",
 }
 

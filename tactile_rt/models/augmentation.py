@@ -38,6 +38,10 @@ T = TypeVar("T")
 Loads = tuple[Tensor, Tensor, Tensor]  # samples, offset, sigma as `InputStage` takes them
 
 
+def _as_is(x: T, _: Generator) -> T:
+    return x
+
+
 @dataclass(frozen=True)
 class Augmentation:
     """What happens to a batch before and after the input stage; draws come from a generator.
@@ -47,10 +51,12 @@ class Augmentation:
             generator, to the same three.
         frames: The function that augments frames: (batch, step, sub-step * channel, row, column)
             and a generator on their device, to the same shape.
+        mask: The function that blanks steps of such frames.
     """
 
     loads: Callable[[Loads, Generator], Loads]
     frames: Callable[[Tensor, Generator], Tensor]
+    mask: Callable[[Tensor, Generator], Tensor] = _as_is
 
 
 def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
@@ -86,14 +92,10 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
         jitter = published_pictures.JITTERS[name]
         frames = partial(published_pictures.augment, jitter=jitter)
 
-    def then_mask(x: Tensor, generator: Generator) -> Tensor:
-        return mask_steps(frames(x, generator), masking, generator)
+    def mask(x: Tensor, generator: Generator) -> Tensor:
+        return mask_steps(x, masking, generator)
 
-    return Augmentation(loads, then_mask if masking else frames)
-
-
-def _as_is(x: T, _: Generator) -> T:
-    return x
+    return Augmentation(loads, frames, mask if masking else _as_is)
 
 
 class Tactile:

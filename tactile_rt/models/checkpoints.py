@@ -1,105 +1,195 @@
-"""What is trained and shipped as one, and its checkpoints."""
+"""Checkpoints of networks: what one says of itself, the sets that it fits, and its network.
 
-from collections.abc import Callable, Sequence
+torch writes an archive: a pickle of everything but the numbers of tensors, which lie beside it.
+What is read without torch leaves the numbers where they are, and nothing but plain values is made
+of the pickle. torch is imported where a network is made, seconds that a refusal need not take.
+"""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor, nn
+import msgspec
 
-from tactile_rt.core.errors import ConfigError, SpecMismatch
-from tactile_rt.core.files import replaced
-from tactile_rt.core.stream import ArraySpec, Timing
-from tactile_rt.core.stream.sensor_spec import ChannelLimits, channel_limits
-from tactile_rt.models.checkpoint_files import describe_checkpoint, no_checkpoint
-from tactile_rt.models.ead import EAD, EADConfig
-from tactile_rt.models.inputs import InputStage, paper_units
+from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
+from tactile_rt.core.files import open_regular, replaced
+from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream.sensor_spec import ChannelLimits
+from tactile_rt.models.ead_config import EADConfig
+from tactile_rt.sets.manifest import SweepManifest, check_labelled, join_manifests
+
+if TYPE_CHECKING:
+    from tactile_rt.models.ead import TactileClassifier
 
 __all__ = [
-    "TactileClassifier",
+    "NETWORK",
     "begin_from",
+    "check_array",
+    "describe_checkpoint",
+    "fill_checkpoint",
     "load_checkpoint",
-    "run_on",
+    "network_of",
+    "probed_on",
+    "reason",
     "save_whole",
+    "trained_on",
     "untrained",
 ]
 
+PICKLE = "/data.pkl"  # in the archive, in a folder of any name
+NEEDED = ("model", "network", "config", "spec", "categories", "refusals")
+# of a network's configuration, what a training configuration says
+NETWORK = (
+    "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",
+    "preprocessing",
+)  # fmt: skip
 
-class TactileClassifier(nn.Module):
-    """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
 
-    Args:
-        limits: what is believed of the channels; None: what `channel_limits` says of an array
-            without a described sensor.
+def describe_checkpoint(path: Path) -> dict[str, Any]:
+    """Read what a `best.pt` holds; every tensor is None.
 
     Raises:
-        ConfigError: the network is for another array, or its preprocessing for other units.
+        ModelError: not there, or no such checkpoint, as far as can be told without its numbers.
     """
+    try:
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            names = [name for name in archive.namelist() if name.endswith(PICKLE)]
+            if not names:
+                raise ModelError("it is another archive")
+            with archive.open(names[0]) as pickled:
+                saved = _WithoutTensors(pickled).load()
+        missing = [key for key in NEEDED if key not in saved]
+        if missing:  # of last.pt, for one
+            raise ModelError(f"it has no {missing[0]}, which a best.pt has")
+        EADConfig(**saved["network"])
+        ArraySpec.from_json(saved["spec"])
+    except FileNotFoundError:
+        raise ModelError(f"no checkpoint {path}") from None
+    except Exception as error:  # zipfile and pickle raise many unrelated types for a damaged file
+        raise no_checkpoint(path, error) from None
+    found: dict[str, Any] = saved
+    return found
 
-    def __init__(
-        self, spec: ArraySpec, network: EADConfig, limits: ChannelLimits | None = None
-    ) -> None:
-        super().__init__()
-        if network.preprocessing == "paper":
-            clip, scale = paper_units(spec)
-        else:
-            limits = limits or channel_limits(spec)
-            clip, scale = limits.clip.tolist(), limits.scale.tolist()
-        self.inputs = InputStage(spec.grid, spec.grid_shape, clip, scale, network.preprocessing)
-        channels, *grid = network.frame
-        if tuple(grid) != tuple(spec.grid_shape) or channels % len(spec.channels):
-            found = " x ".join(map(str, network.frame))
-            rows, columns = spec.grid_shape
-            raise ConfigError(
-                f"a network for frames of {found} (channels x rows x columns) does not fit an "
-                f"array of {len(spec.channels)} channels on {rows} x {columns} cells"
+
+def network_of(path: Path) -> dict[str, Any]:
+    """Read what a training configuration says of the network of a checkpoint."""
+    network = describe_checkpoint(path)["network"]
+    return {key: value for key, value in network.items() if key in NETWORK}
+
+
+def no_checkpoint(path: Path, error: Exception) -> ModelError:
+    """The error to raise of a file that is no checkpoint."""
+    return ModelError(f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}")
+
+
+def reason(error: Exception) -> str:
+    """An error in one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+class _WithoutTensors(pickle.Unpickler):
+    def persistent_load(self, pid: Any) -> None:
+        """The numbers of a tensor."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("collections", "OrderedDict"):
+            return OrderedDict
+        if module.partition(".")[0] == "torch":
+            return _nothing
+        raise ModelError(f"it asks for {module}.{name}")
+
+
+def _nothing(*_: Any) -> None:
+    """A tensor."""
+
+
+def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
+    """A set that a checkpoint is to be used on is of the array that it was made for, and its
+    samples are so far apart that steps are of as many.
+    """
+    spec = ArraySpec.from_json(saved["spec"])
+    if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
+        raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
+    channels = len(spec.channels)
+    taken, given = EADConfig(**saved["network"]).frame[0], manifest.frame[0]
+    if taken != given:
+        raise SpecMismatch(
+            f"{checkpoint} takes steps of {taken // channels} samples, and of the set, with one "
+            f"every {manifest.period_ns / 1e6:g} ms, a step has {given // channels}: name a set of "
+            "the sample period that it was trained at"
+        )
+
+
+def trained_on(
+    checkpoint: Path, saved: Mapping[str, Any], data: Sequence[Path] = ()
+) -> list[tuple[Path, SweepManifest]]:
+    """Find the sweep sets that a checkpoint was trained on: folders and manifests.
+
+    Args:
+        data: the sets; default: where they lay when it was trained on.
+
+    Raises:
+        RecordingError: one is not there, or no sweep set.
+        SpecMismatch: one is of another array, or they hold other categories.
+    """
+    config = saved["config"]
+    folders = tuple(data) or tuple(map(Path, (config["data"], *config.get("also", ()))))
+    for folder in folders:
+        if not data and not folder.exists():
+            raise RecordingError(
+                f"{folder}, a sweep set that {checkpoint} was trained on, is not here: name it by "
+                "--data"
             )
-        self.network = EAD(network)
-
-    @property
-    def timing(self) -> Timing:
-        """How the windows are cut that it takes."""
-        config = self.network.config
-        return Timing(config.max_steps, config.frame[0] // len(self.inputs.clip))
-
-    def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
-        """(batch, step, sub-step, element, channel) SI -> logits (batch, step, class)"""
-        logits: Tensor = self.network(self.inputs(samples, offset, sigma))
-        return logits
-
-    def features(self, frames: Tensor) -> Tensor:
-        """(batch, step, channel, row, column) -> (batch, step, feature): encoder and attender."""
-        return self.network.features(frames)
-
-    @torch.no_grad()
-    def feature_size(self) -> int:
-        """How many features a step has; the attender may change the encoder's number."""
-        frame = torch.zeros(1, 1, *self.network.config.frame)
-        mode = self.training
-        size = self.eval().features(frame.to(self.inputs.clip)).shape[-1]
-        self.train(mode)
-        return size
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    manifest = join_manifests(manifests)
+    check_array(checkpoint, saved, manifest)
+    held = list(manifest.categories)
+    classes = saved["network"]["classes"] - len(saved["refusals"])
+    if saved["categories"] != held or len(held) != classes:
+        other = (
+            ", ".join(sorted({*saved["categories"]} ^ {*held})[:3]) or "the same in another order"
+        )
+        there = " and ".join(map(str, folders))
+        raise SpecMismatch(
+            f"{checkpoint} tells other categories apart than {there} holds ({other}): name what "
+            "it was trained on by --data"
+        )
+    return list(zip(folders, manifests, strict=True))
 
 
-def run_on(
-    model: TactileClassifier,
-) -> Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]:
-    """The function that `evaluation.predict` wants, of a torch model."""
+def probed_on(
+    checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
+) -> tuple[Path, SweepManifest]:
+    """The sweep set that a checkpoint is probed on.
 
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        model.eval()
-        device = model.inputs.clip.device
-        with torch.inference_mode():
-            logits = model(*(torch.from_numpy(a).to(device) for a in (samples, offset, sigma)))
-        out: NDArray[np.float32] = logits.float().cpu().numpy()
-        return out
+    Args:
+        data: the set; empty: the first of those that it was trained on.
 
-    return run
+    Raises:
+        RecordingError: it is not there, or no sweep set.
+        SpecMismatch: it is of another array.
+        ConfigError: it has no labels; or the folder is that of a trained network, which the probe
+            would take the place of.
+    """
+    best = folder / "best.pt"
+    if (folder / "config.json").exists() or (best.exists() and best.samefile(checkpoint)):
+        raise ConfigError(
+            f"{folder} holds a training run, whose best.pt the probe would replace: choose another "
+            "folder"
+        )
+    path = Path(data or saved["config"]["data"])
+    manifest = SweepManifest.read(path)
+    check_array(checkpoint, saved, manifest)
+    check_labelled(path, manifest)
+    return path, manifest
 
 
 def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
@@ -108,6 +198,8 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     Raises:
         ModelError: not there, or not such a checkpoint.
     """
+    import torch
+
     describe_checkpoint(path)
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
@@ -118,13 +210,16 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     return model.eval(), saved
 
 
-def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> None:
+def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> dict[str, Any]:
     """Give a network that is to be trained the weights of a checkpoint.
 
     Args:
         model: of the same network, but that it may tell apart other things.
         labels: what the network is to tell apart; it knows those from the beginning that the
             checkpoint knew by the same name.
+
+    Returns:
+        What the checkpoint holds.
 
     Raises:
         ModelError: no such checkpoint.
@@ -149,14 +244,45 @@ def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> N
     # what the channels are limited to is the new set's to say
     kept = {name: own[name] if name.startswith("inputs.") else w for name, w in weights.items()}
     model.load_state_dict(kept)
+    return saved
 
 
 def untrained(saved: dict[str, Any]) -> TactileClassifier:
     """The network of a checkpoint as it might be before training: for the same channels."""
+    from tactile_rt.models.ead import TactileClassifier
+
     clip, scale = (saved["model"][f"inputs.{name}"].numpy() for name in ("clip", "scale"))
     limits = ChannelLimits(noise=scale, floor=scale, clip=clip, scale=scale)
     spec = ArraySpec.from_json(saved["spec"])
     return TactileClassifier(spec, EADConfig(**saved["network"]), limits)
+
+
+def fill_checkpoint(
+    model: TactileClassifier,
+    manifest: SweepManifest,
+    refusals: Sequence[str],
+    config: Mapping[str, Any],
+    trained: Mapping[str, list[str]],
+    metrics: Mapping[str, float],
+) -> dict[str, Any]:
+    """Tell what a `best.pt` holds of a network.
+
+    Args:
+        manifest: what the set is that it was trained on.
+        config: of its training, as JSON has it.
+        trained: names of the objects that it has learnt from, by where they come from.
+    """
+    return {
+        "model": model.state_dict(),
+        "config": config,
+        "network": msgspec.to_builtins(model.network.config),
+        "spec": manifest.spec.to_json(),
+        "period_ns": manifest.period_ns,
+        "categories": list(manifest.categories),
+        "refusals": list(refusals),
+        "trained_objects": trained,
+        "metrics": metrics,
+    }
 
 
 def save_whole(path: Path, state: dict[str, Any]) -> None:
@@ -165,6 +291,8 @@ def save_whole(path: Path, state: dict[str, Any]) -> None:
     Raises:
         OSError: the medium is full, or failed.
     """
+    import torch
+
     with replaced(path) as file:
         try:
             torch.save(state, file)

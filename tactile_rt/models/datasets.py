@@ -6,6 +6,7 @@ onset on the noisy signal, and carries the baseline that the detector had measur
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -16,33 +17,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import UNKNOWN
+from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import MOUSE, Timing
 from tactile_rt.models.implausible import implausible
 from tactile_rt.models.onsets import Onsets, find_onsets
-from tactile_rt.sets.manifest import FAULTS, SweepManifest, join_manifests
-from tactile_rt.sets.objects import Sweeps, read_sweeps
+from tactile_rt.sets.manifest import (
+    FAULTS,
+    OUTLIERS,
+    SweepManifest,
+    join_manifests,
+    object_path,
+    read_manifests,
+)
+from tactile_rt.sets.objects import Sweeps, read_split
 from tactile_rt.sets.sensor_faults import SensorFaults
 
 __all__ = [
     "NOISE_LEVELS",
     "SweepSet",
+    "check_sets",
     "drawn_as",
-    "frame_of",
     "joined",
     "of_categories",
+    "read_splits",
     "relabelled",
     "windows",
     "with_faults",
 ]
 
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets
-
-
-def frame_of(manifest: SweepManifest) -> tuple[int, int, int]:
-    """Channels, rows and columns of what a network sees of a sweep set's array in a step."""
-    spec = manifest.spec
-    rows, columns = spec.grid_shape
-    return Timing.of(manifest.period_ns).substeps * len(spec.channels), rows, columns
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class SweepSet:
         floor: (channel,) The smallest sigma of the detector, SI.
         window: The first sample of a sweep's window: "onset", where the detector hears the touch,
             or "sweep", where the object sets out, on the baseline that was measured until then.
+        joined_of: The manifests of the sets that it was joined of; none if of one alone.
     """
 
     manifest: SweepManifest
@@ -61,13 +65,23 @@ class SweepSet:
     noise: NDArray[np.float32]
     floor: NDArray[np.float32]
     window: str = "onset"
+    joined_of: tuple[SweepManifest, ...] = ()
 
     @classmethod
     def read(cls, folder: Path, split: str) -> SweepSet:
         """Read a split."""
-        manifest = SweepManifest.read(folder)
+        return cls.read_known(folder, SweepManifest.read(folder), split)
+
+    @classmethod
+    def read_known(cls, folder: Path, manifest: SweepManifest, split: str) -> SweepSet:
+        """Read a split of a set whose manifest is known."""
         limits = manifest.limits
-        return cls(manifest, read_sweeps(folder, split), limits.noise, limits.floor)
+        return cls(manifest, read_split(folder, manifest, split), limits.noise, limits.floor)
+
+    @property
+    def manifests(self) -> tuple[SweepManifest, ...]:
+        """What the sets are that its sweeps are of."""
+        return self.joined_of or (self.manifest,)
 
     def onsets(self, values: NDArray[np.float32]) -> Onsets:
         """Find where windows of (sweep, sample, element, channel) begin, and their baselines."""
@@ -110,6 +124,11 @@ class SweepSet:
         unknown = (UNKNOWN,) if (self.sweeps.labels < 0).any() else ()
         named = implausible(self.manifest.spec) if self.manifest.faults.implausible else ()
         return (*unknown, *named)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of all that a network that learns from it tells apart: last the refusals."""
+        return (*self.manifest.categories, *self.refusals)
 
     @cached_property
     def noisy_starts(self) -> NDArray[np.int64]:
@@ -158,6 +177,32 @@ def windows(
     return shaped
 
 
+def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, SweepSet]:
+    """Read and check what a training learns from, with outliers, and what it validates on.
+
+    Args:
+        folders: of sets that are learnt from together.
+        labelled: whether it is learnt from their labels.
+
+    Raises:
+        ConfigError: the sets cannot be joined, or one has no labels to learn from.
+        RecordingError: a set is missing, unfinished, damaged or unfit.
+    """
+    manifests, whole = read_manifests(folders, labelled)
+    training, validating = [], []
+    for folder, manifest in zip(folders, manifests, strict=True):
+        names = ["train", *([OUTLIERS] if manifest.split.get(OUTLIERS) else [])]
+        splits = [joined([SweepSet.read_known(folder, manifest, name) for name in names])]
+        if manifest.split.get("validation") or len(folders) == 1:  # a further set may have none
+            splits.append(SweepSet.read_known(folder, manifest, "validation"))
+        check_sets(folder, splits)
+        training.append(splits[0])
+        validating += splits[1:]
+    if not validating:
+        raise RecordingError(f"{folders[0]} and the sets beside it have no validation objects")
+    return joined(training), relabelled(joined(validating), whole.categories)
+
+
 def joined(sets: Sequence[SweepSet]) -> SweepSet:
     """Sets of one array as one, with the categories of all; faults are those of the first.
 
@@ -167,13 +212,19 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
         return sets[0]
     manifest = join_manifests([one.manifest for one in sets])
     after = max(one.sweeps.values.shape[1] - one.manifest.lead for one in sets)
-    whole = Sweeps(
-        np.concatenate([_lengthened(one, manifest.lead, after) for one in sets]),
-        np.concatenate([relabelled(one, manifest.categories).sweeps.labels for one in sets]),
-        np.concatenate([one.sweeps.objects for one in sets]),
-        recorded=np.concatenate([one.recorded for one in sets]),
-    )
-    return replace(sets[0], manifest=manifest, sweeps=whole)
+    parts = [
+        (
+            _lengthened(one, manifest.lead, after),
+            relabelled(one, manifest.categories).sweeps.labels,
+            one.sweeps.objects,
+            one.recorded,
+        )
+        for one in sets
+    ]
+    values, labels, objects, recorded = map(np.concatenate, zip(*parts, strict=True))
+    whole = Sweeps(values, labels, objects, recorded=recorded)
+    of = tuple(manifest for one in sets for manifest in one.manifests)
+    return replace(sets[0], manifest=manifest, sweeps=whole, joined_of=of)
 
 
 def _lengthened(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
@@ -217,3 +268,37 @@ def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
         manifest=replace(data.manifest, categories=tuple(categories)),
         sweeps=replace(data.sweeps, labels=place[data.sweeps.labels]),
     )
+
+
+def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
+    """The sweeps themselves: finite, long enough, and none on two sides.
+
+    Raises:
+        RecordingError: otherwise; the message names the object.
+    """
+    seen: dict[bytes, tuple[str, int]] = {}
+    for number, data in enumerate(sets):
+        sweeps = data.sweeps
+        if sweeps.values.shape[1] < data.timing.samples:
+            raise RecordingError(
+                f"{folder}: sweeps of {sweeps.values.shape[1]} samples are shorter than a window "
+                f"of {data.timing.samples}"
+            )
+        first = {str(name): int(at) for at, name in reversed(list(enumerate(sweeps.objects)))}
+        for k, sweep in enumerate(sweeps.values):
+            if not np.isfinite(sweep).all():
+                name = str(sweeps.objects[k])
+                raise RecordingError(
+                    f"{object_path(folder, name)}: sweep {k - first[name]} holds values that are "
+                    "not finite: delete the file and sweep again"
+                )
+        for name, at in first.items():
+            if not np.ptp(sweeps.values[at], axis=0).any():
+                continue  # a miss is like any other miss, also above a magnet
+            key = hashlib.blake2b(sweeps.values[at].tobytes()).digest()
+            twin, where = seen.setdefault(key, (name, number))
+            if where != number:
+                raise RecordingError(
+                    f"{folder}: {name} is {twin} by another name, on another side of the split: an "
+                    "accuracy on it would mean nothing; make the set anew"
+                )

@@ -13,16 +13,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.core.errors import ConfigError
-from tactile_rt.models.ead_config import DECODERS
-
-__all__ = ["DECODERS", "HIDDEN", "LinearDecoder", "MLPAllDecoder", "MLPDecoder", "make"]
+__all__ = ["HIDDEN", "KINDS", "LinearDecoder", "MLPAllDecoder", "MLPDecoder"]
 
 HIDDEN = (1024, 512)  # at width 1
 
 
 class LinearDecoder(nn.Linear):
-    """Each step alone: one layer, so the features are the embedding."""
+    """Each step alone: one layer at any width, so the features are the embedding."""
+
+    def __init__(self, features: int, classes: int, width: float = 1.0, steps: int = 22) -> None:
+        super().__init__(features, classes)
 
     def embed(self, features: Tensor) -> Tensor:
         """features (..., feature) -> themselves"""
@@ -46,7 +46,7 @@ class LinearDecoder(nn.Linear):
 class MLPDecoder(nn.Sequential):
     """Each step alone: feature-1024-512-class at width 1 (Chung et al. 2025, model training)."""
 
-    def __init__(self, features: int, classes: int, width: float = 1.0) -> None:
+    def __init__(self, features: int, classes: int, width: float = 1.0, steps: int = 22) -> None:
         wide, narrow = hidden(width)
         super().__init__(
             nn.Linear(features, wide),
@@ -146,18 +146,9 @@ def hidden(width: float) -> tuple[int, int]:
     return wide, narrow
 
 
-def make(
-    name: str, features: int, classes: int, width: float = 1.0, steps: int = 22
-) -> LinearDecoder | MLPDecoder | MLPAllDecoder:
-    """The decoder of that name.
-
-    Args:
-        steps: an episode's steps, which "mlp-all" has weights for.
-    """
-    if name == "linear":
-        return LinearDecoder(features, classes)
-    if name == "mlp":
-        return MLPDecoder(features, classes, width)
-    if name == "mlp-all":
-        return MLPAllDecoder(features, classes, width, steps)
-    raise ConfigError(f"decoder is {name!r}, not one of {', '.join(DECODERS)}")
+# each made of the numbers of features and of classes, the width, and an episode's steps
+KINDS: dict[str, type[LinearDecoder | MLPDecoder | MLPAllDecoder]] = {
+    "linear": LinearDecoder,
+    "mlp": MLPDecoder,
+    "mlp-all": MLPAllDecoder,
+}

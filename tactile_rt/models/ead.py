@@ -1,10 +1,18 @@
-"""Encoder-Attender-Decoder: what an array of whiskers touches, decided anew at every step.
+"""From a sensor's samples to what an array of whiskers touches, decided anew at every step.
 
-    normalised frames -> encoder -> attender -> decoder -> logits
+    samples -> input stage -> frames -> encoder -> attender -> decoder -> logits
     (batch, step, channel, row, column) -> (batch, step, feature) -> (batch, step, class)
 
 The channels are those of all sub-steps of a step, rows and columns the array's grid: 5 sub-steps
 x 6 loads on 5 x 7 cells for the mouse's whiskers of the paper.
+
+The input stage is in the graph, so that units travel with it. Most whiskers feel micronewtons
+while one that jams feels newtons, so values are compressed as sign(v) log(1 + |v| / s). The scale
+s never falls below the noise measured at rest, or the logarithm would magnify silent channels into
+signals. A recurrent network would never forget a number that is none: so a sample that is NaN or
+infinite counts as no load, and so does a channel whose baseline or noise is, also in a file that
+others run. The paper's own preprocessing ("paper") has no logarithm: forces in mN and moments in
+uN m as they are, limited to 1000 of either (Chung et al. 2025, and its code).
 
 `EAD.forward` takes a whole window for training; `EAD.step` takes one frame and explicit state,
 for streaming, and gives the same logits. The logits of a step use no later frame.
@@ -12,6 +20,7 @@ for streaming, and gives the same logits. The logits of a step use no later fram
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -19,7 +28,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.stream import ArraySpec, Timing
+from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models import attenders, decoders
 from tactile_rt.models.ead_config import (
     ATTENDERS,
@@ -31,15 +42,171 @@ from tactile_rt.models.ead_config import (
 )
 from tactile_rt.models.encoders.cells import Cell
 
-__all__ = ["ATTENDERS", "DECODERS", "EAD", "ENCODERS", "READOUTS", "EADConfig", "count_parameters"]
+__all__ = [
+    "ATTENDERS",
+    "DECODERS",
+    "EAD",
+    "ENCODERS",
+    "READOUTS",
+    "EADConfig",
+    "InputStage",
+    "TactileClassifier",
+    "count_parameters",
+    "paper_units",
+]
 
+PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
+PAPER_CLIP = 1000.0  # of these units
+NOISE_FLOOR = 3.0  # standard deviations of the noise that count as silence
 GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and only there
+
+
+class TactileClassifier(nn.Module):
+    """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
+
+    Args:
+        limits: what is believed of the channels.
+
+    Raises:
+        ConfigError: the network is for another array, or its preprocessing for other units.
+    """
+
+    def __init__(self, spec: ArraySpec, network: EADConfig, limits: ChannelLimits) -> None:
+        super().__init__()
+        if network.preprocessing == "paper":
+            clip, scale = paper_units(spec)
+        else:
+            clip, scale = limits.clip.tolist(), limits.scale.tolist()
+        self.inputs = InputStage(spec.grid, spec.grid_shape, clip, scale, network.preprocessing)
+        channels, *grid = network.frame
+        if tuple(grid) != tuple(spec.grid_shape) or channels % len(spec.channels):
+            found = " x ".join(map(str, network.frame))
+            rows, columns = spec.grid_shape
+            raise ConfigError(
+                f"a network for frames of {found} (channels x rows x columns) does not fit an "
+                f"array of {len(spec.channels)} channels on {rows} x {columns} cells"
+            )
+        self.network = EAD(network)
+
+    @property
+    def timing(self) -> Timing:
+        """How the windows are cut that it takes."""
+        config = self.network.config
+        return Timing(config.max_steps, config.frame[0] // len(self.inputs.clip))
+
+    def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
+        """(batch, step, sub-step, element, channel) SI -> logits (batch, step, class)"""
+        logits: Tensor = self.network(self.inputs(samples, offset, sigma))
+        return logits
+
+    def features(self, frames: Tensor) -> Tensor:
+        """(batch, step, channel, row, column) -> (batch, step, feature): encoder and attender."""
+        return self.network.features(frames)
+
+
+class InputStage(nn.Module):
+    """Raw samples in SI units (N, N m) to network frames.
+
+    Args:
+        positions: grid (row, column) of each element, in the order of the samples.
+        shape: rows and columns of the grid; cells without an element are zero.
+        clip: per channel, the largest magnitude that is believed (channel,), SI.
+        scale: per channel, the floor of the logarithm's scale (channel,), SI; without a logarithm,
+            the unit.
+        preprocessing: one of `ead_config.PREPROCESSINGS`.
+
+    Raises:
+        ConfigError: clip and scale of unlike lengths or not positive, two elements in one place,
+            or one outside the grid.
+    """
+
+    clip: Tensor
+    scale: Tensor
+    element: Tensor
+
+    def __init__(
+        self,
+        positions: Sequence[tuple[int, int]],
+        shape: tuple[int, int],
+        clip: Sequence[float],
+        scale: Sequence[float],
+        preprocessing: str = "log",
+    ) -> None:
+        super().__init__()
+        self.logarithm = preprocessing == "log"
+        rows, columns = shape
+        if len(clip) != len(scale):
+            raise ConfigError(f"{len(clip)} clip limits, but {len(scale)} scales")
+        if not all(value > 0 for value in (*clip, *scale)):
+            raise ConfigError("clip limits and scales must be positive")
+        if len(set(positions)) != len(positions):
+            raise ConfigError("two elements share a grid position")
+        # An extra, always silent element fills the cells that have none.
+        element = torch.full((rows, columns), len(positions))
+        for i, (row, column) in enumerate(positions):
+            if not (0 <= row < rows and 0 <= column < columns):
+                raise ConfigError(
+                    f"position {(row, column)} is outside the {rows} x {columns} grid"
+                )
+            element[row, column] = i
+        self.shape = (rows, columns)
+        self.elements = len(positions)
+        self.register_buffer("clip", torch.tensor(clip, dtype=torch.float32))
+        self.register_buffer("scale", torch.tensor(scale, dtype=torch.float32))
+        self.register_buffer("element", element.flatten())
+
+    def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
+        """Frames, sub-step-major: all channels of the first sub-step, then of the second, ...
+
+        samples         (batch, ..., sub-step, element, channel)  SI
+        offset, sigma   (batch, element, channel)                 SI: mean and noise at rest
+        ->              (batch, ..., sub-step * channel, row, column)
+
+        Raises:
+            ValueError: samples of another number of elements or channels.
+        """
+        if samples.shape[-2:] != (self.elements, len(self.clip)):
+            found = " x ".join(map(str, samples.shape[-2:]))
+            raise ValueError(
+                f"samples are {found} (element x channel), not {self.elements} x {len(self.clip)}"
+            )
+        for _ in range(samples.dim() - offset.dim()):
+            offset, sigma = offset.unsqueeze(1), sigma.unsqueeze(1)
+        load = samples - offset  # as samples, SI
+        load = torch.where(load.abs() < torch.inf, load, 0.0)  # NaN is not less either
+        value = torch.clamp(load, -self.clip, self.clip)  # as samples, SI
+        scale = torch.sqrt(self.scale**2 + (NOISE_FLOOR * sigma) ** 2)  # as offset, SI
+        scale = torch.where(scale < torch.inf, scale, torch.inf)  # of which any load is nothing
+        if self.logarithm:
+            value = torch.sign(value) * torch.log1p(value.abs() / scale)  # as samples, no unit
+        else:
+            value = value / self.scale
+        cells = F.pad(value, (0, 0, 0, 1)).index_select(-2, self.element)
+        # (batch, ..., sub-step, cell, channel) -> (batch, ..., sub-step * channel, row, column)
+        frames: Tensor = cells.transpose(-2, -1).flatten(-3, -2).unflatten(-1, self.shape)
+        return frames
+
+
+def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
+    """Clip and unit of each channel (channel,), SI, of the preprocessing "paper".
+
+    Raises:
+        ConfigError: a channel that is neither a force nor a moment.
+    """
+    if unknown := sorted(set(spec.units) - set(PAPER_UNITS)):
+        raise ConfigError(
+            f"preprocessing paper is of forces and moments: this array has {name_some(unknown)}; "
+            "take log"
+        )
+    units = [PAPER_UNITS[unit] for unit in spec.units]
+    return [PAPER_CLIP * unit for unit in units], units
 
 
 class EAD(nn.Module):
     """The network of one `EADConfig`; see the module's docstring.
 
     Attributes:
+        feature_size: The number of features of a step, which the decoder reads.
         lag: The number of steps that a frame takes to reach the logits: the first `lag` steps of a
             window know of no frame, the last `lag` frames do not count.
     """
@@ -65,9 +232,9 @@ class EAD(nn.Module):
             self.attender = attenders.MambaAttender(width)
         else:
             self.attender = attenders.NoAttender()
-        self.decoder = decoders.make(
-            config.decoder, width, config.classes, config.width, config.max_steps
-        )
+        self.feature_size = width
+        kind = decoders.KINDS[config.decoder]
+        self.decoder = kind(width, config.classes, config.width, config.max_steps)
 
     def features(self, frames: Tensor) -> Tensor:
         """What the decoder reads of frames, (batch, step, feature)."""
@@ -137,17 +304,7 @@ def _encoder(config: EADConfig) -> Any:
     module, name = encoder_class(config.encoder)
     kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
     if config.encoder == "graph":
-        from tactile_rt.models.encoders.graph import parse_graph
-
-        graph = parse_graph(config.graph)
-        read = graph.frame
-        if (found := (read.channels, read.rows, read.columns)) != config.frame:
-            sizes = (" x ".join(map(str, size)) for size in (found, config.frame))
-            raise ConfigError(
-                "the graph's {} has {} channels, rows and columns, the array's frames "
-                "{}: change the graph".format(read.name, *sizes)
-            )
-        return kind(graph.scaled(config.width))
+        return kind(config.graph, config.width, config.frame)
     if config.encoder.startswith("zhuang-"):
         channels, rows, columns = config.frame
         frame = (channels, rows, columns + int(_alone(config)))

@@ -27,14 +27,14 @@ CELLS = (
     "lstm-ln-published",
 )  # fmt: skip
 ZHUANG = ("zhuang", "ZhuangEncoder")
-# name: (module in `encoders`, class), imported when a network needs it
+# name: (module in `encoders`, what makes it), imported when a network needs it
 ENCODERS: dict[str, tuple[str, str]] = {
     **{f"zhuang-{cell}": ZHUANG for cell in CELLS},
     "resnet18": ("resnet", "ResNet18Encoder"),
     "s4": ("s4", "S4Encoder"),
     "mamba": ("mamba", "MambaEncoder"),
     "gru": ("gru", "GRUEncoder"),
-    "graph": ("graph_encoder", "GraphEncoder"),
+    "graph": ("graph_encoder", "build_encoder"),
 }
 ATTENDERS = ("gpt", "mamba", "none")
 DECODERS = ("linear", "mlp", "mlp-all")
@@ -53,7 +53,7 @@ def added_cells() -> tuple[str, ...]:
 
 
 def encoder_class(name: str) -> tuple[str, str]:
-    """The module in `encoders` and the class of an encoder that exists."""
+    """The module in `encoders`, and in it what makes an encoder that exists."""
     return ENCODERS.get(name, ZHUANG)
 
 

@@ -18,11 +18,11 @@ import torch
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.export.release import release
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, read_splits
 from tactile_rt.models.evaluation.model_file import evaluate_model
 from tactile_rt.models.evaluation.records import Record, write
 from tactile_rt.models.training.config import Progress, TrainingConfig
-from tactile_rt.models.training.loop import read_splits, train
+from tactile_rt.models.training.loop import train
 from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import Project
@@ -132,7 +132,7 @@ def _train(
     torch.set_num_threads(1)
     tell(MakeProgress("finding onsets", 0, 1, end - time.monotonic()))
     config = read_recipe(RECIPE, str(sweeps.resolve()))
-    splits = read_splits(config)
+    splits = read_splits(config.folders, config.labelled)
     batch = max(2, min(config.batch, len(splits[0].sweeps) // 8))
     config = replace(config, batch=batch)
     if not budget.updates:

@@ -16,7 +16,7 @@ import msgspec
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import write_whole
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, Timing
 from tactile_rt.core.stream.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.sets.sensor_faults import SensorFaults
 
@@ -33,6 +33,7 @@ __all__ = [
     "has_object",
     "join_manifests",
     "object_path",
+    "read_manifests",
     "split_by_object",
     "trained_objects",
 ]
@@ -104,6 +105,12 @@ class SweepManifest:
     def recorded(self) -> bool:
         """Whether its sweeps were recorded, with the noise of their sensor, not simulated."""
         return RECORDINGS in self.recipe
+
+    @property
+    def frame(self) -> tuple[int, int, int]:
+        """Channels, rows and columns of what a network sees of the array in a step."""
+        rows, columns = self.spec.grid_shape
+        return Timing.of(self.period_ns).substeps * len(self.spec.channels), rows, columns
 
     @property
     def limits(self) -> ChannelLimits:
@@ -230,6 +237,28 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
         split={side: tuple(names) for side, names in split.items()},
         category_of={name: kind for m in manifests for name, kind in m.category_of.items()},
     )
+
+
+def read_manifests(
+    folders: Sequence[Path], labelled: bool
+) -> tuple[list[SweepManifest], SweepManifest]:
+    """Read what sets are that are learnt from together: each, and all as one.
+
+    Args:
+        labelled: whether it is learnt from their labels.
+
+    Raises:
+        ConfigError: they cannot be joined, or one has no labels to learn from.
+        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+    """
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    whole = join_manifests(manifests)
+    for folder, manifest in zip(folders, manifests, strict=True):
+        if labelled:
+            check_labelled(folder, manifest)
+        check_split(folder, manifest)
+    check_split(folders[0], whole)
+    return manifests, whole
 
 
 def _compare_recipes(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:

@@ -17,7 +17,15 @@ from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import write_whole
 from tactile_rt.sets.manifest import CONTACTS, SKIPPED, SweepManifest, has_object, object_path
 
-__all__ = ["Sweeps", "read_object", "read_skipped", "read_sweeps", "write_object", "write_skipped"]
+__all__ = [
+    "Sweeps",
+    "read_object",
+    "read_skipped",
+    "read_split",
+    "read_sweeps",
+    "write_object",
+    "write_skipped",
+]
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,11 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
             or damaged.
         ConfigError: no such split.
     """
-    manifest = SweepManifest.read(folder)
+    return read_split(folder, SweepManifest.read(folder), split)
+
+
+def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
+    """Read one split of a set whose manifest is known, as `read_sweeps` does."""
     names = _names_of(folder, manifest, split)
     labels = [manifest.label(name) for name in names]
     missing = [name for name in names if not has_object(folder, name)]

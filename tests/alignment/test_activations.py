@@ -20,15 +20,16 @@ from tactile_rt.alignment.rdm import rdm  # noqa: E402
 from tactile_rt.alignment.stimuli_input import SHIPPED, read_stimuli  # noqa: E402
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model  # noqa: E402
 from tactile_rt.core.errors import ConfigError  # noqa: E402
+from tactile_rt.core.stream.sensor_spec import channel_limits  # noqa: E402
 from tactile_rt.core.stream.stimuli import STIMULI  # noqa: E402
-from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
-from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tactile_rt.models.ead import EADConfig, TactileClassifier  # noqa: E402
 from tactile_rt.models.encoders.graph_encoder import draw_as_published  # noqa: E402
 from tactile_rt.models.encoders.zhuang import zhuang_graph  # noqa: E402
 from tests.helpers.source_tree import ROOT  # noqa: E402
 
 FELT = read_stimuli()
 SPEC = load_model(shipped_model())[1].array
+LIMITS = channel_limits(SPEC)
 # Steps from the frame to each map, counted by hand from the paper's graph.
 STEPS_TO = {"conv1": 0, "conv2": 1, "conv3": 2, "conv4": 3, "conv5": 4, "conv6": 5, "fc7": 2,
             "fc8": 3}  # fmt: skip
@@ -51,7 +52,7 @@ LAYERS = {
 def build(encoder, attender="none", decoder="linear", seed=0):
     torch.manual_seed(seed)
     config = EADConfig(7, encoder, attender, decoder, width=1 / 32)
-    return TactileClassifier(SPEC, config)
+    return TactileClassifier(SPEC, config, LIMITS)
 
 
 def test_shipped_input():
@@ -119,7 +120,7 @@ def test_batch_norm_and_dropout_are_off_and_the_mode_is_kept(encoder, attender):
 
 def test_untrained_networks_are_of_a_seed_and_leave_the_generator_alone():
     network = {"classes": 7, "encoder": "gru", "width": 1 / 32}
-    weights = TactileClassifier(SPEC, EADConfig(**network)).state_dict()
+    weights = TactileClassifier(SPEC, EADConfig(**network), LIMITS).state_dict()
     saved = {"spec": SPEC.to_json(), "network": network, "model": weights}
     torch.manual_seed(5)
     before = torch.random.get_rng_state()
@@ -211,7 +212,7 @@ def test_a_card_that_names_no_network_has_no_control():
 def test_a_twin_has_the_first_weights_that_its_network_had():
     """As the paper draws them, where training did: evenly, within 1 / sqrt(fan-in)."""
     config = EADConfig(7, "zhuang-ugrnn", "none", width=1 / 32)
-    weights = TactileClassifier(SPEC, config).state_dict()
+    weights = TactileClassifier(SPEC, config, LIMITS).state_dict()
     network = msgspec.to_builtins(config)
     card = read_model(shipped_model())[0]
     for first, others in (("paper", "kaiming"), ("kaiming", "paper")):
@@ -219,7 +220,7 @@ def test_a_twin_has_the_first_weights_that_its_network_had():
         saved = {"spec": SPEC.to_json(), "network": network, "model": weights, "config": training}
         twin = untrained_layers(saved, FELT, 3)
         torch.manual_seed(3)
-        model = TactileClassifier(SPEC, config)
+        model = TactileClassifier(SPEC, config, LIMITS)
         if first == "paper":
             draw_as_published(model.network.encoder)
         expected = network_layers(model, FELT).traces["encoder.conv1"]

@@ -37,11 +37,10 @@ from tactile_rt.alignment.layers import Layers  # noqa: E402
 from tactile_rt.alignment.onnx_activations import onnx_layers  # noqa: E402
 from tactile_rt.alignment.stimuli_input import read_stimuli  # noqa: E402
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model  # noqa: E402
+from tactile_rt.core.stream.sensor_spec import channel_limits  # noqa: E402
+from tactile_rt.export.graph_forms import in_precision, window_graph  # noqa: E402
 from tactile_rt.export.onnx_step import export_step  # noqa: E402
-from tactile_rt.export.precision import in_precision  # noqa: E402
-from tactile_rt.export.windows import window_graph  # noqa: E402
-from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
-from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tactile_rt.models.ead import EADConfig, TactileClassifier  # noqa: E402
 from tests.helpers.small_networks import stir  # noqa: E402
 
 FELT = read_stimuli()
@@ -143,7 +142,7 @@ def written(path, encoder, attender, decoder, width=1 / 32, trained=True):
     torch.manual_seed(2)
     card = load_model(shipped_model())[1]
     config = EADConfig(len(card.labels), encoder, attender, decoder, width=width)
-    model = TactileClassifier(card.array, config).eval()
+    model = TactileClassifier(card.array, config, channel_limits(card.array)).eval()
     if trained:
         stir(model)
     plain = change(card, provenance={}, figures={}, embeddings=None)

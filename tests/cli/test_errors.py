@@ -213,9 +213,10 @@ def tiny_model(torch, tmp_path, sweep_set):
     import onnx
 
     from tactile_rt.classifier.model_file import METADATA_KEY
+    from tactile_rt.core.stream.sensor_spec import channel_limits
     from tactile_rt.export.onnx_step import export_checkpoint
-    from tactile_rt.models.checkpoints import TactileClassifier
-    from tactile_rt.models.ead import EADConfig
+    from tactile_rt.models.checkpoints import load_checkpoint
+    from tactile_rt.models.ead import EADConfig, TactileClassifier
     from tactile_rt.models.training.config import TrainingConfig
     from tactile_rt.sets.manifest import SweepManifest
 
@@ -223,7 +224,7 @@ def tiny_model(torch, tmp_path, sweep_set):
     spec = manifest.spec
     network = EADConfig(classes=12, encoder="gru", attender="none", width=1 / 16)  # soon traced
     saved = {
-        "model": TactileClassifier(spec, network).state_dict(),
+        "model": TactileClassifier(spec, network, channel_limits(spec)).state_dict(),
         "network": msgspec.to_builtins(network),
         "config": msgspec.to_builtins(TrainingConfig(str(sweep_set))),
         "spec": spec.to_json(),
@@ -232,7 +233,8 @@ def tiny_model(torch, tmp_path, sweep_set):
     }
     torch.save(saved, tmp_path / "best.pt")
     path = tmp_path / "tiny.onnx"
-    card = export_checkpoint(tmp_path / "best.pt", path, "tiny")
+    trained = load_checkpoint(tmp_path / "best.pt")
+    card = export_checkpoint(tmp_path / "best.pt", trained, [manifest], path, "tiny")
 
     def write(**changes):
         model = onnx.load(path)

@@ -28,8 +28,8 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.stream import MOUSE, ArraySpec
-from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.export import onnx_step, streaming
+from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR, channel_limits
+from tactile_rt.export import onnx_step, streaming, streaming_parts
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
@@ -38,9 +38,9 @@ from tactile_rt.export.onnx_step import (
     step_graph,
     write_model,
 )
-from tactile_rt.models.checkpoints import TactileClassifier
+from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import windows
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead import EADConfig, TactileClassifier
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.testing import cut
@@ -58,7 +58,7 @@ NETWORK = EADConfig(classes=len(CATEGORIES), attender="gpt", width=1 / 32, reado
 def build() -> TactileClassifier:
     """Untrained, but with no parameter at a value that hides a mistake, such as zero."""
     torch.manual_seed(0)
-    model = TactileClassifier(SPEC, NETWORK).eval()
+    model = TactileClassifier(SPEC, NETWORK, channel_limits(SPEC)).eval()
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
@@ -108,6 +108,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         patch.setattr(torch.onnx, "export", remember)
         card = export_checkpoint(
             checkpoint,
+            load_checkpoint(checkpoint),
+            [manifest],
             folder / "out" / "tiny.onnx",
             "tiny",
             temperature=1.25,
@@ -185,7 +187,7 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(streaming, "LARGE", 0)
-    monkeypatch.setattr(streaming, "WIDE", 0)
+    monkeypatch.setattr(streaming_parts, "WIDE", 0)
     path = tmp_path / "wide.onnx"
     export_step(exported.model, exported.card, path)
     operators = [node.op_type for node in onnx.load(path).graph.node]

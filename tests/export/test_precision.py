@@ -23,8 +23,8 @@ from tactile_rt.classifier.model_file import (
     verify_model,
 )
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.export.graph_forms import CONTRIB, PRECISIONS, in_precision
 from tactile_rt.export.onnx_step import PARITY_BAR, parity, step_graph, write_model
-from tactile_rt.export.precision import CONTRIB, PRECISIONS, in_precision
 from tactile_rt.models.ead import EADConfig
 
 CLASSES = 6

@@ -11,8 +11,8 @@ import torch
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Timing
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
+from tactile_rt.core.stream.sensor_spec import channel_limits
+from tactile_rt.models.ead import EAD, ENCODERS, EADConfig, TactileClassifier
 from tests.helpers.small_networks import TOLERANCE, build, stream
 from tests.helpers.tiny_sweeps import plate
 
@@ -39,12 +39,14 @@ def test_a_window_and_its_steps_give_the_same_logits(
 
 def test_a_network_of_another_array_is_refused_in_one_line() -> None:
     with pytest.raises(ConfigError, match=r"30 x 5 x 7 .* does not fit an array of 6 channels on"):
-        TactileClassifier(plate(2, 4), EADConfig(3, "gru", "none", width=1 / 32))
+        spec = plate(2, 4)
+        TactileClassifier(spec, EADConfig(3, "gru", "none", width=1 / 32), channel_limits(spec))
 
 
 def test_a_classifier_knows_how_its_windows_are_cut() -> None:
     config = EADConfig(3, "gru", "none", width=1 / 32, frame=(12, 2, 4), max_steps=10)
-    model = TactileClassifier(plate(2, 4, "fx fy fz"), config)
+    spec = plate(2, 4, "fx fy fz")
+    model = TactileClassifier(spec, config, channel_limits(spec))
     assert model.timing == Timing(steps=10, substeps=4)
     samples = torch.zeros(2, 10, 4, 8, 3)
     rest = torch.zeros(2, 8, 3)

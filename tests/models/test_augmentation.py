@@ -247,7 +247,8 @@ def test_every_augmentation_can_be_built(name, masking):
     changed = not torch.equal(before[0], after[0])
     assert changed == (name == "tactile")
     x = frames()
-    y = made.frames(x, generator(4))
+    draws = generator(4)
+    y = made.mask(made.frames(x, draws), draws)
     assert y.shape == x.shape
     assert torch.equal(x, y) == (name in ("none", "tactile") and not masking)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.models.inputs import InputStage, paper_units
+from tactile_rt.models.ead import InputStage, paper_units
 from tests.helpers.tiny_sweeps import plate, tiny_array
 
 EMPTY = {(0, 5), (0, 6), (1, 5), (1, 6), (4, 6)}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig
-from tactile_rt.models.objectives import (
+from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig, TactileClassifier
+from tactile_rt.models.training.objectives import (
     Autoencoder,
     Predictive,
     SimCLR,
@@ -40,17 +40,18 @@ def loads(n=4, seed=0):
 def classifier(encoder="gru", attender="none", width=1 / 32, **other):
     torch.manual_seed(0)
     config = EADConfig(3, encoder, attender, "linear", width, max_steps=STEPS, **other)
-    return TactileClassifier(SPEC, config)
+    return TactileClassifier(SPEC, config, channel_limits(SPEC))
 
 
 def objectives(model):
     plain, tactile = build("none", SPEC), build("tactile", SPEC)
+    masked = build("none", SPEC, 0.25)
     return (
         Supervised(model, plain, "anytime", 0.1),
         SimCLR(model, tactile, 0.1),
         SimSiam(model, tactile),
         Autoencoder(model, plain),
-        Predictive(model, plain, 0.25),
+        Predictive(model, masked),
     )
 
 
@@ -143,7 +144,7 @@ def test_each_step_tells_the_four_after_it_and_has_seen_none_of_them(encoder):
 
 def test_what_is_masked_is_predicted_all_the_same():
     """Of a network that is told nothing the loss is that of the untouched frames."""
-    objective = Predictive(classifier(), build("none", SPEC), masking=0.8).eval()
+    objective = Predictive(classifier(), build("none", SPEC, 0.8)).eval()
     with torch.no_grad():
         objective.head.weight.zero_()
         objective.head.bias.zero_()

@@ -15,22 +15,22 @@ import torch
 from torch import nn
 
 from tactile_rt.core.errors import ConfigError, ModelError
-from tactile_rt.models.checkpoints import load_checkpoint, run_on
-from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation.measures import hits, predict
-from tactile_rt.models.training.batches import TrainingBatches
+from tactile_rt.models.checkpoints import load_checkpoint
+from tactile_rt.models.datasets import SweepSet, read_splits
+from tactile_rt.models.evaluation.measures import hits, predict, run_on
+from tactile_rt.models.training.batches import TrainingBatches, prefetched
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
-from tactile_rt.models.training.feeding import prefetched
-from tactile_rt.models.training.loop import build_objective, initialise, read_splits, train
-from tactile_rt.models.training.optimizers import (
+from tactile_rt.models.training.loop import initialise, train
+from tactile_rt.models.training.objectives import build_objective
+from tactile_rt.models.training.probing import linear_probe, probe
+from tactile_rt.models.training.recipes import read_recipe
+from tactile_rt.models.training.updates import (
     LARS,
     build_optimizer,
     build_schedule,
     parameter_groups,
+    replayed,
 )
-from tactile_rt.models.training.probing import linear_probe, probe
-from tactile_rt.models.training.recipes import read_recipe
-from tactile_rt.models.training.replay import replayed
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object
 from tests.helpers.tiny_sweeps import SAMPLES, write_tiny_set
@@ -216,7 +216,7 @@ def test_rates_may_change_by_epoch():
 
 def test_first_weights_are_drawn_as_published(tiny):
     config = read_recipe("paper-gated-ln", tiny, width=0.125)
-    network = build_objective(config, read_splits(config)[0]).model.network
+    network = build_objective(config, read_splits(config.folders, True)[0]).model.network
     encoder = network.encoder
     for name, bias in (("convs.conv3", 0.0), ("cells.conv3.conv", None), ("dense.fc7", 0.1)):
         part = encoder.get_submodule(name)
@@ -300,7 +300,7 @@ def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(
         tiny, encoder=encoder, width=1 / 32, objective=objective, augmentation="tactile",
         dropout=0.0, precision="fp32",
     )  # fmt: skip
-    training, _ = read_splits(config)
+    training, _ = read_splits(config.folders, True)
     learning = build_objective(config, training).cuda().train()
     batches = TrainingBatches(training, 6, 0, device="cuda")
     views = [loads for *loads, labels in [next(batches.epoch(0, v)) for v in (0, 1)]]
@@ -326,8 +326,8 @@ def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(
 
 
 def test_an_update_that_is_no_graph_is_told_and_leaves_the_objective(tiny, monkeypatch, caplog):
-    training, _ = read_splits(config := TrainingConfig(tiny, encoder="resnet18", width=1 / 32))
-    learning = build_objective(config, training)
+    training, _ = read_splits([Path(tiny)], True)
+    learning = build_objective(TrainingConfig(tiny, encoder="resnet18", width=1 / 32), training)
     *loads, labels = next(TrainingBatches(training, 6, 0).epoch(0))
     seen = learning.see([loads], torch.Generator())
     before = {name: buffer.clone() for name, buffer in learning.named_buffers()}

@@ -14,8 +14,11 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
 from tactile_rt.core.errors import ConfigError, ModelError  # noqa: E402
-from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of  # noqa: E402
-from tactile_rt.models.checkpoints import load_checkpoint  # noqa: E402
+from tactile_rt.models.checkpoints import (  # noqa: E402
+    describe_checkpoint,
+    load_checkpoint,
+    network_of,
+)
 from tactile_rt.models.ead_config import CELLS  # noqa: E402
 from tactile_rt.models.encoders import cells  # noqa: E402
 from tactile_rt.models.grid.plan import read_grid  # noqa: E402
@@ -26,9 +29,8 @@ from tactile_rt.models.training.config import (  # noqa: E402
     ProbeConfig,
     TrainingConfig,
 )
-from tactile_rt.models.training.loop import train  # noqa: E402
+from tactile_rt.models.training.loop import Validation, train  # noqa: E402
 from tactile_rt.models.training.probing import probe  # noqa: E402
-from tactile_rt.models.training.validation import Validation  # noqa: E402
 from tests.helpers.holding import held_elsewhere  # noqa: E402
 from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402
 

@@ -12,11 +12,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.cells import Cell, make_cell
 from tactile_rt.models.encoders.convolution import Convolution, convolve, convolve_valid
-from tactile_rt.models.encoders.graph import Graph, Input, Node
+from tactile_rt.models.encoders.graph import Graph, Input, Node, parse_graph
 
-__all__ = ["GraphEncoder", "draw_as_published"]
+__all__ = ["GraphEncoder", "build_encoder", "draw_as_published"]
 
 
 class Fusion(nn.Module):
@@ -274,3 +275,24 @@ def _flat(maps: Sequence[Tensor]) -> Tensor:
     sites = [m for m in maps if m.shape[:2] != (1, 1)]
     parts = [_cat(sites).movedim(2, 0).flatten(1)[None, None]] if sites else []
     return _cat(parts + [m for m in maps if m.shape[:2] == (1, 1)])
+
+
+def build_encoder(text: str, width: float, frame: tuple[int, int, int]) -> GraphEncoder:
+    """Build the encoder of a graph in TOML.
+
+    Args:
+        width: what its channel counts are multiplied by.
+        frame: channels, rows and columns of the array's frames.
+
+    Raises:
+        ConfigError: the text is no graph, or one of other frames.
+    """
+    graph = parse_graph(text)
+    read = graph.frame
+    if (found := (read.channels, read.rows, read.columns)) != frame:
+        sizes = (" x ".join(map(str, size)) for size in (found, frame))
+        raise ConfigError(
+            "the graph's {} has {} channels, rows and columns, the array's frames "
+            "{}: change the graph".format(read.name, *sizes)
+        )
+    return GraphEncoder(graph.scaled(width))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.classifier import fuse
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
+
+if TYPE_CHECKING:
+    from tactile_rt.models.ead import TactileClassifier
 
 __all__ = [
     "CutWindows",
@@ -38,6 +41,7 @@ __all__ = [
     "hits",
     "posteriors",
     "predict",
+    "run_on",
     "run_over",
 ]
 
@@ -289,3 +293,20 @@ def bootstrap(
     ]
     low, high = np.nanpercentile(values, LEVELS)
     return Interval(statistic(np.arange(len(objects))), float(low), float(high))
+
+
+def run_on(model: TactileClassifier) -> Step:
+    """The function that `predict` wants, of a torch model."""
+    import torch  # here: a model file is measured without
+
+    def run(
+        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        model.eval()
+        device = model.inputs.clip.device
+        with torch.inference_mode():
+            logits = model(*(torch.from_numpy(a).to(device) for a in (samples, offset, sigma)))
+        out: NDArray[np.float32] = logits.float().cpu().numpy()
+        return out
+
+    return run

@@ -16,12 +16,18 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoints import load_checkpoint, run_on
-from tactile_rt.models.data_checks import check_sets
-from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
+from tactile_rt.models.checkpoints import load_checkpoint
+from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
-from tactile_rt.models.evaluation.measures import CutWindows, among, cut_windows, hits, posteriors
+from tactile_rt.models.evaluation.measures import (
+    CutWindows,
+    among,
+    cut_windows,
+    hits,
+    posteriors,
+    run_on,
+)
 from tactile_rt.models.evaluation.svm import fit_svm
 from tactile_rt.models.grid.outcomes import (
     POINT,
@@ -38,8 +44,7 @@ from tactile_rt.models.grid.outcomes import (
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
-from tactile_rt.models.training.devices import launched
-from tactile_rt.models.training.loop import initialise, train
+from tactile_rt.models.training.loop import initialise, launched, train
 from tactile_rt.models.training.probing import probe
 from tactile_rt.sets.manifest import SweepManifest, check_split
 
@@ -70,7 +75,7 @@ class Workbench:
                 continue
             config = self.grid.config(task, self.data)
             build(config.augmentation, manifest.spec)
-            config.network(len(manifest.categories), frame_of(manifest))
+            config.network(len(manifest.categories), manifest.frame)
             sweeps = self.splits_of(task.cell.share)[0].sweeps
             pairs = config.pairs == TWO_SWEEPS
             check_batches(

@@ -1,23 +1,46 @@
-"""Batches of training windows: noise as the robot will have it, faults as its sensor may have."""
+"""Batches of training windows, drawn ahead of the network: noise and faults as a robot has them.
+
+A thread draws and augments them while the network computes. Everything of a batch is drawn from
+(seed, epoch, index) alone, so that neither threads nor an interruption change it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Generator as Yields
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Generator, Tensor
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.datasets import NOISE_LEVELS, SweepSet, windows
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-__all__ = ["JITTER", "TrainingBatches", "check_batches", "partners"]
+__all__ = [
+    "JITTER",
+    "Batch",
+    "BatchFeed",
+    "Share",
+    "TrainingBatches",
+    "check_batches",
+    "generator_of",
+    "partners",
+    "prefetched",
+]
 
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are drawn evenly
+CPU = torch.device("cpu")
+AHEAD = 2  # batches that wait for the network: more only take memory
+AUGMENTED = 1  # tells the draws of frames from those of loads
 JITTER = 5  # samples either side of where a window begins, unless told otherwise
 
 
@@ -128,8 +151,6 @@ class TrainingBatches:
     def _draw(
         self, at: NDArray[np.int64], rng: np.random.Generator, severity: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        import torch  # here: sets are read and checked without
-
         data, n = self._data, len(at)
         elements, channels = data.manifest.spec.shape
         faults = self._faults
@@ -172,8 +193,6 @@ class TrainingBatches:
 
     def _there(self, array: NDArray[Any]) -> Tensor:
         """In single precision, on the device."""
-        import torch
-
         tensor = torch.from_numpy(np.asarray(array, dtype=np.float32))
         if self._device == "cpu":
             return tensor
@@ -181,8 +200,6 @@ class TrainingBatches:
 
     def _normal(self, shape: Sequence[int], rng: np.random.Generator) -> Tensor:
         """Standard normal numbers on the device."""
-        import torch
-
         if self._device == "cpu":
             return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
         generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**63)))
@@ -228,3 +245,121 @@ def _noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDArray[n
     levels = np.where(which < CLEAN_SHARE, 0.0, levels)
     drawn: NDArray[np.float32] = levels.astype(np.float32)
     return drawn
+
+
+@dataclass(frozen=True)
+class Share:
+    """This device's part of every batch."""
+
+    rank: int = 0
+    devices: int = 1
+
+    def of(self, tensor: Tensor) -> Tensor:
+        """(batch, ...) -> every `devices`-th row from `rank` on, as many on every device."""
+        even = len(tensor) // self.devices * self.devices
+        return tensor[self.rank : even : self.devices]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What an update needs.
+
+    Attributes:
+        views: The loads, one or two batches of them, as `InputStage` takes them, each drawn by
+            itself.
+        labels: (batch,) The index of the category of each window.
+        generator: What the augmentation of the frames is drawn from.
+    """
+
+    views: list[Loads]
+    labels: Tensor
+    generator: Generator
+
+
+class BatchFeed:
+    """Epochs of batches, each view augmented afresh, on the device."""
+
+    def __init__(
+        self,
+        batches: TrainingBatches,
+        augmentation: Augmentation,
+        views: int,
+        seed: int,
+        share: Share,
+        device: torch.device,
+    ) -> None:
+        self._batches, self._augmentation = batches, augmentation
+        self._views, self._seed, self._share, self._device = views, seed, share, device
+        self.waited = 0.0  # s, by the network for the present epoch's batches
+
+    def __len__(self) -> int:
+        return len(self._batches)
+
+    def epoch(self, number: int) -> Yields[Batch, None, None]:
+        """The batches of an epoch."""
+        self.waited = 0.0
+        with closing(prefetched(lambda: self._draw(number))) as ready:
+            while True:
+                began = time.monotonic()
+                batch = next(ready, None)
+                self.waited += time.monotonic() - began
+                if batch is None:
+                    return
+                yield batch
+
+    def _draw(self, number: int) -> Iterator[Batch]:
+        share = self._share
+        drawn = [self._batches.epoch(number, view) for view in range(self._views)]
+        for index, batches in enumerate(zip(*drawn, strict=True)):
+            place = self._seed, number, index, share.rank
+            generator = generator_of(CPU, *place)
+            views = [
+                self._augmentation.loads((share.of(a), share.of(b), share.of(c)), generator)
+                for a, b, c, _ in batches
+            ]
+            labels = share.of(batches[0][3]).to(self._device)
+            yield Batch(views, labels, generator_of(self._device, *place, AUGMENTED))
+
+
+def generator_of(device: torch.device, *seed: int) -> Generator:
+    """A generator that any numbers seed."""
+    word = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    return Generator(device).manual_seed(word)
+
+
+def prefetched(
+    draw: Callable[[], Iterator[Batch]], ahead: int = AHEAD
+) -> Yields[Batch, None, None]:
+    """The items of `draw()`, made in a thread of their own, at most so many ahead.
+
+    What is raised there is raised here; the thread ends when the iteration is left.
+    """
+    ready: queue.Queue[Batch | BaseException | None] = queue.Queue(ahead)
+    left = threading.Event()
+
+    def put(item: Batch | BaseException | None) -> None:
+        while not left.is_set():
+            with suppress(queue.Full):
+                ready.put(item, timeout=0.1)
+                return
+
+    def work() -> None:
+        try:
+            for item in draw():
+                put(item)
+                if left.is_set():
+                    return
+            put(None)
+        except BaseException as error:
+            put(error)
+
+    thread = threading.Thread(target=work, name="batches", daemon=True)
+    thread.start()
+    try:
+        while (item := ready.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        left.set()
+        thread.join()

@@ -4,15 +4,18 @@ Needs no torch, so that what cannot be is refused before it is loaded.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from math import isfinite
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from tactile_rt.core.errors import ConfigError, ModelError, name_some
-from tactile_rt.models.checkpoint_files import NETWORK
-from tactile_rt.models.datasets import frame_of
+from tactile_rt.core.files import write_whole
+from tactile_rt.models.checkpoints import NETWORK
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
-from tactile_rt.sets.manifest import SweepManifest, check_labelled, check_split, join_manifests
+from tactile_rt.sets.manifest import read_manifests
 from tactile_rt.sets.sensor_faults import SensorFaults
 
 __all__ = [
@@ -29,7 +32,8 @@ __all__ = [
     "ProbeConfig",
     "Progress",
     "TrainingConfig",
-    "manifests_of",
+    "as_json",
+    "begin_run",
 ]
 
 OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder", "predictive")
@@ -42,6 +46,7 @@ FIRST_WEIGHTS = ("kaiming", "paper")
 RATES_PER = ("update", "epoch")
 WINDOWS = ("onset", "sweep")
 PAIRS = ONE_SWEEP, TWO_SWEEPS = ("one-sweep", "two-sweeps")
+PATHS = ("data", "also", "begin")  # keys of a configuration
 LARGEST = 1e38  # numbers of single precision end there
 
 
@@ -176,6 +181,27 @@ class TrainingConfig:
             raise ConfigError("schedule one-cycle changes the rate per update, not per epoch")
         _check_seed(self.seed)
 
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Where the sets lie that are learnt from."""
+        return tuple(map(Path, (self.data, *self.also)))
+
+    @property
+    def labelled(self) -> bool:
+        """Whether it is learnt from labels."""
+        return self.objective == "supervised"
+
+    def check_sets(self) -> None:
+        """Refuse sets that cannot be learnt from so, before anything of them is read.
+
+        Raises:
+            ConfigError: it names no network, its sets cannot be joined, or one has no labels to
+                learn from.
+            RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+        """
+        _, whole = read_manifests(self.folders, self.labelled)
+        self.network(len(whole.categories), whole.frame)
+
     def network(self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME) -> EADConfig:
         """The network's configuration for so many classes and for frames of a size.
 
@@ -186,24 +212,50 @@ class TrainingConfig:
         return EADConfig(classes=classes, frame=frame, **own)
 
 
-def manifests_of(config: TrainingConfig) -> tuple[list[SweepManifest], SweepManifest]:
-    """What the sets of a training configuration are, and all of them as one.
+def as_json(config: TrainingConfig) -> dict[str, Any]:
+    """Turn it into what a file has, which knows no tuples."""
+    plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(config)))
+    return plain
+
+
+def begin_run(config: TrainingConfig, folder: Path) -> None:
+    """Make the folder of a run, or check that the one that is there is of this very run.
 
     Raises:
-        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
-            labels to learn from.
-        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+        ConfigError: it is of another configuration, or of none that is known.
     """
-    folders = [Path(folder) for folder in (config.data, *config.also)]
-    manifests = [SweepManifest.read(folder) for folder in folders]
-    whole = join_manifests(manifests)
-    config.network(len(whole.categories), frame_of(whole))
-    for folder, manifest in zip(folders, manifests, strict=True):
-        if config.objective == "supervised":
-            check_labelled(folder, manifest)
-        check_split(folder, manifest)
-    check_split(folders[0], whole)
-    return manifests, whole
+    folder.mkdir(parents=True, exist_ok=True)
+    path, mine = folder / "config.json", as_json(config)
+    # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
+    if not (folder / "last.pt").exists():
+        text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
+        write_whole(path, lambda file: file.write(text))
+        return
+    try:
+        theirs = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path} is gone, so that nobody knows what run this is: choose another folder, or "
+            f"delete {folder / 'last.pt'} to begin anew"
+        ) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
+    differing = [
+        key for key in {**mine, **theirs} if not _same(key, theirs.get(key), mine.get(key))
+    ]
+    if differing:
+        raise ConfigError(
+            f"{folder} holds a run of another configuration (other {name_some(differing)}): choose "
+            "another folder, or repeat the options that began it"
+        )
+
+
+def _same(key: str, one: Any, other: Any) -> bool:
+    """Compare two values of a key; a path may be spelt in several ways."""
+    if key in PATHS and one and other:
+        names = [[value] if isinstance(value, str) else value for value in (one, other)]
+        one, other = ([str(Path(name).resolve()) for name in some] for some in names)
+    return bool(one == other)
 
 
 @dataclass(frozen=True)

@@ -6,59 +6,57 @@ that was not. Under torchrun every process has a share of each batch:
     torchrun --nproc-per-node 2 --no-python tactile-rt train data/default24 runs/mine
 """
 
+import logging
+import os
 import time
-from collections.abc import Callable
-from contextlib import closing, nullcontext
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict
 from itertools import islice
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import alone_in
-from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoint_files import describe_checkpoint
-from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
-from tactile_rt.models.data_checks import check_sets
-from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of, joined, relabelled
-from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
-from tactile_rt.models.objectives import (
-    Autoencoder,
-    Objective,
-    Predictive,
-    SimCLR,
-    SimSiam,
-    Supervised,
+from tactile_rt.models.augmentation import Augmentation, Loads
+from tactile_rt.models.checkpoints import begin_from, fill_checkpoint, save_whole
+from tactile_rt.models.datasets import SweepSet, drawn_as, read_splits, windows
+from tactile_rt.models.disturbances import CLEAN, RATED
+from tactile_rt.models.evaluation.measures import among, cut_windows, hits, posteriors, run_on
+from tactile_rt.models.training.batches import (
+    BatchFeed,
+    Share,
+    TrainingBatches,
+    generator_of,
+    partners,
 )
-from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.models.training.config import (
     TWO_SWEEPS,
     DivergedError,
     Progress,
     TrainingConfig,
-    manifests_of,
+    as_json,
+    begin_run,
 )
-from tactile_rt.models.training.devices import is_first, launched
-from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
-from tactile_rt.models.training.optimizers import build_optimizer
-from tactile_rt.models.training.replay import batch_loss
-from tactile_rt.models.training.resuming import RunState, as_json, begin_run, log_epoch
-from tactile_rt.models.training.validation import Validation
-from tactile_rt.sets.manifest import OUTLIERS, trained_objects
+from tactile_rt.models.training.objectives import Objective, build_objective
+from tactile_rt.models.training.updates import RunState, batch_loss, log_epoch
+from tactile_rt.sets.manifest import trained_objects
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
-__all__ = ["build_objective", "initialise", "labels_of", "read_splits", "train"]
+__all__ = ["Validation", "initialise", "launched", "train"]
 
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
-AUGMENTED = 1  # tells the draws of frames from those of loads
+VIEWS, FRAMES = 2**32, 2**32 + 1  # epochs that no training reaches: their draws are others
+Score = tuple[dict[str, float], float]
 
 
 def train(
@@ -84,7 +82,7 @@ def train(
         OSError: the medium is full, or failed; the last checkpoint is as it was.
     """
     with (
-        alone_in(folder) if is_first() else nullcontext(),
+        alone_in(folder) if _is_first() else nullcontext(),
         launched(config, device) as fabric,
     ):
         return _train(fabric, config, folder, report, splits)
@@ -98,12 +96,12 @@ def _train(
     splits: Splits | None,
 ) -> Path:
     torch.manual_seed(config.seed)
-    training, validating = (drawn_as(one, asdict(config)) for one in splits or read_splits(config))
+    training, validating = _take_splits(config, splits)
     objective = build_objective(config, training)
+    before = None
     if config.begin:
-        begin_from(objective.model, Path(config.begin), labels_of(training))
-    before = describe_checkpoint(Path(config.begin)) if config.begin else None
-    met = trained_objects(manifests_of(config)[0], before)
+        before = begin_from(objective.model, Path(config.begin), training.classes)
+    met = trained_objects(training.manifests, before)
     share = Share(fabric.global_rank, fabric.world_size)
     two_sweeps = config.pairs == TWO_SWEEPS
     batches = TrainingBatches(
@@ -115,14 +113,14 @@ def _train(
     augmentation = objective.augmentation
     feed = BatchFeed(batches, augmentation, objective.views, config.seed, share, fabric.device)
     validate = Validation(config, validating, augmentation, share, fabric.device)
-    optimizer = build_optimizer(objective, config)
-    run = RunState(objective, optimizer, config, len(batches))
+    run = RunState(objective, config, len(batches))
+    settings = as_json(config)
     if fabric.is_global_zero:
         begin_run(config, folder)  # when all that may be refused has been
     fabric.barrier()
     run.resume(folder)
-    wrapped, _ = fabric.setup(objective, optimizer)
-    loss_of = batch_loss(fabric, wrapped, objective, config, feed)
+    wrapped, _ = fabric.setup(objective, run.optimizer)
+    loss_of = batch_loss(fabric, wrapped, objective, feed, config.precision == "bf16")
 
     while run.done < run.updates:
         epoch, began, losses = run.epoch, time.monotonic(), []
@@ -131,15 +129,12 @@ def _train(
         objective.train()
         with closing(feed.epoch(epoch)) as drawn:
             for batch in islice(drawn, run.updates - run.done):
-                generator = generator_of(
-                    fabric.device, config.seed, epoch, batch.index, share.rank, AUGMENTED
-                )
-                loss = loss_of(batch, generator)
-                optimizer.zero_grad()
+                loss = loss_of(batch)
+                run.optimizer.zero_grad()
                 fabric.backward(loss)
                 norm = fabric.clip_gradients(
                     wrapped,
-                    optimizer,
+                    run.optimizer,
                     max_norm=config.clip_norm or inf,
                     error_if_nonfinite=False,
                 )
@@ -150,7 +145,7 @@ def _train(
                         f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
                         f"try a learning rate below {config.learning_rate:g}"
                     )
-                optimizer.step()
+                run.optimizer.step()
                 run.schedule.step()
                 run.done += 1
                 losses.append(loss.item())
@@ -174,7 +169,9 @@ def _train(
         better, run.best = score >= run.best, max(score, run.best)
         if fabric.is_global_zero:
             if better:
-                save_whole(folder / "best.pt", _card(config, objective, training, met, metrics))
+                model, refusals = objective.model, training.refusals
+                best = fill_checkpoint(model, training.manifest, refusals, settings, met, metrics)
+                save_whole(folder / "best.pt", best)
             log_epoch(folder / "history.csv", metrics)
             save_whole(folder / "last.pt", run.state())
         shown = {**metrics, "waiting": feed.waited / metrics["seconds"]}
@@ -186,66 +183,20 @@ def _train(
 def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:
     """A run's network as it is before its first update, as a `best.pt`; of the same seed."""
     torch.manual_seed(config.seed)
-    training = drawn_as((splits or read_splits(config))[0], asdict(config))
-    objective = build_objective(config, training)
+    training, _ = _take_splits(config, splits)
+    model = build_objective(config, training).model
     folder.mkdir(parents=True, exist_ok=True)
-    save_whole(folder / "best.pt", _card(config, objective, training, {}, {"epoch": 0}))
+    settings, manifest = as_json(config), training.manifest
+    begun = fill_checkpoint(model, manifest, training.refusals, settings, {}, {"epoch": 0})
+    save_whole(folder / "best.pt", begun)
     return folder / "best.pt"
 
 
-def read_splits(config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
-    """What a configuration trains and validates on, held against `data_checks`.
-
-    What it trains on has the outliers of the sets, too.
-
-    Raises:
-        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
-            labels to learn from.
-        RecordingError: a set is missing, unfinished, damaged or unfit.
-    """
-    folders = [Path(folder) for folder in (config.data, *config.also)]
-    manifests, whole = manifests_of(config)
-    training, validating = [], []
-    for folder, manifest in zip(folders, manifests, strict=True):
-        names = ["train", *([OUTLIERS] if manifest.split.get(OUTLIERS) else [])]
-        splits = [joined([SweepSet.read(folder, name) for name in names])]
-        if manifest.split.get("validation") or len(folders) == 1:  # a further set may have none
-            splits.append(SweepSet.read(folder, "validation"))
-        check_sets(folder, splits)
-        training.append(splits[0])
-        validating += splits[1:]
-    if not validating:
-        raise RecordingError(f"{folders[0]} and the sets beside it have no validation objects")
-    return joined(training), relabelled(joined(validating), whole.categories)
-
-
-def labels_of(training: SweepSet) -> tuple[str, ...]:
-    """The names of what a network that learns from these sweeps tells apart: last the refusals."""
-    return (*training.manifest.categories, *training.refusals)
-
-
-def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
-    """The network of a configuration and what it is trained for.
-
-    Raises:
-        ConfigError: there is no such network, or the array cannot be augmented so.
-    """
-    manifest = training.manifest
-    network = config.network(len(labels_of(training)), frame_of(manifest))
-    model = TactileClassifier(manifest.spec, network, manifest.limits)
-    if config.first_weights == "paper" and isinstance(model.network.encoder, GraphEncoder):
-        draw_as_published(model.network.encoder)
-    predictive = config.objective == "predictive"
-    masking = 0.0 if predictive else config.masking  # what it predicts is not blanked
-    augmentation = build(config.augmentation, manifest.spec, masking)
-    if config.objective == "supervised":
-        return Supervised(model, augmentation, config.loss, config.label_smoothing)
-    model.network.decoder.requires_grad_(False)  # it has no part in these
-    if predictive:
-        return Predictive(model, augmentation, config.masking)
-    if config.objective == "simclr":
-        return SimCLR(model, augmentation, config.temperature)
-    return {"simsiam": SimSiam, "autoencoder": Autoencoder}[config.objective](model, augmentation)
+def _take_splits(config: TrainingConfig, splits: Splits | None) -> Splits:
+    """The splits to train and to validate on, as a configuration draws them."""
+    training, validating = splits or read_splits(config.folders, config.labelled)
+    drawn = asdict(config)
+    return drawn_as(training, drawn), drawn_as(validating, drawn)
 
 
 def _mean(fabric: "Fabric", losses: list[float]) -> float:
@@ -258,21 +209,141 @@ def _mean(fabric: "Fabric", losses: list[float]) -> float:
     return shared.item()
 
 
-def _card(
-    config: TrainingConfig,
-    objective: Objective,
-    data: SweepSet,
-    met: dict[str, list[str]],
-    metrics: dict[str, float],
-) -> dict[str, Any]:
-    return {
-        "model": objective.model.state_dict(),
-        "config": as_json(config),
-        "network": msgspec.to_builtins(objective.model.network.config),
-        "spec": data.manifest.spec.to_json(),
-        "period_ns": data.manifest.period_ns,
-        "categories": list(data.manifest.categories),
-        "refusals": list(data.refusals),
-        "trained_objects": met,
-        "metrics": metrics,
-    }
+def _is_first() -> bool:
+    """Tell whether this process is the one that writes: of torchrun's it is the first."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+@contextmanager
+def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
+    """The devices of a run, together until the block ends.
+
+    Args:
+        device: "auto", "cpu", "cuda", ...
+
+    Raises:
+        ConfigError: a batch is too small to be shared, or there is no such device here.
+    """
+    # Imported here: seconds that whoever only loads a checkpoint need not spend.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from lightning.fabric import Fabric
+        from lightning.fabric.strategies.ddp import DDPStrategy
+
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    if (config.batch < 2 * size and config.objective != "supervised") or config.batch < size:
+        raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
+    for name in ("lightning.fabric", "lightning.pytorch"):  # a run says enough itself
+        logging.getLogger(name).setLevel(logging.WARNING)
+    # Of kernels of 1 x 1, whose numbers lie alike whichever strides they are told to have.
+    warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
+    try:
+        fabric = Fabric(
+            accelerator=device,
+            devices=local,
+            num_nodes=size // local,
+            # Static: some layers of some networks (a position never reached) have no part in a
+            # window, and always the same ones.
+            strategy=DDPStrategy(static_graph=True) if size > 1 else "auto",
+        )
+    # no such kind; none of it in this machine; none of what it needs
+    except (ValueError, RuntimeError, ModuleNotFoundError) as error:
+        raise ConfigError(f"accelerator is {device!r}: {error}") from None
+    joined = torch.distributed.is_available() and torch.distributed.is_initialized()
+    fabric.launch()
+    try:
+        yield fabric
+    finally:
+        if size > 1 and not joined:
+            torch.distributed.destroy_process_group()
+
+
+class Validation:
+    """Measures an objective on the validation split.
+
+    Supervised: top-1 without and with rated noise; the score is their mean, since a robot's
+    sensor is somewhere between, or the former alone where training draws no noise. Self-supervised:
+    the loss, augmented alike every time; the score is its negative.
+
+    Args:
+        share: this device's of every batch.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        data: SweepSet,
+        augmentation: Augmentation,
+        share: Share,
+        device: torch.device,
+    ) -> None:
+        self._config, self._data, self._augmentation = config, data, augmentation
+        self._share, self._device = share, device
+        supervised = config.objective == "supervised"
+        self._measure: Callable[[Objective], Score] = self._top1 if supervised else self._loss
+        if supervised:
+            # Cut once, since they are the same after every epoch.
+            self._clean, self._noisy = (
+                list(cut_windows(data, disturbance=one)) for one in (CLEAN, RATED)
+            )
+        else:
+            self._found = data.onsets(data.sweeps.values)
+            usable = self._usable = np.flatnonzero(self._found.start >= 0)
+            if not len(usable):
+                raise ConfigError("in no validation sweep was a touch found: make more sweeps")
+            self._other = np.arange(len(data.sweeps))  # what the second view is of
+            if config.pairs == TWO_SWEEPS:
+                rng = np.random.default_rng([config.seed, VIEWS])
+                self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
+
+    def __call__(self, objective: Objective) -> Score:
+        """Metrics by name, and the score: the higher the better; NaN if it answers no numbers."""
+        objective.eval()
+        return self._measure(objective)
+
+    def _top1(self, objective: Objective) -> Score:
+        data, run = self._data, run_on(objective.model)
+        labels, classes = data.sweeps.labels, len(data.manifest.categories)
+        shares = []
+        for cut in (self._clean, self._noisy):
+            answers = posteriors(cut, run)[:, -1]
+            touched = np.concatenate([one.detected for one in cut])
+            if not np.isfinite(answers[touched]).all():
+                return {}, nan  # it overflows: no gradient says so, if training's windows do not
+            # Whether a model may refuse to decide is another question.
+            shares.append(hits(among(answers, classes), labels).mean())
+        clean, noisy = shares
+        metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
+        return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
+
+    def _cut(self, at: NDArray[np.int64]) -> Loads:
+        """This device's share of some sweeps' windows, as `InputStage` takes them."""
+        cut = windows(self._data.sweeps.values[at], self._found.start[at], self._data.timing)
+        arrays = cut, self._found.offset[at], self._found.sigma[at]
+        samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
+        return samples, offset, sigma
+
+    @torch.inference_mode()
+    def _loss(self, objective: Objective) -> Score:
+        data, config = self._data, self._config
+        # Whole batches, as far as there are any: a contrast is as hard as its batch is large.
+        parts = max(len(self._usable) // config.batch, 1)
+        total = torch.zeros((), device=self._device)
+        for index, at in enumerate(np.array_split(self._usable, parts)):
+            place = index, self._share.rank
+            drawn = generator_of(torch.device("cpu"), config.seed, VIEWS, *place)
+            views = [
+                self._augmentation.loads(self._cut(one), drawn)
+                for one in (at, self._other[at])[: objective.views]
+            ]
+            views = [
+                (a.to(self._device), b.to(self._device), c.to(self._device)) for a, b, c in views
+            ]
+            frames = generator_of(self._device, config.seed, FRAMES, *place)
+            labels = self._share.of(torch.from_numpy(data.sweeps.labels[at])).to(self._device)
+            total += objective(views, labels, frames) / parts
+        if self._share.devices > 1:
+            torch.distributed.all_reduce(total)
+            total /= self._share.devices
+        return {"validation_loss": float(total)}, -float(total)

@@ -8,20 +8,19 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import msgspec
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import alone_in
-from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
-from tactile_rt.models.data_checks import check_sets, probed_on
-from tactile_rt.models.datasets import SweepSet, drawn_as, of_categories, windows
-from tactile_rt.models.evaluation.measures import hits, predict
+from tactile_rt.models.checkpoints import fill_checkpoint, load_checkpoint, probed_on, save_whole
+from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as, of_categories, windows
+from tactile_rt.models.ead import TactileClassifier
+from tactile_rt.models.evaluation.measures import hits, predict, run_on
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
-from tactile_rt.models.training.resuming import log_epoch
+from tactile_rt.models.training.updates import log_epoch
 from tactile_rt.sets.manifest import check_split, trained_objects
 
 __all__ = ["linear_probe", "probe"]
@@ -100,24 +99,11 @@ def _probe(
     folder.mkdir(parents=True, exist_ok=True)
     for line in history:
         log_epoch(folder / "history.csv", line)
-    card = {
-        "model": model.state_dict(),
-        "config": {
-            **saved["config"],
-            "data": str(path),
-            "also": (),
-            "begin": "",
-            "probe": asdict(config),
-        },
-        "network": msgspec.to_builtins(network),
-        "spec": manifest.spec.to_json(),
-        "period_ns": manifest.period_ns,
-        "categories": list(manifest.categories),
-        "refusals": [],
-        "trained_objects": trained_objects([manifest], saved),
-        "metrics": metrics,
-    }
-    save_whole(folder / "best.pt", card)
+    told = {
+        **saved["config"], "data": str(path), "also": (), "begin": "", "probe": asdict(config)
+    }  # fmt: skip
+    met = trained_objects([manifest], saved)
+    save_whole(folder / "best.pt", fill_checkpoint(model, manifest, (), told, met, metrics))
     report(Progress(config.epochs, config.epochs, 1, 1, metrics["loss"], metrics))
     return folder / "best.pt"
 

@@ -1,4 +1,8 @@
-"""Smaller files and integer products: an exported graph's weights in fewer bits.
+"""Other forms of an exported step: its weights in fewer bits, and a whole window at once.
+
+window: a whole episode in, logits and embedding of every step out. It is the streaming step, run
+by ONNX's own `Scan` over the steps of the window from a zero state: so the two forms cannot differ,
+and the file is no larger than one step.
 
 fp16, bf16: the weights of products are stored in 16 bits and cast back when the file is loaded:
 half the size, the same speed.
@@ -13,22 +17,24 @@ per map. States, norms, biases and sums stay in single precision.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import helper, numpy_helper
+from onnx import TensorProto, helper, numpy_helper
 
+from tactile_rt.classifier.model_card import StateTensor
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["PRECISIONS", "Precision", "in_precision"]
+__all__ = ["PRECISIONS", "Precision", "in_precision", "window_graph"]
 
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "fp16", "bf16", "int8")
 BLOCK, LEAST_BLOCK = 128, 16  # inputs that share a scale; onnxruntime wants a power of two
 SMALL = 1024  # weights of fewer numbers stay as they are
+OUTPUTS = ("logits", "embedding")
 CONTRIB = "com.microsoft"  # onnxruntime's own operators, which every build of it has
 
 
@@ -53,7 +59,7 @@ def _store(proto: onnx.ModelProto, precision: Precision) -> None:
     """Weights in 16 bits, each with a Cast that is folded when the file is loaded."""
     casts = []
     for weight in proto.graph.initializer:
-        if weight.data_type != onnx.TensorProto.FLOAT or np.prod(weight.dims) < SMALL:
+        if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < SMALL:
             continue
         values = numpy_helper.to_array(weight)
         name = weight.name
@@ -67,20 +73,18 @@ def _store(proto: onnx.ModelProto, precision: Precision) -> None:
         else:
             weight.CopyFrom(_bfloat16(values, f"{name}_16"))
         casts.append(
-            helper.make_node(
-                "Cast", [weight.name], [name], f"{name}_cast", to=onnx.TensorProto.FLOAT
-            )
+            helper.make_node("Cast", [weight.name], [name], f"{name}_cast", to=TensorProto.FLOAT)
         )
     nodes = [*casts, *proto.graph.node]
     del proto.graph.node[:]
     proto.graph.node.extend(nodes)
 
 
-def _bfloat16(values: NDArray[np.float32], name: str) -> onnx.TensorProto:
+def _bfloat16(values: NDArray[np.float32], name: str) -> TensorProto:
     """Rounded to nearest, ties to even."""
     bits = np.ascontiguousarray(values).view(np.uint32)
     rounded = (bits + 0x7FFF + ((bits >> 16) & 1)) >> 16
-    tensor = onnx.TensorProto(name=name, data_type=onnx.TensorProto.BFLOAT16, dims=values.shape)
+    tensor = TensorProto(name=name, data_type=TensorProto.BFLOAT16, dims=values.shape)
     tensor.raw_data = rounded.astype("<u2").tobytes()
     return tensor
 
@@ -91,7 +95,7 @@ def _quantise(proto: onnx.ModelProto) -> None:
     makers = {output: node for node in graph.node for output in node.output}
     nodes: list[onnx.NodeProto] = []
     biases = _biases(graph, weights)
-    added: dict[str, onnx.TensorProto] = {}
+    added: dict[str, TensorProto] = {}
     gathered: dict[str, tuple[str, str, str]] = {}
     for node in graph.node:
         weight = weights.get(node.input[1]) if node.op_type in ("MatMul", "Gemm") else None
@@ -123,7 +127,7 @@ def _quantise(proto: onnx.ModelProto) -> None:
 
 
 def _blocks(
-    node: onnx.NodeProto, values: NDArray[np.float32], added: dict[str, onnx.TensorProto]
+    node: onnx.NodeProto, values: NDArray[np.float32], added: dict[str, TensorProto]
 ) -> Iterator[onnx.NodeProto]:
     """x (..., inputs) times weights (inputs, outputs), the weights in blocks of inputs."""
     inputs, outputs = values.shape
@@ -161,7 +165,7 @@ def _integer(
     node: onnx.NodeProto,
     values: NDArray[np.float32],
     taps: tuple[onnx.NodeProto, ...],
-    added: dict[str, onnx.TensorProto],
+    added: dict[str, TensorProto],
     gathered: dict[str, tuple[str, str, str]],
     bias: tuple[str, str] | None,
 ) -> Iterator[onnx.NodeProto]:
@@ -203,9 +207,7 @@ def _integer(
     )
 
 
-def _biases(
-    graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
-) -> dict[str, tuple[str, str]]:
+def _biases(graph: onnx.GraphProto, weights: dict[str, TensorProto]) -> dict[str, tuple[str, str]]:
     """By product: the vector that is added to it, where it has no other use, and their sum."""
     uses = Counter(name for node in graph.node for name in node.input)
     uses.update(output.name for output in graph.output)
@@ -244,3 +246,88 @@ def _used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto
             kept.append(node)
             needed.update(node.input)
     return kept[::-1]
+
+
+def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.ModelProto:
+    """A model of kind "window" from the step that `onnx_step.step_graph` made.
+
+    samples (batch, step, sub-step, element, channel), offset and sigma as for the step
+    -> logits (batch, step, class), embedding (batch, step, unit)
+    """
+    graph = step.graph
+    values = {value.name: value for value in (*graph.input, *graph.output)}
+    # The loop's body sees offset and sigma from outside; other names it may not share with outside.
+    inside = {name: f"scan_{name}" for name in ("samples", *OUTPUTS, *(s.name for s in state))}
+    nodes = []
+    for node in graph.node:
+        copy = onnx.NodeProto()
+        copy.CopyFrom(node)
+        copy.input[:] = [inside.get(name, name) for name in node.input]
+        copy.output[:] = [inside.get(name, name) for name in node.output]
+        nodes.append(copy)
+    body = helper.make_graph(
+        nodes,
+        "step",
+        [_named(values[name], inside[name]) for name in (*(s.name for s in state), "samples")],
+        [values[f"{s.name}_next"] for s in state]
+        + [_named(values[name], inside[name]) for name in OUTPUTS],
+        list(graph.initializer),
+        value_info=list(graph.value_info),
+    )
+    outer = [
+        helper.make_node("Shape", ["offset"], ["batch_size"], start=0, end=1),
+    ]
+    shapes = []
+    for s in state:
+        shapes.append(numpy_helper.from_array(np.array(s.shape, dtype=np.int64), f"{s.name}_size"))
+        outer.append(
+            helper.make_node(
+                "Concat", ["batch_size", f"{s.name}_size"], [f"{s.name}_shape"], axis=0
+            )
+        )
+        zero = numpy_helper.from_array(np.zeros(1, dtype=s.dtype))
+        outer.append(
+            helper.make_node(
+                "ConstantOfShape", [f"{s.name}_shape"], [f"{s.name}_start"], value=zero
+            )
+        )
+    outer.append(
+        helper.make_node(
+            "Scan",
+            [*(f"{s.name}_start" for s in state), "samples"],
+            [*(f"{s.name}_last" for s in state), *OUTPUTS],
+            body=body,
+            num_scan_inputs=1,
+            scan_input_axes=[1],
+            scan_output_axes=[1] * len(OUTPUTS),
+        )
+    )
+    sample = values["samples"].type.tensor_type.shape.dim
+    sizes = [sample[i].dim_value for i in range(1, 4)]
+    out = helper.make_graph(
+        outer,
+        "window",
+        [
+            helper.make_tensor_value_info("samples", TensorProto.FLOAT, ["batch", "step", *sizes]),
+            values["offset"],
+            values["sigma"],
+        ],
+        [_of_every_step(values[name]) for name in OUTPUTS],
+        shapes,
+    )
+    model = helper.make_model(out, opset_imports=step.opset_import, ir_version=step.ir_version)
+    model.producer_name, model.producer_version = step.producer_name, step.producer_version
+    return model
+
+
+def _of_every_step(value: onnx.ValueInfoProto) -> onnx.ValueInfoProto:
+    """(batch, number) -> (batch, step, number)"""
+    number = value.type.tensor_type.shape.dim[1].dim_value
+    return helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["batch", "step", number])
+
+
+def _named(value: onnx.ValueInfoProto, name: str) -> onnx.ValueInfoProto:
+    copy = onnx.ValueInfoProto()
+    copy.CopyFrom(value)
+    copy.name = name
+    return copy

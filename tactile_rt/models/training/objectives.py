@@ -21,6 +21,8 @@ At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
 2025-tactile-whisking).
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 
@@ -28,8 +30,11 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.augmentation import Augmentation, Loads, mask_steps
-from tactile_rt.models.checkpoints import TactileClassifier
+from tactile_rt.models.augmentation import Augmentation, Loads, build
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.ead import TactileClassifier
+from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
+from tactile_rt.models.training.config import TrainingConfig
 
 __all__ = [
     "Autoencoder",
@@ -39,6 +44,7 @@ __all__ = [
     "SimSiam",
     "Supervised",
     "anytime_loss",
+    "build_objective",
     "last_loss",
     "nt_xent",
 ]
@@ -51,6 +57,27 @@ NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
 DECONVOLUTIONS = 3
 PREDICTED = 4  # steps from each on that `Predictive` tells
 SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
+
+
+def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
+    """Build the network of a configuration and what it is trained for.
+
+    Raises:
+        ConfigError: there is no such network, or the array cannot be augmented so.
+    """
+    manifest = training.manifest
+    network = config.network(len(training.classes), manifest.frame)
+    model = TactileClassifier(manifest.spec, network, manifest.limits)
+    if config.first_weights == "paper" and isinstance(model.network.encoder, GraphEncoder):
+        draw_as_published(model.network.encoder)
+    augmentation = build(config.augmentation, manifest.spec, config.masking)
+    if config.labelled:
+        return Supervised(model, augmentation, config.loss, config.label_smoothing)
+    model.network.decoder.requires_grad_(False)  # it has no part in these
+    if config.objective == "simclr":
+        return SimCLR(model, augmentation, config.temperature)
+    kinds = {"simsiam": SimSiam, "autoencoder": Autoencoder, "predictive": Predictive}
+    return kinds[config.objective](model, augmentation)
 
 
 class Objective(nn.Module):
@@ -84,12 +111,13 @@ class Objective(nn.Module):
         return features[:, -1]
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
-        """What `loss` takes of a batch: the augmented frames of every view.
+        """Make what `loss` takes of a batch: the augmented frames of every view.
 
         Args:
             views: `self.views` batches of loads, SI.
         """
-        return [self.frames(view, generator) for view in views]
+        mask = self.augmentation.mask
+        return [mask(self.frames(view, generator), generator) for view in views]
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         """The loss of a batch of what `see` gave and labels (batch,)."""
@@ -170,7 +198,7 @@ class SimCLR(Objective):
     ) -> None:
         super().__init__(model, augmentation)
         self._temperature = temperature
-        width, features = model.network.config.width, model.feature_size()
+        width, features = model.network.config.width, model.network.feature_size
         hidden, out = _scaled(CONTRASTED[0], width), _scaled(CONTRASTED[1], width, LEAST)
         self.neck = nn.Sequential(
             nn.Linear(features, hidden, bias=False),
@@ -220,7 +248,7 @@ class SimSiam(Objective):
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
         super().__init__(model, augmentation)
-        width, features = model.network.config.width, model.feature_size()
+        width, features = model.network.config.width, model.network.feature_size
         out, hidden = _scaled(PROJECTED, width), _scaled(BOTTLENECK, width)
         self.projector = nn.Sequential(
             nn.Linear(features, out),
@@ -259,7 +287,7 @@ class Autoencoder(Objective):
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
         super().__init__(model, augmentation)
-        features, (channels, *grid) = model.feature_size(), model.network.config.frame
+        features, (channels, *grid) = model.network.feature_size, model.network.config.frame
         cells = grid[0] * grid[1]
         first = min(channels, features // cells + 1)
         layers: list[nn.Module] = [
@@ -284,26 +312,20 @@ class Predictive(Objective):
     """From what each step has felt, a linear layer tells the frames of the next four steps.
 
     A network never sees later steps, so all that is to come is hidden from it at every step at
-    once. The loss is the mean squared error of the normalised frames, over all that the steps that
-    can know anything tell of later ones in the window.
-
-    Args:
-        masking: the share of the steps, 0 to 1, that the network does not see and that are
-            predicted all the same.
+    once, and steps that are masked are predicted all the same. The loss is the mean squared error
+    of the normalised frames, over all that the steps that can know anything tell of later ones in
+    the window.
     """
 
-    def __init__(
-        self, model: TactileClassifier, augmentation: Augmentation, masking: float = 0.0
-    ) -> None:
+    def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
         super().__init__(model, augmentation)
-        self._masking = masking
         channels, rows, columns = model.network.config.frame
-        self.head = nn.Linear(model.feature_size(), PREDICTED * channels * rows * columns)
+        self.head = nn.Linear(model.network.feature_size, PREDICTED * channels * rows * columns)
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
         """The frames that are to be told, and those that the network sees."""
-        (frames,) = super().see(views, generator)
-        return [frames, mask_steps(frames, self._masking, generator) if self._masking else frames]
+        (frames,) = (self.frames(view, generator) for view in views)
+        return [frames, self.augmentation.mask(frames, generator)]
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         frames, shown = seen  # (batch, step, channel, row, column) each
@@ -318,7 +340,7 @@ class Predictive(Objective):
 
 
 def _in_single_precision(like: Tensor) -> torch.autocast:
-    """Where losses are computed: mixed precision ends at the network's output."""
+    """Compute losses in it: mixed precision ends at the network's output."""
     return torch.autocast(like.device.type, enabled=False)
 
 

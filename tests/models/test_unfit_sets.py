@@ -13,8 +13,7 @@ from tests.helpers.tiny_sweeps import write_tiny_set
 
 pytest.importorskip("torch")
 
-from tactile_rt.models.data_checks import check_sets
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, check_sets
 
 
 @pytest.fixture

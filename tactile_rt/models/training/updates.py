@@ -1,0 +1,379 @@
+"""Updates of a network: their loss, optimizer and schedule, and how many of a run are done.
+
+An update of a recurrent network is thousands of kernels, each of which takes longer to start than
+to run: on a GPU a graph of them is started once. Optimizers and schedules are those of the paper's
+Table A2, and the ones of the shipped recipe. A parameter may carry its own settings (state-space
+models want them), as in ``parameter._optim = {"lr_scale": 0.1, "weight_decay": 0.0}``; equal
+settings share a group. With ``"stacked"`` each of its rows is a norm's, and would be a tensor of
+its own elsewhere.
+
+A run's folder holds `last.pt` and a line of `history.csv`, written after each epoch: a run that is
+killed goes on from there and ends with the same numbers.
+"""
+
+import csv
+import io
+import logging
+import math
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
+
+from tactile_rt.core.errors import ModelError
+from tactile_rt.core.files import replaced
+from tactile_rt.models.checkpoints import describe_checkpoint, reason
+from tactile_rt.models.training.batches import Batch, BatchFeed
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.objectives import Objective
+
+if TYPE_CHECKING:
+    from lightning.fabric import Fabric
+
+__all__ = [
+    "LARS",
+    "RunState",
+    "batch_loss",
+    "build_optimizer",
+    "build_schedule",
+    "log_epoch",
+    "logged_epochs",
+    "parameter_groups",
+    "replayed",
+]
+
+MOMENTUM = 0.9
+WARMUP_RATIO = 1e-4  # of "cosine-annealing": the rate begins above it
+TRUST = 1e-3  # LARS's coefficient (You et al. 2017)
+
+
+@dataclass
+class RunState:
+    """How far a run is, and all that it takes to go on.
+
+    Attributes:
+        epoch, done: The numbers of epochs and of updates that are done.
+    """
+
+    objective: Objective
+    config: TrainingConfig
+    per_epoch: int
+    epoch: int = 0
+    done: int = 0
+    best: float = -math.inf
+
+    def __post_init__(self) -> None:
+        self.updates = self.config.updates or self.config.epochs * self.per_epoch
+        self.epochs = math.ceil(self.updates / self.per_epoch)
+        self.optimizer = build_optimizer(self.objective, self.config)
+        self.schedule: LRScheduler = build_schedule(
+            self.optimizer, self.config, self.updates, self.per_epoch
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Gather what `last.pt` holds."""
+        return {
+            "model": self.objective.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "epoch": self.epoch,
+            "done": self.done,
+            "best": self.best,
+        }
+
+    def resume(self, folder: Path) -> None:
+        """Go on from the `last.pt` of a folder, if there is one.
+
+        Raises:
+            ModelError: it, `best.pt` or `history.csv` is damaged, or the best network is gone.
+        """
+        last = folder / "last.pt"
+        if not last.exists():
+            return
+        try:
+            saved = torch.load(last, map_location="cpu", weights_only=True)
+            self.objective.load_state_dict(saved["model"])
+            self.optimizer.load_state_dict(saved["optimizer"])
+            self.schedule.load_state_dict(saved["schedule"])
+            self.epoch, self.done, self.best = saved["epoch"], saved["done"], saved["best"]
+        except Exception as error:  # torch raises many unrelated types for a damaged file
+            raise ModelError(
+                f"{last} is damaged ({reason(error)[:60]}): delete it to begin the run anew"
+            ) from None
+        try:
+            describe_checkpoint(folder / "best.pt")
+        except ModelError as error:
+            raise ModelError(f"{error}: delete {last} to begin the run anew") from None
+        logged_epochs(folder / "history.csv", until=self.epoch + 1)  # else told after an epoch
+
+
+def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
+    """Read the lines of a run's `history.csv` before an epoch.
+
+    Raises:
+        ModelError: it is damaged, or lines are missing.
+    """
+    if until <= 1 or not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.DictReader(file, strict=True))
+        epochs = [int(line["epoch"]) for line in lines]
+        whole = epochs[-1] >= until - 1 and all(b == a + 1 for a, b in pairwise(epochs))
+    except (UnicodeDecodeError, csv.Error, IndexError, KeyError, TypeError, ValueError):
+        whole = False
+    if not whole:
+        raise ModelError(f"{path} is damaged: delete it to go on without what it tells")
+    return [line for line, epoch in zip(lines, epochs, strict=True) if epoch < until]
+
+
+def log_epoch(path: Path, metrics: dict[str, float]) -> None:
+    """Add a line to `history.csv`, in place of those of later epochs.
+
+    Raises:
+        OSError: the medium is full, or failed.
+    """
+    # A line that was logged before the run was killed, but not yet saved, is written again.
+    old = logged_epochs(path, metrics["epoch"])
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(metrics))
+    writer.writeheader()
+    writer.writerows([*old, metrics])
+    with replaced(path) as whole:
+        whole.write(text.getvalue().encode())
+
+
+class LARS(torch.optim.Optimizer):
+    """Layer-wise adaptive rates (You et al. 2017): SGD with a rate for every tensor.
+
+    The rate of a tensor w with gradient g is multiplied by TRUST |w| / (|g| + decay |w|). Biases,
+    norms and every tensor that is still zero take the plain rate, and the former no decay.
+
+    Args:
+        lr, momentum, weight_decay: as in SGD.
+        published: multiply even where |w| = 0, as the paper's code: such tensors never move.
+    """
+
+    def __init__(
+        self,
+        params: Iterable[Any],
+        lr: float,
+        momentum: float = MOMENTUM,
+        weight_decay: float = 0.0,
+        published: bool = False,
+    ) -> None:
+        super().__init__(params, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay})
+        self._published = published
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
+        """One update; `closure`, if given, evaluates the loss anew."""
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is not None:
+                    self._move(p, group)
+        return loss
+
+    def _move(self, p: torch.Tensor, group: dict[str, Any]) -> None:
+        assert p.grad is not None
+        stacked = group.get("stacked", False)
+        layer = self._published or (p.dim() > 1 and not stacked)
+        decay = group["weight_decay"] if layer else 0.0
+        rate = p.new_ones(())
+        if layer:
+            size, slope = _size(p, stacked), _size(p.grad, stacked)
+            ratio = TRUST * size / (slope + decay * size).clamp(min=1e-12)
+            plain = torch.zeros_like(ratio) if self._published else rate
+            rate = torch.where((size > 0) & (slope > 0), ratio, plain)
+        change = p.grad.add(p, alpha=decay) * (rate * group["lr"])
+        state = self.state[p]
+        if "momentum" in state:
+            state["momentum"].mul_(group["momentum"]).add_(change)
+        else:
+            state["momentum"] = change.clone()
+        p.sub_(state["momentum"])
+
+
+def _size(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
+    """A tensor's norm, or that of each of its rows, to multiply the tensor with."""
+    size: torch.Tensor = torch.linalg.vector_norm(
+        tensor, dim=-1 if stacked else None, keepdim=stacked
+    )
+    return size
+
+
+def parameter_groups(
+    model: nn.Module, learning_rate: float, weight_decay: float, own_rates: bool = True
+) -> list[Any]:
+    """Groups of the parameters that are trained, by what their ``_optim`` asks for.
+
+    Args:
+        learning_rate, weight_decay: of those that ask for none of their own.
+    """
+    groups: dict[tuple[float, float, bool], list[nn.Parameter]] = {}
+    for parameter in model.parameters():
+        if parameter.requires_grad:
+            own = getattr(parameter, "_optim", {})
+            asked = own if own_rates else {}
+            scale, decay = asked.get("lr_scale", 1.0), asked.get("weight_decay", weight_decay)
+            key = scale, decay, own.get("stacked", False)
+            groups.setdefault(key, []).append(parameter)
+    return [
+        {"params": members, "lr": learning_rate * scale, "weight_decay": decay, "stacked": stacked}
+        for (scale, decay, stacked), members in groups.items()
+    ]
+
+
+def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
+    """The optimizer of a configuration: Table A2 has a weight decay of 1e-4 for all."""
+    rate, decay = config.learning_rate, config.weight_decay
+    groups = parameter_groups(model, rate, decay, config.own_rates)
+    if config.optimizer == "sgd":
+        return torch.optim.SGD(groups, rate, momentum=MOMENTUM)
+    if config.optimizer == "adam":
+        return torch.optim.Adam(groups, rate)
+    if config.optimizer == "adamw":
+        return torch.optim.AdamW(groups, rate)
+    return LARS(groups, rate, published=config.optimizer == "lars-paper")
+
+
+def build_schedule(
+    optimizer: torch.optim.Optimizer, config: TrainingConfig, updates: int, per_epoch: int = 1
+) -> LRScheduler:
+    """The schedule of a configuration, to be stepped after every one of so many updates.
+
+    Time is counted in updates, or, with `rate_per` "epoch", in epochs of `per_epoch` updates, as
+    the paper does.
+
+    - "step": tenfold down after every `drop_every` of all time (StepLR).
+    - "constant".
+    - "cosine": up from nothing in the warm-up, then a half cosine down to 0.
+    - "cosine-annealing": up from 1e-4 in the warm-up, then a half cosine down to 0.
+    - "one-cycle": Smith and Topin (2018), as torch has it.
+    """
+    if config.schedule == "one-cycle":
+        return OneCycleLR(
+            optimizer,
+            [group["lr"] for group in optimizer.param_groups],
+            total_steps=updates,
+            # of a warm-up of one update torch makes a division by zero
+            pct_start=config.warmup if config.warmup * updates != 1 else 0.0,
+            cycle_momentum=False,
+        )
+    unit = per_epoch if config.rate_per == "epoch" else 1  # updates
+    end = math.ceil(updates / unit)
+    warm = round(config.warmup * end)
+    late = int(config.rate_per == "epoch")  # annealing counts epochs from 1
+    drop = max(round(config.drop_every * end), 1)
+
+    def factor(update: int) -> float:
+        at = update // unit
+        if config.schedule == "constant":
+            return 1.0
+        if config.schedule == "step":
+            return 0.1 ** (at // drop)
+        if config.schedule == "cosine":
+            return at / warm if at < warm else _half_cosine(at - warm, end - warm)
+        if at < warm:
+            return 1 - (1 - (at + late) / warm) * (1 - WARMUP_RATIO)
+        return _half_cosine(at + late - warm, end - warm)
+
+    return LambdaLR(optimizer, factor)
+
+
+def _half_cosine(at: int, end: int) -> float:
+    return 0.5 * (1 + math.cos(math.pi * min(at / max(end, 1), 1.0)))
+
+
+def batch_loss(
+    fabric: "Fabric",
+    wrapped: Callable[..., Tensor],
+    objective: Objective,
+    feed: BatchFeed,
+    bf16: bool,
+) -> Callable[[Batch], Tensor]:
+    """Make the function that gives the loss of a batch, ready for `backward`.
+
+    Args:
+        wrapped: the objective, as `fabric` has set it up.
+        bf16: whether products are of mixed precision.
+    """
+    device = fabric.device.type
+
+    def by_kernels(batch: Batch) -> Tensor:
+        # Not Fabric's, which casts a recurrent network's weights anew at every step.
+        with torch.autocast(device, torch.bfloat16, enabled=bf16):
+            loss: Tensor = wrapped(batch.views, batch.labels, batch.generator)
+            return loss
+
+    if device != "cuda" or fabric.world_size > 1:
+        return by_kernels
+    with closing(feed.epoch(0)) as drawn:
+        batch = next(drawn)
+    seen = objective.see(batch.views, batch.generator)
+    graph = replayed(objective, seen, batch.labels, bf16)
+    if graph is None:
+        return by_kernels
+
+    def by_graph(batch: Batch) -> Tensor:
+        with torch.autocast(device, torch.bfloat16, enabled=bf16):
+            seen = objective.see(batch.views, batch.generator)
+        return graph(*seen, batch.labels)
+
+    return by_graph
+
+
+class _Loss(nn.Module):
+    """An objective's loss of tensors alone, which is what can be captured."""
+
+    def __init__(self, objective: Objective) -> None:
+        super().__init__()
+        self.objective = objective
+
+    def forward(self, *tensors: Tensor) -> Tensor:
+        *seen, labels = tensors
+        return self.objective.loss(seen, labels)
+
+
+def replayed(
+    objective: Objective, seen: Sequence[Tensor], labels: Tensor, bf16: bool
+) -> Callable[..., Tensor] | None:
+    """The objective's loss as a function of (*seen, labels), all of the shapes of those given.
+
+    The objective is left as it was, its running means, too. While the function is made, no other
+    thread may use the GPU.
+
+    Args:
+        objective: on a GPU, in training mode.
+        seen, labels: of any batch, as `Objective.loss` takes them.
+
+    Returns:
+        The function; None, which is logged, if there is something in the objective that cannot be
+        captured, such as what another package adds and decides by values.
+    """
+    before = {name: buffer.clone() for name, buffer in objective.named_buffers()}
+    loss = _Loss(objective).train()
+    try:
+        with torch.autocast("cuda", torch.bfloat16, enabled=bf16, cache_enabled=False):
+            # In place: from here on the module replays.
+            torch.cuda.make_graphed_callables(loss, (*seen, labels), allow_unused_input=True)
+    except RuntimeError as error:
+        logging.getLogger(__name__).warning(
+            "an update cannot be one CUDA graph (%s): training goes on kernel by kernel, slower",
+            reason(error),
+        )
+        return None
+    finally:
+        for name, buffer in objective.named_buffers():
+            buffer.copy_(before[name])
+    return loss
