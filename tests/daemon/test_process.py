@@ -15,7 +15,7 @@ import pytest
 
 from bench.daemon.process import free_port, messages_of
 from tactile_rt.daemon.config import EXAMPLE
-from tactile_rt.daemon.part import ADMISSION
+from tactile_rt.daemon.config import ADMISSION
 from tests.helpers.waiting import PATIENCE_S, until
 
 RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
