@@ -273,7 +273,7 @@ def fit_rules(
 def fit_open_set(
     groups: Sequence[tuple[NDArray[np.float32], NDArray[np.str_]]], refused: float = REFUSED
 ) -> OpenSetRule:
-    """Fit thresholds by which at most so many sweeps of known kinds are refused at each step.
+    """Fit thresholds that refuse few sweeps of known kinds at each step.
 
     Args:
         groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
@@ -299,7 +299,7 @@ def fit_prediction_sets(
     noise: float,
     coverage: float = COVERAGE,
 ) -> PredictionSetRule | None:
-    """Fit the quantiles of a coverage in each group; None if one has too few objects.
+    """Fit the quantiles of a coverage in each group; None with too few objects.
 
     Args:
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)

@@ -82,7 +82,7 @@ class TrainingConfig:
             paper; where two views are hard to tell as a pair, as two sweeps are, a higher one.
         masking: The share of the steps of a window that is blanked, from 0 to less than 1.
         optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
-            `optimizers`.
+            `updates`.
         rate_per: The time after which the schedule changes the rate: "update", or "epoch" (the
             paper).
         learning_rate: The peak of the learning rate.
