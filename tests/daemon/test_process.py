@@ -14,8 +14,7 @@ import termios
 import pytest
 
 from bench.daemon.process import free_port, messages_of
-from tactile_rt.daemon.config import EXAMPLE
-from tactile_rt.daemon.config import ADMISSION
+from tactile_rt.daemon.config import ADMISSION, EXAMPLE
 from tests.helpers.waiting import PATIENCE_S, until
 
 RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
