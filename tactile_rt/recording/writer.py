@@ -179,7 +179,7 @@ class RecordingWriter:
         if force:
             check_not_recorded(path)
         hidden = target if special else _hidden(target, force)
-        self._raw = hidden.open("wb" if special else "xb")
+        self._raw = _create(hidden, special)
         if not special:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -373,6 +373,10 @@ def _hidden(path: Path, force: bool) -> Path:
     if not force and os.path.lexists(path):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     return path.with_name(f".{path.stem[:50]}.{secrets.token_hex(4)}{PART}")
+
+
+def _create(path: Path, force: bool) -> BinaryIO:
+    return path.open("wb" if force else "xb")
 
 
 def _reveal(hidden: Path, path: Path, force: bool) -> None:
