@@ -73,7 +73,7 @@ def whisk(
         from tactile_rt.sim_backend.arrays.files import load_array
         from tactile_rt.sim_backend.objects.catalogue import load_object
         from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
-        from tactile_rt.sim_backend.stimuli import Surface, whisk_against, write_input
+        from tactile_rt.sim_backend.stimulus_simulation import Surface, whisk_against, write_input
         from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
         from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
         from tactile_rt.sim_backend.whisking_source import Placing, parse_point

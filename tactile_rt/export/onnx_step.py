@@ -37,7 +37,8 @@ from tactile_rt.core.packages import VERSION
 from tactile_rt.export.graph_forms import Precision, in_precision, window_graph
 from tactile_rt.export.streaming import streaming
 from tactile_rt.models.ead import TactileClassifier
-from tactile_rt.sets.manifest import SweepManifest, join_manifests, trained_objects
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.splits import join_manifests, trained_objects
 
 __all__ = [
     "OPSET",

@@ -47,7 +47,7 @@ from tactile_rt.models.evaluation.measures import (
     run_on,
     run_over,
 )
-from tactile_rt.sets.manifest import join_manifests
+from tactile_rt.sets.splits import join_manifests
 
 __all__ = [
     "COVERAGE",

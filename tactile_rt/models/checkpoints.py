@@ -22,7 +22,8 @@ from tactile_rt.core.files import open_regular, replaced
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.ead_config import EADConfig
-from tactile_rt.sets.manifest import SweepManifest, check_labelled, join_manifests
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.splits import check_labelled, join_manifests
 
 if TYPE_CHECKING:
     from tactile_rt.models.ead import TactileClassifier

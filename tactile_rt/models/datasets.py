@@ -25,12 +25,11 @@ from tactile_rt.sets.manifest import (
     FAULTS,
     OUTLIERS,
     SweepManifest,
-    join_manifests,
     object_path,
-    read_manifests,
 )
 from tactile_rt.sets.objects import Sweeps, read_split
 from tactile_rt.sets.sensor_faults import SensorFaults
+from tactile_rt.sets.splits import join_manifests, read_manifests
 
 __all__ = [
     "NOISE_LEVELS",

@@ -7,8 +7,8 @@ sets/default24/
     SHA256SUMS         of all these, once the set is finished: `sha256sum -c` reads it too
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,8 @@ __all__ = [
     "UNLABELLED",
     "WITHHELD",
     "SweepManifest",
-    "check_labelled",
-    "check_split",
     "has_object",
-    "join_manifests",
     "object_path",
-    "read_manifests",
-    "split_by_object",
-    "trained_objects",
 ]
 
 SET_VERSION = 2
@@ -208,59 +202,6 @@ def has_object(folder: Path, name: str) -> bool:
     return object_path(folder, name).exists()
 
 
-def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
-    """Join sets of one array: the first, with categories and objects of all.
-
-    Raises:
-        ConfigError: sets of another array or sensor, or of another period.
-    """
-    first = manifests[0]
-    for other in manifests[1:]:
-        differing = first.spec.differences(other.spec, ("name", "rate_hz"))
-        if first.period_ns != other.period_ns:
-            periods = (f"{m.period_ns * 1e-6:g} ms" for m in (first, other))
-            differing = [*differing, f"the period of their samples, {' and '.join(periods)}"]
-        if first.sensor != other.sensor:
-            differing = [*differing, "the sensor: its noise, range or rate"]
-        if differing:
-            names = " and ".join(str(m.recipe.get("name", "?")) for m in (first, other))
-            raise ConfigError(f"the sweep sets {names} cannot be joined: {differing[0]}")
-    split: dict[str, dict[str, None]] = {}  # dictionaries, as sets that keep their order
-    for one in manifests:
-        for side, names_there in one.split.items():
-            split.setdefault(side, {}).update(dict.fromkeys(names_there))
-    return replace(
-        first,
-        lead=max(one.lead for one in manifests),
-        categories=tuple(dict.fromkeys(c for one in manifests for c in one.categories)),
-        withheld=tuple(dict.fromkeys(c for one in manifests for c in one.withheld)),
-        split={side: tuple(names) for side, names in split.items()},
-        category_of={name: kind for m in manifests for name, kind in m.category_of.items()},
-    )
-
-
-def read_manifests(
-    folders: Sequence[Path], labelled: bool
-) -> tuple[list[SweepManifest], SweepManifest]:
-    """Read what sets are that are learnt from together: each, and all as one.
-
-    Args:
-        labelled: whether it is learnt from their labels.
-
-    Raises:
-        ConfigError: they cannot be joined, or one has no labels to learn from.
-        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
-    """
-    manifests = [SweepManifest.read(folder) for folder in folders]
-    whole = join_manifests(manifests)
-    for folder, manifest in zip(folders, manifests, strict=True):
-        if labelled:
-            check_labelled(folder, manifest)
-        check_split(folder, manifest)
-    check_split(folders[0], whole)
-    return manifests, whole
-
-
 def _compare_recipes(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
     """List the keys that differ, those of tables by their full name."""
     found = []
@@ -271,60 +212,3 @@ def _compare_recipes(here: dict[str, Any], there: dict[str, Any], prefix: str = 
         elif mine != theirs:
             found.append(f"{prefix}{key}")
     return found
-
-
-def split_by_object(
-    categories: Sequence[str], objects: int, validation: int, test: int
-) -> dict[str, tuple[str, ...]]:
-    """Split `objects` instances of every category by object: the last ones are the test."""
-    first = {"train": 0, "validation": objects - test - validation, "test": objects - test}
-    stop = {"train": first["validation"], "validation": first["test"], "test": objects}
-    return {
-        # Index first, so that an unfinished set has its objects spread over the categories.
-        split: tuple(f"{c}-{i}" for i in range(first[split], stop[split]) for c in categories)
-        for split in SPLITS
-    }
-
-
-def check_labelled(folder: Path, manifest: SweepManifest) -> None:
-    """Check that a set which is to teach its labels has some.
-
-    Raises:
-        ConfigError: its touches have none.
-    """
-    if UNLABELLED in manifest.categories:
-        raise ConfigError(
-            f"{folder} holds touches without labels: learn from them by --recipe simclr, or say "
-            "what was touched with `tactile-rt label`"
-        )
-
-
-def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """Check that no object is on two sides, and every trained one has a label."""
-    side: dict[str, str] = {}
-    for split, names in manifest.split.items():
-        for name in names:
-            if name in side:
-                where = "twice in" if side[name] == split else f"in {side[name]!r} and in"
-                raise RecordingError(
-                    f"{folder}: the object {name} is {where} {split!r} of the split: an accuracy "
-                    "on it would mean nothing; make the set anew"
-                )
-            side[name] = split
-            if split not in (WITHHELD, OUTLIERS) and manifest.label(name) < 0:
-                raise RecordingError(
-                    f"{folder}: {name} of {split!r} is of the withheld category "
-                    f"{manifest.category(name)!r}, which has no label to train on"
-                )
-
-
-def trained_objects(
-    manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
-) -> dict[str, list[str]]:
-    """List the objects that a network has learnt from, by their source."""
-    before = saved.get("trained_objects", {}) if saved else {}
-    found = {source: dict.fromkeys(names) for source, names in before.items()}
-    for one in manifests:
-        names = (*one.split["train"], *one.split.get(OUTLIERS, ()))
-        found.setdefault(one.source, {}).update(dict.fromkeys(names))
-    return {source: list(names) for source, names in found.items()}

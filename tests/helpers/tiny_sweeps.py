@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.core.stream import ArraySpec
-from tactile_rt.sets.manifest import SweepManifest, split_by_object
+from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object
+from tactile_rt.sets.splits import split_by_object
 
 COLUMNS = (5, 5, 7, 7, 6)  # of rows A to E
 LEAD, SAMPLES = 24, 136

@@ -14,7 +14,8 @@ from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.implausible import IMPLAUSIBLE
 from tactile_rt.models.training.loop import train
 from tactile_rt.models.training.recipes import read_recipe
-from tactile_rt.sets.manifest import SweepManifest, join_manifests
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.splits import join_manifests
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
 SMALL = f"--encoder gru --set attender=none --set decoder=linear --set width={1 / 32}".split()

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.sets.manifest import SPLITS, SweepManifest, has_object, split_by_object
+from tactile_rt.sets.manifest import SPLITS, SweepManifest, has_object
 from tactile_rt.sets.objects import (
     read_object,
     read_skipped,
@@ -17,6 +17,7 @@ from tactile_rt.sets.objects import (
     write_object,
     write_skipped,
 )
+from tactile_rt.sets.splits import split_by_object
 from tactile_rt.testing import small_spec
 
 SPEC = small_spec()

@@ -20,7 +20,12 @@ from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.grid.outcomes import SUBSET, TESTED, Outcome, waiting_tasks, write_tested
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
 from tactile_rt.models.grid.work import Workbench
-from tactile_rt.sets.manifest import SET_VERSION, SPLITS, SweepManifest, has_object
+from tactile_rt.sets.manifest import (
+    SET_VERSION,
+    SPLITS,
+    SweepManifest,
+    has_object,
+)
 from tactile_rt.sets.objects import read_object, read_skipped, write_object, write_skipped
 
 __all__ = ["prepare", "run_grid", "write_subset"]

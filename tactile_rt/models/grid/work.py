@@ -46,7 +46,8 @@ from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
 from tactile_rt.models.training.loop import initialise, launched, train
 from tactile_rt.models.training.probing import probe
-from tactile_rt.sets.manifest import SweepManifest, check_split
+from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.splits import check_split
 
 __all__ = ["Workbench"]
 

@@ -15,8 +15,8 @@ from tactile_rt.core.errors import ConfigError, ModelError, name_some
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.checkpoints import NETWORK
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
-from tactile_rt.sets.manifest import read_manifests
 from tactile_rt.sets.sensor_faults import SensorFaults
+from tactile_rt.sets.splits import read_manifests
 
 __all__ = [
     "AUGMENTATIONS",

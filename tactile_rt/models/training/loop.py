@@ -46,7 +46,7 @@ from tactile_rt.models.training.config import (
 )
 from tactile_rt.models.training.objectives import Objective, build_objective
 from tactile_rt.models.training.updates import RunState, batch_loss, log_epoch
-from tactile_rt.sets.manifest import trained_objects
+from tactile_rt.sets.splits import trained_objects
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric

@@ -21,7 +21,7 @@ from tactile_rt.models.evaluation.measures import hits, predict, run_on
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.updates import log_epoch
-from tactile_rt.sets.manifest import check_split, trained_objects
+from tactile_rt.sets.splits import check_split, trained_objects
 
 __all__ = ["linear_probe", "probe"]
 

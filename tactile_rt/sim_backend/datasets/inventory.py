@@ -13,7 +13,13 @@ import numpy as np
 
 from tactile_rt.core.errors import RecordingError, name_some
 from tactile_rt.core.files import write_whole
-from tactile_rt.sets.manifest import MANIFEST, SKIPPED, SweepManifest, has_object, object_path
+from tactile_rt.sets.manifest import (
+    MANIFEST,
+    SKIPPED,
+    SweepManifest,
+    has_object,
+    object_path,
+)
 from tactile_rt.sets.objects import read_skipped
 
 __all__ = ["SUMS", "Tally", "check_sums", "remove_leftovers", "tally", "write_sums", "written_sum"]

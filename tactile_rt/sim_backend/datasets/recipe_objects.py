@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import no_such
-from tactile_rt.sets.manifest import OUTLIERS, SPLITS, WITHHELD, split_by_object
+from tactile_rt.sets.manifest import OUTLIERS, SPLITS, WITHHELD
+from tactile_rt.sets.splits import split_by_object
 from tactile_rt.sim_backend.datasets.recipes import VARIED_SHAPES, ObjectChoice
 from tactile_rt.sim_backend.objects import catalogue as shapes
 from tactile_rt.sim_backend.objects.catalogue import VARIED, TactileObject, load_object

@@ -1,12 +1,4 @@
-"""One step of one whisker: mechanics, contacts with dry friction, and the load on its base.
-
-A contact gives way along its normal only outwards, and its friction opposes the slip with as much
-as the coefficient times the normal impulse. Where the normal impulse is zero the surfaces may part.
-Contacts are solved one after the other until none changes (Gauss and Seidel); in one, friction is a
-viscous drag whose coefficient is found so that the drag is Coulomb's, which leaves a linear problem
-with one unknown each time. Nothing here opens a sliding contact, as the convex cones of many
-engines do.
-"""
+"""One step of one whisker: mechanics, contacts with dry friction, and the load on its base."""
 
 import math
 from typing import Any, NamedTuple
@@ -24,79 +16,13 @@ from tactile_rt.sim_backend.rods.chains import (
     solve_many_forth,
 )
 from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.friction import impulses
 from tactile_rt.sim_backend.rods.touching import MOST_CONTACTS, Contacts
 
-__all__ = ["Scratch", "impulses", "scratch", "step"]
+__all__ = ["Scratch", "scratch", "step"]
 
 A = Any
-CREEP = 2e-5  # mm/ms: slower slips are held with less than all friction
-MOST_SWEEPS = 20
 OUT_SWEEPS = 30
-# For a contact's drag, in the first sweep and in later ones: there the other contacts have yet to
-# settle, and what more rounds would find is lost.
-MOST_ROUNDS, LATER_ROUNDS = 10, 2
-TOLERANCE = 1e-4  # of the largest impulse
-
-
-@compiled
-def impulses(count: int, response: A, free: A, friction: float, drag: A, found: A) -> int:
-    """Solve for the impulses of some contacts.
-
-    Args:
-        count: how many contacts, each with a normal and two tangential directions.
-        response: (3 contact, 3 contact) change of relative velocity per impulse.
-        free: (3 contact,) relative velocity without any impulse, along the normal with the gap to
-            be closed added, mm/ms.
-        drag: (contact,) where to begin: friction's impulse per slip; filled with what was found.
-        found: (3 contact,) impulses, from where to begin; filled.
-
-    Returns:
-        The number of sweeps over the contacts.
-    """
-    for sweep in range(MOST_SWEEPS):
-        largest, change = 0.0, 0.0
-        for c in range(count):
-            i = 3 * c
-            w0, w1, w2 = free[i], free[i + 1], free[i + 2]
-            for j in range(3 * count):
-                if (j < i or j > i + 2) and found[j] != 0.0:
-                    w0 += response[i, j] * found[j]
-                    w1 += response[i + 1, j] * found[j]
-                    w2 += response[i + 2, j] * found[j]
-            n, t, s = 0.0, 0.0, 0.0
-            r00, r01, r02 = response[i, i], response[i, i + 1], response[i, i + 2]
-            if w0 < 0.0 and friction == 0.0:
-                n = -w0 / r00
-            elif w0 < 0.0:
-                r11, r12, r22 = (
-                    response[i + 1, i + 1],
-                    response[i + 1, i + 2],
-                    response[i + 2, i + 2],
-                )
-                d = drag[c]
-                for _ in range(LATER_ROUNDS if sweep else MOST_ROUNDS):
-                    # Slip under the drag: (1 + d R) slip = w + r n, r what n does to the slip.
-                    m11, m12, m22 = 1.0 + d * r11, d * r12, 1.0 + d * r22
-                    det = m11 * m22 - m12 * m12
-                    x1, x2 = (m22 * w1 - m12 * w2) / det, (m11 * w2 - m12 * w1) / det
-                    y1, y2 = (m22 * r01 - m12 * r02) / det, (m11 * r02 - m12 * r01) / det
-                    n = -(w0 - d * (r01 * x1 + r02 * x2)) / (r00 - d * (r01 * y1 + r02 * y2))
-                    n = max(n, 0.0)
-                    slip1, slip2 = x1 + y1 * n, x2 + y2 * n
-                    t, s = -d * slip1, -d * slip2
-                    square = slip1 * slip1 + slip2 * slip2
-                    wanted = friction * n / math.sqrt(square + CREEP * CREEP)
-                    settled = abs(wanted - d) * math.sqrt(square) <= 1e-5 * friction * n
-                    d = wanted
-                    if settled:
-                        break
-                drag[c] = d
-            change = max(change, abs(n - found[i]), abs(t - found[i + 1]), abs(s - found[i + 2]))
-            largest = max(largest, n)
-            found[i], found[i + 1], found[i + 2] = n, t, s
-        if count == 1 or change <= TOLERANCE * largest:
-            return sweep + 1
-    return MOST_SWEEPS
 
 
 @compiled

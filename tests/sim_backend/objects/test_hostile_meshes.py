@@ -15,7 +15,7 @@ pytest.importorskip("trimesh")
 FORKS = """
 import json, os, sys
 import tactile_rt.sim_backend.objects.catalogue
-import tactile_rt.sim_backend.stimuli
+import tactile_rt.sim_backend.stimulus_simulation
 from tactile_rt.cli import main
 
 found, (out, *paths) = [], sys.argv[1:]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("numba")
 
-from tactile_rt.sim_backend.rods.one_step import CREEP, impulses
+from tactile_rt.sim_backend.rods.friction import CREEP, impulses
 
 
 def solved(response: np.ndarray, free: np.ndarray, friction: float) -> np.ndarray:

@@ -13,7 +13,7 @@ import mujoco
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
-from tactile_rt.sim_backend.stimuli import (
+from tactile_rt.sim_backend.stimulus_simulation import (
     PERIOD_NS,
     Surface,
     Touch,
