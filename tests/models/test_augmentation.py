@@ -8,13 +8,13 @@ import torch
 
 from tactile_rt.calibration.correction import Mirror
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.models.array_symmetries import symmetries
 from tactile_rt.models.augmentation import (
     Tactile,
     _blurred,
     build,
     image,
     mask_steps,
+    symmetries,
     tactile_paper,
 )
 from tactile_rt.models.training.config import AUGMENTATIONS
