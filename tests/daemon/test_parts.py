@@ -64,6 +64,30 @@ def decision():
 # mailbox
 
 
+def test_a_mailbox_is_bounded_in_bytes_but_takes_one_of_any_size():
+    box = Mailbox({Packet}, items=1000, size=10_000)
+    for _ in range(100):
+        box.put(Packet("a", bytes(1000), 0))
+    assert box.state.waiting_bytes <= 10_000 and box.state.waiting["packets"] == 6
+    box.put(Packet("a", bytes(50_000), 0))
+    assert [len(i.packet) for i in box.take()] == [50_000]
+    assert box.state.dropped["packets"] == 100
+
+
+def test_whoever_waits_for_room_gets_it_from_the_reader_or_when_there_is_none():
+    box = Mailbox({SourceChunk}, 4, 1 << 20)
+    for _ in range(4):
+        box.put(samples())
+    box.wait_for_room(PATIENCE_S)  # nobody takes: there is nobody to wait for
+    box.taking = True
+    thread = threading.Thread(target=lambda: box.wait_for_room(1000.0))
+    thread.start()
+    assert thread.is_alive()
+    box.take()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
 def test_a_mailbox_takes_what_it_wants_of_the_source_that_it_wants():
     box = Mailbox({SourceChunk}, 10, 1 << 20, source="a")
     box.put(samples(source="b"))
