@@ -195,6 +195,8 @@ def test_a_process_without_a_turn_blames_none_of_its_parts():
     (line,) = told(*stalled, starved_s=9.0)
     assert line.startswith("late: daemon: it had no turn")
     assert len(told(*stalled)) == 4
+    stale = [replace(SOURCE, device=Health(State.STALE, 1))]
+    assert len(told(stale)) == 1 and len(told(stale, starved_s=9.0)) == 1
     # but what was lost meanwhile was lost
     assert len(told([replace(SOURCE, losses=Losses(5, 5))], starved_s=9.0)) == 2
 
@@ -207,8 +209,10 @@ def test_a_line_does_not_change_as_long_as_what_it_says_is_true():
     )
 
 
-def test_a_clock_that_was_set_is_told():
+def test_what_is_wrong_with_the_daemon_itself_is_told():
     assert told(clock_stepped=True) == ["UTC has jumped: daemon: the wall clock was set"]
+    (line,) = told(refused="no such codec")
+    assert line.startswith("old configuration: daemon: ") and "no such codec" in line
 
 
 class Hand:
