@@ -38,6 +38,7 @@ from tactile_rt.export.onnx_step import (
     step_graph,
     write_model,
 )
+from tactile_rt.models.attenders import gpt
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig, TactileClassifier
@@ -66,10 +67,13 @@ def build() -> TactileClassifier:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _one_thread() -> Iterator[None]:
+def _cheap() -> Iterator[None]:
+    """One thread, and a transformer of two layers: the exporter takes seconds for each."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gpt, "LAYERS", 2)
+        yield
     torch.set_num_threads(before)
 
 
@@ -190,8 +194,11 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
     monkeypatch.setattr(streaming_parts, "WIDE", 0)
     path = tmp_path / "wide.onnx"
     export_step(exported.model, exported.card, path)
-    operators = [node.op_type for node in onnx.load(path).graph.node]
-    assert operators.count("Conv") > 30, "four products in each of eight layers, and more"
+    wide, narrow = (
+        [node.op_type for node in onnx.load(file).graph.node].count("Conv")
+        for file in (path, exported.path)
+    )
+    assert wide >= narrow + 4 * gpt.LAYERS, "each layer has four products"
     for batch in (1, 3):
         follow(path, exported.model, batch)
 
