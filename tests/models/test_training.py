@@ -265,9 +265,16 @@ def test_only_so_many_batches_are_drawn_ahead(no_thread_left):
 
 
 @pytest.mark.parametrize(
-    "objective", ["supervised", "simclr", "simsiam", "autoencoder", "predictive"]
+    ("objective", "augmentation"),
+    [
+        ("supervised", "tactile"),
+        ("supervised", "image"),
+        ("simclr", "image"),
+        ("simsiam", "tactile"),
+        ("autoencoder", "tactile"),
+        ("predictive", "image"),
+    ],
 )
-@pytest.mark.parametrize("augmentation", ["tactile", "image"])
 def test_a_run_of_every_objective_can_be_repeated(tiny, tmp_path, objective, augmentation):
     config = TrainingConfig(
         tiny, **SMALL, objective=objective, augmentation=augmentation, masking=0.25, updates=3
