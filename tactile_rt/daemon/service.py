@@ -29,7 +29,7 @@ DEVICES = ("char-ttyACM", "char-ttyUSB", "char-ttyS", "char-ttyAMA", "char-ttyTH
 
 UNIT = """\
 [Unit]
-Description=tactile_rt: whisker arrays in, what they touch out
+Description=tactile_rt: tactile sensors in, what they touch out
 Documentation=man:systemd.exec(5)
 After=network.target time-sync.target
 StartLimitIntervalSec=0

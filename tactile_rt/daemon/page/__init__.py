@@ -1,4 +1,4 @@
-"""The web page: live whiskers, decisions and states in a browser, without a build step.
+"""The web page: live arrays, decisions and states in a browser, without a build step.
 
 consumer thread:  items -> Feed -> lines
 server thread:    lines -> one bounded queue per browser -> the page's HTTP server
