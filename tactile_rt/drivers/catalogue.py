@@ -28,26 +28,26 @@ def _entry(where: str, device: str) -> Entry:
 
 # (wire, name)
 CODECS = {
-    ("serial", "native"): _entry("native:NativeSerial", "your own firmware, by our format"),
-    ("can", "native"): _entry("native_can:NativeCan", "your own firmware, by our format"),
+    ("serial", "native"): _entry("native:NativeSerial", "Your own firmware, by our format"),
+    ("can", "native"): _entry("native_can:NativeCan", "Your own firmware, by our format"),
     ("serial", "bota"): _entry("bota:Bota", "Bota SensONE and Rokubi, generation 2: six axes"),
     ("serial", "optoforce"): _entry("optoforce:OptoForceSerial", "OptoForce OMD and HEX, USB"),
     ("can", "optoforce"): _entry("optoforce:OptoForceCan", "OptoForce OMD and HEX"),
     ("serial", "anyskin"): _entry("anyskin:AnySkin", "AnySkin, ReSkin, eFlesh: magnetic skins"),
-    ("serial", "mlx_hex"): _entry("mlx_hex:MlxHex", "one magnet whisker on an MLX90393"),
+    ("serial", "mlx_hex"): _entry("mlx_hex:MlxHex", "One magnet whisker on an MLX90393"),
     ("serial", "hx711_whisker"): _entry(
-        "hx711_whisker:Hx711Whisker", "up to nine strain-gauge whiskers on HX711"
+        "hx711_whisker:Hx711Whisker", "Up to nine strain-gauge whiskers on HX711"
     ),
-    ("serial", "ascii_line"): _entry("ascii_line:AsciiLine", "any board that prints numbers"),
+    ("serial", "ascii_line"): _entry("ascii_line:AsciiLine", "Any board that prints numbers"),
     ("serial", "binary_frame"): _entry(
-        "binary_frame:BinaryFrame", "any sensor whose frame you describe, mapping=FILE.toml"
+        "binary_frame:BinaryFrame", "Any sensor whose frame you describe, mapping=FILE.toml"
     ),
     ("serial", "ft300"): _entry("ft300:Ft300", "Robotiq FT 150 and FT 300: six axes"),
     ("serial", "tsf85"): _entry("tsf85:Tsf85", "Robotiq TSF-85: two fingertips of 28 taxels"),
     ("serial", "ati_485"): _entry("ati_485:Ati485", "ATI with digital output, RS-485: six axes"),
     ("can", "xela"): _entry("xela:Xela", "XELA uSkin uSPa44: 16 taxels of three axes"),
     ("can", "can-dbc"): _entry(
-        "can_dbc:CanDbc", "any CAN sensor with a DBC file, mapping=FILE.toml"
+        "can_dbc:CanDbc", "Any CAN sensor with a DBC file, mapping=FILE.toml"
     ),
     ("can", "ati_can"): _entry("ati_can:AtiCan", "ATI on the NETCANOEM board: six axes"),
     ("can", "aft200"): _entry("aft200:Aft200", "Aidin AFT200: six axes"),

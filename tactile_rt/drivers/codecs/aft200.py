@@ -66,7 +66,7 @@ class Aft200(CanCodec):
 
     Options = Aft200Options
     full_scale = (300.0,) * 3 + (50.0,) * 3
-    cannot_detect = "a lost sample: there is no counter, and forces and torques pair by order only"
+    cannot_detect = "a lost sample (no counter); forces and torques pair by order only"
 
     @classmethod
     def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:

@@ -58,8 +58,8 @@ class AnySkin(DescribedFrame):
 
     Options = AnySkinOptions
     cannot_detect = (
-        "there is no counter and no checksum: lost and repeated frames leave no trace, and of "
-        "changed bytes only a missing line end and impossible values are seen"
+        "lost and repeated frames (no counter); changed values, but for a missing line end and "
+        "impossible values (no checksum)"
     )
 
     @classmethod

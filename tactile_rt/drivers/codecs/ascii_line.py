@@ -75,8 +75,8 @@ class AsciiLine(SerialCodec):
     Options = AsciiLineOptions
     baud = 115200
     cannot_detect = (
-        "there is no checksum: a changed digit is a changed value; without a count column lost and "
-        "repeated lines leave no trace; the first line after each connection is not used"
+        "changed digits (no checksum); lost and repeated lines without a count column; the first "
+        "line after each connection is not used"
     )
 
     def __init__(self, options: AsciiLineOptions) -> None:

@@ -74,10 +74,10 @@ class Ati485(SerialCodec):
     parity = "E"
     status_bits: ClassVar[dict[int, str]] = {0: "the sensor's status word is not zero"}
     cannot_detect = (
-        "It sends no header, counter or time. A 7-bit sum passes one damaged frame in 128, and "
-        "every change of a highest bit. While the frames are constant, 17 % of them pass at a "
-        "second place too: joining such a stream, or losing bytes in it, cannot be resolved until "
-        "they change (see lock_confidence). Frames that never came or came twice cannot be seen."
+        "frames that never came or came twice (no counter, no clock); one damaged frame in 128, "
+        "and every change of a highest bit (a sum of 7 bits). There is no header: of frames that "
+        "stay constant 17 % fit at a second place too, and where they begin is known once they "
+        "change (lock_confidence)"
     )
 
     def __init__(self, options: Ati485Options) -> None:

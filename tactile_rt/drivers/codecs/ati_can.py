@@ -98,7 +98,7 @@ class AtiCan(CanCodec):
         15: "some error",
     }
     cannot_detect = (
-        "a lost sample: there is no counter; after a lost second frame up to 64 samples may mix "
+        "a lost sample (no counter); after a lost second frame up to 64 samples may mix "
         "two neighbouring ones while requests are never all answered"
     )
 

@@ -72,8 +72,8 @@ class DescribedFrame(SerialCodec):
     """
 
     cannot_detect = (
-        "What the frame has nothing for: without a checksum changed values, without a counter or "
-        "clock frames that never came or came twice."
+        "changed values without a checksum; frames that never came or came twice without a "
+        "counter or a clock"
     )
 
     def __init__(self, mapping: FrameMapping, where: str, rate_hz: float = 0.0) -> None:
@@ -265,7 +265,10 @@ def frame_codec(name: str) -> type[DescribedFrame]:
     if not frame.count:
         clock = ", but for steps of its clock" if frame.time else ""
         unseen.append(f"frames that never came or came twice{clock}")
+    else:
+        bits = int(frame.count.type.removeprefix("uint"))
+        unseen.append(f"{2**bits:,} samples lost in succession")
     Described.cannot_detect = "; ".join(unseen)
-    about, _, _ = (FRAMES / f"{name}.toml").read_text("utf-8").partition("\n#\n")
-    Described.__doc__ = about.replace("# ", "")
+    about, _, _ = (FRAMES / f"{name}.toml").read_text("utf-8").partition("\n\n")
+    Described.__doc__ = about.replace("# ", "").replace("#\n", "\n")
     return Described

@@ -70,9 +70,8 @@ class Bota(DescribedFrame):
     Options = BotaOptions
     greeting = b"App Init\r\n"
     cannot_detect = (
-        "It has no sample counter: frames that never came, or came twice, show only in the steps "
-        "of its clock."
-        " Damaged frames are told from noise by how they begin, wrongly once in some thousand."
+        "frames that never came or came twice, but for steps of its clock (no counter); of some "
+        "thousand damaged frames one is miscounted"
     )
 
     def __init__(self, options: BotaOptions) -> None:

@@ -54,9 +54,8 @@ class Ft300(DescribedFrame):
     Options = Ft300Options
     measures = True
     cannot_detect = (
-        "It sends neither a counter nor a time: frames that never came, repeated frames and the "
-        "device's overload cannot be seen."
-        " Damaged frames are told from noise by how they begin, wrongly once in some thousand."
+        "frames that never came or came twice (no counter, no clock); overload of the sensor; of "
+        "some thousand damaged frames one is miscounted"
     )
 
     def __init__(self, options: Ft300Options) -> None:

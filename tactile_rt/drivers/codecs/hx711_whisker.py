@@ -62,8 +62,8 @@ class Hx711Whisker(DescribedFrame):
 
     Options = Hx711WhiskerOptions
     cannot_detect = (
-        "there is no counter and no checksum: lost and repeated frames leave no trace, and of "
-        "changed bytes only a damaged ending and voltages out of range are seen"
+        "lost and repeated frames (no counter); changed values, but for a damaged ending and "
+        "voltages out of range (no checksum)"
     )
 
     @classmethod

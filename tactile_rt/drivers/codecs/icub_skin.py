@@ -73,8 +73,8 @@ class IcubSkin(CanCodec):
     calibration. Taxels of which the frame did not come, or that the board calls stuck, are invalid;
     so is a whole triangle that the board could not read.
 
-    Source: icub-main (class CanBusSkin and SkinDiagnostics.h) and the skin board's firmware, which
-    sends the triangles in ascending order.
+    Source: github.com/robotology/icub-main (class CanBusSkin and SkinDiagnostics.h) and the skin
+    board's firmware, which sends the triangles in ascending order.
     """
 
     Options = IcubSkinOptions
@@ -83,7 +83,7 @@ class IcubSkin(CanCodec):
         1: "a triangle did not take its configuration",
         **{4 + i: f"taxel {i} of a triangle is stuck" for i in range(TAXELS)},
     }
-    cannot_detect = "a lost sample: there is no counter"
+    cannot_detect = "a lost sample (no counter)"
 
     @classmethod
     def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:

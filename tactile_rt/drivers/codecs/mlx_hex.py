@@ -81,10 +81,7 @@ class MlxHex(SerialCodec):
         3: "a bit of the chip's memory was corrected",
         4: "the chip refused a command",
     }
-    cannot_detect = (
-        "there is no counter and no checksum: lost and repeated lines leave no trace, and a digit "
-        "changed into another is a changed value"
-    )
+    cannot_detect = "lost and repeated lines (no counter); changed digits (no checksum)"
 
     def __init__(self, options: MlxHexOptions) -> None:
         super().__init__(

@@ -103,7 +103,7 @@ class NativeCan(CanCodec):
     count_bits = 16
     tick_ns = 1000.0
     status_bits = STATUS
-    cannot_detect = "65,536 samples lost in succession look like none lost"
+    cannot_detect = "65,536 samples lost in succession (over CAN)"
 
     @classmethod
     def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:

@@ -7,7 +7,8 @@ filter, zero; the device answers AA 00 50 01 and a status. A CAN bus carries the
 frames of 8, each message beginning with a frame.
 
 Sources: OptoForce, General DAQ User Guide 2.2, sections 3 to 5 (as quoted by the public drivers
-alknemeyer/optoforce, shadow-robot/optoforce and RCPRG-ros-pkg/optoforce_can).
+github.com/alknemeyer/optoforce, github.com/shadow-robot/optoforce and
+github.com/RCPRG-ros-pkg/optoforce_can).
 """
 
 import re
@@ -189,8 +190,8 @@ class OptoForceSerial(SerialCodec):
         SEVERAL: "several sensors are at fault",
     }
     cannot_detect = (
-        "The checksum is a sum of bytes: two changes that cancel each other, or two bytes changing "
-        "places, pass it."
+        "changes that cancel each other, or bytes that change places (a sum of bytes); 65,536 "
+        "samples lost in succession"
     )
 
     @classmethod

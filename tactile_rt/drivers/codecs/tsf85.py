@@ -85,8 +85,8 @@ class Tsf85(SerialCodec):
     baud = 115_200  # nominal: USB has none
     tick_bits = 48  # of the 64 sent
     cannot_detect = (
-        "Its checksum is not used: damage that leaves a packet's structure intact is taken for a "
-        "measurement. Without a counter, lost samples show only in the time (whole ms)."
+        "damage that leaves a packet's structure intact (the checksum is not used); lost samples, "
+        "but for steps of its clock in whole ms (no counter)"
     )
 
     @classmethod

@@ -59,8 +59,8 @@ class Xela(CanCodec):
 
     Options = XelaOptions
     cannot_detect = (
-        "a lost sample: there is no counter; two neighbouring samples that lost complementary "
-        "taxels come out as one"
+        "a lost sample (no counter); two neighbouring samples that lost complementary taxels come "
+        "out as one"
     )
 
     @classmethod
