@@ -35,7 +35,8 @@ def test_the_citation_is_of_this_release() -> None:
 
 
 def test_every_address_of_the_project_is_the_same_and_none_is_named_before_it_is_there() -> None:
-    for file in (*ROOT.glob("*.*"), *(ROOT / ".github").rglob("*.yml")):
+    files = (*ROOT.glob("*.*"), *(ROOT / ".github").rglob("*.yml"))
+    for file in filter(Path.is_file, files):
         named = re.findall(r"https://[\w.]*github[\w.]*/tactile[\w-]*/\w+", file.read_text("utf-8"))
         assert set(named) <= {SOURCE}, file
 
