@@ -68,7 +68,7 @@ def build_benchmark(
     cells: Annotated[str | None, typer.Option(help="Only excitatory or inhibitory units.")] = None,
     clock: Annotated[
         str | None,
-        typer.Option(help="Spike times are on the session's, or the recording's. See the docs."),
+        typer.Option(help="Clock of the spike times: session or recording (see the docs)."),
     ] = None,
     bootstraps: Annotated[int, typer.Option(help="Number of random splits of the trials.")] = 1000,
     seed: Seed = 1234,

@@ -51,7 +51,7 @@ def fetch_recordings(
     ] = False,
     json: Json = None,
 ) -> None:
-    """Download the needed MB of published neural recordings."""
+    """Download the needed part of published neural recordings."""
     from tactile_rt.alignment.datasets import find_dataset
     from tactile_rt.alignment.datasets.fetching import counted, fetch, published_files
     from tactile_rt.alignment.selection import Selection

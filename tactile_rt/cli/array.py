@@ -21,7 +21,7 @@ array = add_group("array", "List named arrays, and fit an array's file to measur
 
 @array.command("list", epilog="tactile-rt array list")
 def show(json: Json = None) -> None:
-    """List the arrays that sim:NAME and new --array NAME know.
+    """List the named arrays, for sim:NAME and new --array NAME.
 
     An animal's name takes a side: mouse-left, mouse-both.
     """
@@ -55,7 +55,7 @@ def fit(
     described: Annotated[Path, typer.Option("--array", help="TOML file of the array.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="File to write with the measured values; also the array's own."),
+        typer.Option(help="File to write with the measured values; may be the array's."),
     ] = None,
     seconds: Annotated[
         float, typer.Option(min=1, max=3600, help="Read at most this many seconds.")

@@ -42,7 +42,7 @@ def bench(
     quick: Quick = False,
     json: Json = None,
     resume: Annotated[
-        Path | None, typer.Option(help="File of the finished faults, to continue from.")
+        Path | None, typer.Option(help="With faults: file of results to continue from.")
     ] = None,
 ) -> None:
     """Measure speed and accuracy against the stated limits.

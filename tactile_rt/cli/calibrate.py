@@ -42,7 +42,7 @@ def tare(
 ) -> None:
     """Measure the zero of an untouched sensor and store it.
 
-    Refused if an element is touched meanwhile, or drifts. Matrices, mapping and mirror in the
+    Refused if an element is touched or drifts meanwhile. Matrices, mapping and mirror in the
     device's file are kept.
     """
     from tactile_rt.calibration import Calibration, calibration_path, save_calibration
@@ -106,7 +106,7 @@ def calibrate(
 ) -> None:
     """Fit an element's calibration matrix to known loads.
 
-    By least squares; prints the residuals. Without --device and --out nothing is written.
+    Fits by least squares and prints the residuals. Without --device and --out nothing is written.
     """
     from tactile_rt.calibration import (
         Calibration,

@@ -148,7 +148,7 @@ def install_service(
 ) -> None:
     """Write a systemd service that starts the daemon at boot.
 
-    With it come udev rules for the connected devices, and a script that installs both. Nothing is
+    Also writes udev rules for the connected devices, and a script that installs both. Nothing is
     changed outside the folder: read the script, then run it as root.
     """
     from tactile_rt.daemon.checks import check_config

@@ -29,7 +29,7 @@ def emulate(
     ] = None,
     project: ProjectFolder = None,
     wire: Annotated[
-        str | None, typer.Option(help="serial, slcan or can. Default: serial, else slcan.")
+        str | None, typer.Option(help="Wire: serial, slcan or can. Default: serial, else slcan.")
     ] = None,
     link: Annotated[
         Path | None, typer.Option(help="Link to make to the port, e.g. /tmp/whisker0.")

@@ -30,7 +30,7 @@ def hil(
     ] = None,
     wire: Annotated[
         str | None,
-        typer.Option(help="serial, slcan or virtual (a CAN bus). Default: serial, or a project's."),
+        typer.Option(help="Wire: serial, slcan or virtual (CAN). Default: serial, or a project's."),
     ] = None,
     codec: Annotated[
         str | None, typer.Option(help="Protocol of the device. Default: native, or a project's.")
@@ -52,7 +52,7 @@ def hil(
 
     The decisions on the driver's samples are compared with those on the same samples without device
     and wire. Native float32 must be equal in every bit; with a format that rounds, 99 % of the
-    decisions must have the same label; with --faults, each loss must be counted. Else exit code 1.
+    decisions must keep their label; with --faults, each loss must be counted. Exit code 1 if not.
     """
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.drivers.emulation.faults import read_faults

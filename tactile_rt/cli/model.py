@@ -177,7 +177,7 @@ def evaluate(
 ) -> None:
     """Measure a model on the test objects of a sweep set.
 
-    Accuracy, fusion of several touches, calibration, noise and faults of the sensor.
+    Reports accuracy, fusion of touches, calibration, noise and faults of the sensor.
     """
     from tactile_rt.sets.manifest import SweepManifest
 

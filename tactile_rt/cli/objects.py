@@ -60,7 +60,7 @@ def check(
 ) -> None:
     """Load every object of a folder and report which can be used.
 
-    Also how near the simulated surfaces are. Exit code 1 if some cannot be used.
+    Also reports how near the simulated surfaces are. Exit code 1 if some cannot be used.
     """
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}")

@@ -40,7 +40,7 @@ def sweep(
     processes: Annotated[int, typer.Option(min=0, help="Processes to run; 0: one per core.")] = 0,
     ray: Annotated[
         str | None,
-        typer.Option(help="On a Ray cluster: its address; auto: the one that runs here, or none."),
+        typer.Option(help="Ray cluster: HOST:PORT, local, or auto (a running one, else local)."),
     ] = None,
     card: Annotated[
         bool,

@@ -188,7 +188,7 @@ def export(
     ] = "step",
     data: Annotated[
         list[Path] | None,
-        typer.Option(help="Its sweep set, if that has moved; may be repeated: give all."),
+        typer.Option(help="Sweep set it was trained on, if moved; repeat for each set."),
     ] = None,
     license: Annotated[
         str, typer.Option(help="Licence to store in the file, e.g. Apache-2.0.")

@@ -57,7 +57,7 @@ def whisk(
     ] = None,
     json: Json = None,
 ) -> None:
-    """Simulate whisking against surfaces from first contact on."""
+    """Simulate whisking against surfaces, and store the loads."""
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: name a file that ends in .npz")
     if target is not None and stimulus is not None:
