@@ -15,9 +15,10 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
+    import typer
     from _typeshed import ReadableBuffer
 
-__all__ = ["main"]
+__all__ = ["load_app", "main"]
 
 AGAIN_S = 0.01  # after which a signal whose exception Python dropped comes again
 
@@ -78,14 +79,22 @@ def _leave(number: int) -> NoReturn:
     sys.exit(128 + number)
 
 
-def _run(told: list[int]) -> None:
-    # Each module adds its commands; what a command needs is imported when it runs, so that
-    # `--help` is instant and a robot never imports torch.
-    import typer
+def load_app() -> "typer.Typer":
+    """Return the application with all commands.
 
+    A command imports what it needs when it runs, so help is instant and a robot needs no torch.
+    """
     for module in pkgutil.iter_modules(__path__):
         import_module(f"{__name__}.{module.name}")
     from tactile_rt.cli.app import app
+
+    return app
+
+
+def _run(told: list[int]) -> None:
+    import typer
+
+    app = load_app()
     from tactile_rt.core.errors import TactileError
 
     # Typer brings a copy of click since 0.29: whose these are depends on its release.

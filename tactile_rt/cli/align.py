@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import add_group, check_output, needing
 from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, told_as_json
@@ -19,21 +19,20 @@ from tactile_rt.core.settings import take_sets
 if TYPE_CHECKING:
     from tactile_rt.alignment.results import Results
 
-align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
-app.add_typer(align, name="align")
+align = add_group("align", "Compare models with recordings of barrel cortex.")
 
-Benchmark = Annotated[Path, typer.Option(help="What `align build` wrote.")]
+Benchmark = Annotated[Path, typer.Option(help="Benchmark of `align build`.")]
 
 
-@align.command("example")
+@align.command("example", epilog="tactile-rt align example brain --set mice=4")
 def write_brain(
-    folder: Annotated[Path, typer.Argument(help="The folder to make.")],
+    folder: Annotated[Path, typer.Argument(help="Folder to make.")],
     seed: Seed = 0,
     sets: Annotated[
-        list[str] | None, set_option("Of the brain: mice=6, trials=60, private=0.3")
+        list[str] | None, set_option("An option of the brain: mice=6, trials=60, private=0.3")
     ] = None,
 ) -> None:
-    """Make up a brain: recordings in NWB, and models of known truth, to try the commands on."""
+    """Write made-up recordings and models to try the commands on."""
     from tactile_rt.alignment.example import Brain
     from tactile_rt.alignment.example_files import write_example
 
@@ -52,32 +51,30 @@ def write_brain(
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-@align.command("build")
+@align.command("build", epilog="tactile-rt align build brain/recordings --out benchmark.json")
 def build_benchmark(
     recordings: Annotated[
-        list[Path], typer.Argument(help="NWB files or folders of them; or one published .npz.")
+        list[Path], typer.Argument(help="NWB files, folders of them, or one published .npz.")
     ],
-    out: Annotated[Path, typer.Option(help="The benchmark to write, .json.")],
-    protocol: Annotated[str, typer.Option(help="strict, or paper-code.")] = "strict",
+    out: Annotated[Path, typer.Option(help="Benchmark to write, .json.")],
+    protocol: Annotated[str, typer.Option(help="Protocol: strict or paper-code.")] = "strict",
     task: Annotated[
-        str | None, typer.Option(help="Only sessions of: discrimination, or detection.")
+        str | None, typer.Option(help="Only sessions of discrimination or detection.")
     ] = None,
     sessions: Sessions = None,
     depth: Annotated[
-        str | None, typer.Option(help="Only units of a layer, L4, or a range in um, 419-626.")
+        str | None, typer.Option(help="Only units of a layer, e.g. L4, or a range in um.")
     ] = None,
-    cells: Annotated[
-        str | None, typer.Option(help="Only units that are: excitatory, or inhibitory.")
-    ] = None,
+    cells: Annotated[str | None, typer.Option(help="Only excitatory or inhibitory units.")] = None,
     clock: Annotated[
         str | None,
-        typer.Option(help="Spike times are on the session's, or the recording's. See the docs."),
+        typer.Option(help="Clock of the spike times: session or recording (see the docs)."),
     ] = None,
-    bootstraps: Annotated[int, typer.Option(help="Splits of the trials.")] = 1000,
+    bootstraps: Annotated[int, typer.Option(help="Number of random splits of the trials.")] = 1000,
     seed: Seed = 1234,
     json: Json = None,
 ) -> None:
-    """Freeze recordings into a small benchmark, so that nobody else needs them."""
+    """Make a small benchmark file from neural recordings."""
     from tactile_rt.alignment import build, save_benchmark
     from tactile_rt.alignment.selection import Selection
 
@@ -113,7 +110,7 @@ def build_benchmark(
     )
 
 
-@align.command("score")
+@align.command("score", epilog="tactile-rt align score run/best.pt --benchmark benchmark.json")
 def score_models(
     models: Models,
     benchmark: Benchmark,
@@ -122,7 +119,7 @@ def score_models(
     stimuli: Stimuli = None,
     seed: Seed = 0,
 ) -> None:
-    """Score every layer of some models against a benchmark."""
+    """Score every layer of models against a benchmark."""
     for file in (json, page):
         check_output(file)
     with needing("train"):
@@ -158,12 +155,12 @@ def score_models(
         _show_scores(results)
 
 
-@align.command("report")
+@align.command("report", epilog="tactile-rt align report scores.json --out report.html")
 def write_report(
-    scores: Annotated[list[Path], typer.Argument(help="What `align score --json` wrote.")],
-    out: Annotated[Path, typer.Option(help="The page to write, .html.")],
+    scores: Annotated[list[Path], typer.Argument(help="Files of `align score --json`.")],
+    out: Annotated[Path, typer.Option(help="Page to write, .html.")],
 ) -> None:
-    """Write one self-contained page of some scores on the same benchmark."""
+    """Write one HTML page of scores on the same benchmark."""
     import msgspec
 
     from tactile_rt.alignment.benchmark import benchmark_sha256
@@ -188,24 +185,27 @@ def write_report(
     Console(stderr=True).print(f"{out}", highlight=False)
 
 
-@align.command("decode")
+@align.command("decode", epilog="tactile-rt align decode run/best.pt --paper")
 def decode_stimuli(
     models: Models,
     benchmark: Annotated[
-        Path | None, typer.Option(help="Decode its animals' mean responses too.")
+        Path | None, typer.Option(help="Also decode the mean responses of its animals.")
     ] = None,
     animals: Annotated[
         Path | None,
-        typer.Option(help="Decode recorded animals too, and their mean: a published .npz, or NWB."),
+        typer.Option(help="Also decode recorded animals: a published .npz, or NWB."),
     ] = None,
     stimuli: Stimuli = None,
     paper: Annotated[
         bool,
-        typer.Option("--paper", help="Also the paper's variant: one stimulus held out at a time."),
+        typer.Option("--paper", help="Also hold out one stimulus at a time, as the paper does."),
     ] = False,
     json: Json = None,
 ) -> None:
-    """Decode shape and distance of the stimuli from every layer, with permutation chance."""
+    """Decode shape and distance of the stimuli from every layer.
+
+    Each figure stands beside its chance level by permutation.
+    """
     check_output(json)
     with needing("train"):
         from tactile_rt.alignment.benchmark import load_strict

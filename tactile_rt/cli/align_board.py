@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from tactile_rt.alignment.stimuli_input import StimuliInput
 
 
-@align.command("datasets")
+@align.command("datasets", epilog="tactile-rt align datasets")
 def list_datasets(json: Json = None) -> None:
-    """List the recordings that models can be compared with: license, citation, size."""
+    """List the neural recordings that models can be compared with."""
     from tactile_rt.alignment.datasets import dataset_names, find_dataset
 
     found = [find_dataset(name) for name in dataset_names()]
@@ -39,19 +39,19 @@ def list_datasets(json: Json = None) -> None:
             console.print(f"    {line}", highlight=False, markup=False)
 
 
-@align.command("fetch")
+@align.command("fetch", epilog="tactile-rt align fetch 000231 recordings")
 def fetch_recordings(
-    name: Annotated[str, typer.Argument(help="Of a dataset, 000231; see `align datasets`.")],
+    name: Annotated[str, typer.Argument(help="Name of a dataset: see `align datasets`.")],
     folder: Annotated[
-        Path | None, typer.Argument(help="Where small NWB files are written to, a session each.")
+        Path | None, typer.Argument(help="Folder for small NWB files, one per session.")
     ] = None,
     sessions: Sessions = None,
     listed: Annotated[
-        bool, typer.Option("--list", help="List sizes in bytes, SHA-256 and names; fetch nothing.")
+        bool, typer.Option("--list", help="Only list sizes in bytes, SHA-256 and names.")
     ] = False,
     json: Json = None,
 ) -> None:
-    """Get what is needed of published recordings, some MB of hundreds of GB, from their archive."""
+    """Download the needed part of published neural recordings."""
     from tactile_rt.alignment.datasets import find_dataset
     from tactile_rt.alignment.datasets.fetching import counted, fetch, published_files
     from tactile_rt.alignment.selection import Selection
@@ -95,7 +95,7 @@ def fetch_recordings(
         )  # fmt: skip
 
 
-@align.command("board")
+@align.command("board", epilog="tactile-rt align board run/best.pt --data 000231=recordings")
 def write_board(
     models: Annotated[
         list[Path] | None,
@@ -103,21 +103,26 @@ def write_board(
     ] = None,
     data: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=PATH of recordings, `align datasets` names them; may be repeated."),
+        typer.Option(help="Recordings, NAME=PATH, e.g. 000231=FOLDER; may be repeated."),
     ] = None,
     metric: Annotated[
-        list[str] | None, typer.Option(help="May be repeated. Default: all of them.")
+        list[str] | None, typer.Option(help="Metric; may be repeated. Default: all.")
     ] = None,
     part: Annotated[
         list[str] | None,
-        typer.Option(help="all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
+        typer.Option(
+            help="Units: all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."
+        ),
     ] = None,
     json: Json = None,
     page: Page = None,
     stimuli: Stimuli = None,
     seed: Seed = 0,
 ) -> None:
-    """Compare models with recordings by every metric, as shares of what noise permits."""
+    """Compare models with recordings by every metric.
+
+    Figures are shares of what the noise of the recordings permits.
+    """
     for file in (json, page):
         check_output(file)
     if not data:

@@ -38,23 +38,28 @@ class GateCommand(TyperCommand):
             raise
 
 
-@align.command("gate", cls=GateCommand)
+@align.command(
+    "gate", cls=GateCommand, epilog="tactile-rt align gate model.onnx --reference run/best.pt"
+)
 def gate_model(
-    model: Annotated[Path, typer.Argument(help="What would be released: .onnx, best.pt or .npz.")],
+    model: Annotated[Path, typer.Argument(help="Model to release: .onnx, best.pt or .npz.")],
     benchmark: Annotated[
-        Path | None, typer.Option(help="Tests 1 and 2: what `align build` wrote.")
+        Path | None, typer.Option(help="Tests 1 and 2: benchmark of `align build`.")
     ] = None,
     baseline: Annotated[
-        Path | None, typer.Option(help="Test 3: scores of the model before, on this benchmark.")
+        Path | None, typer.Option(help="Test 3: scores of the previous model on it.")
     ] = None,
     reference: Annotated[
         Path | None,
-        typer.Option(help="Test 4: the checkpoint (or .onnx) that the model was exported from."),
+        typer.Option(help="Test 4: checkpoint (or .onnx) that it was exported from."),
     ] = None,
     stimuli: Stimuli = None,
     json: Json = None,
 ) -> None:
-    """Test a model before its release. Exit code: 0 pass, 1 fail, 2 inconclusive, 3 input error."""
+    """Test whether a model may be released.
+
+    Exit code: 0 pass, 1 fail, 2 inconclusive, 3 input error.
+    """
     try:
         code = _gate(model, benchmark, baseline, reference, stimuli, json)
     except (TactileError, OSError) as error:

@@ -15,6 +15,7 @@ from urllib.parse import unquote
 
 import typer
 
+from tactile_rt.cli.panels import WELCOME, PanelGroup
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import VERSION, lacking
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = [
     "INTERRUPTED",
     "USER_ERROR",
+    "add_group",
     "app",
     "check_folder",
     "check_is_mcap",
@@ -44,8 +46,8 @@ COLUMNS, BOXED = shutil.get_terminal_size().columns, 100
 
 app = typer.Typer(
     name="tactile-rt",
-    help="Tactile perception in real time: whisker arrays in, what they touch out.",
-    no_args_is_help=True,
+    cls=PanelGroup,
+    help="Recognise what whisker arrays, tactile skins and force sensors touch, in real time.",
     pretty_exceptions_enable=False,
     # Boxes cut long words where they have no room; plain text is as wide as the terminal.
     rich_markup_mode="rich" if COLUMNS >= BOXED else None,
@@ -62,12 +64,22 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
+def add_group(name: str, help: str) -> typer.Typer:
+    """Return a new group of commands of the application."""
+    made = typer.Typer(cls=PanelGroup, help=help, no_args_is_help=True)
+    app.add_typer(made, name=name)
+    return made
+
+
+@app.callback(invoke_without_command=True)
 def _options(
+    context: typer.Context,
     version: bool = typer.Option(
         False, "--version", callback=_version, is_eager=True, help="Print the version."
     ),
 ) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(WELCOME)
     if sys.stderr.isatty():  # what takes seconds says so; a log file keeps clean
         said = logging.getLogger(SLOW_WORK)
         said.addHandler(logging.StreamHandler())

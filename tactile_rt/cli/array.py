@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app, check_output, needing, open_url
+from tactile_rt.cli.app import add_group, check_output, needing, open_url
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, show_table, told_as_json
 from tactile_rt.core.errors import ConfigError
@@ -16,18 +16,12 @@ from tactile_rt.core.errors import ConfigError
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.measuring.findings import ArrayFinding
 
-array = typer.Typer(help="Arrays by name, and an array's own file.", no_args_is_help=True)
-app.add_typer(array, name="array")
+array = add_group("array", "List named arrays, and fit an array's file to measurements.")
 
 
-@array.callback()
-def _array() -> None:
-    """Arrays by name; an array's own file: what it says, and what the device does."""
-
-
-@array.command("list")
+@array.command("list", epilog="tactile-rt array list")
 def show(json: Json = None) -> None:
-    """Show the arrays that have a name, for sim:NAME and new --array NAME.
+    """List the named arrays, for sim:NAME and new --array NAME.
 
     An animal's name takes a side: mouse-left, mouse-both.
     """
@@ -55,20 +49,20 @@ def show(json: Json = None) -> None:
     show_table(found, headings, json)
 
 
-@array.command()
+@array.command(epilog="tactile-rt array fit plucks.mcap --array array.toml --out fitted.toml")
 def fit(
     recording: Annotated[str, typer.Argument(help="An .mcap file, or the URL of a source.")],
-    described: Annotated[Path, typer.Option("--array", help="The array's .toml file.")],
+    described: Annotated[Path, typer.Option("--array", help="TOML file of the array.")],
     out: Annotated[
         Path | None,
-        typer.Option(help="Where the file, brought to what was measured, goes; also over itself."),
+        typer.Option(help="File to write with the measured values; may be the array's."),
     ] = None,
     seconds: Annotated[
-        float, typer.Option(min=1, max=3600, help="Read at most so many seconds.")
+        float, typer.Option(min=1, max=3600, help="Read at most this many seconds.")
     ] = 600.0,
     json: Json = None,
 ) -> None:
-    """Measure an array from rest and plucks; show how far it is from its description.
+    """Compare an array at rest and plucked with its description.
 
     Record the array untouched for a minute or two, then bend each whisker and
     let it go, three times or more, with some seconds between.

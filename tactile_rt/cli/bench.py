@@ -33,20 +33,21 @@ AREAS = {
 FAULTS = "faults"  # of the daemon's world; takes hours
 
 
-@app.command()
+@app.command(epilog="tactile-rt bench inference --quick")
 def bench(
     area: Annotated[
-        str | None, typer.Argument(help=f"{', '.join(AREAS)}, or {FAULTS}; default: all but it.")
+        str | None,
+        typer.Argument(help=f"{', '.join(AREAS)}, or {FAULTS}. Default: all but it."),
     ] = None,
     quick: Quick = False,
     json: Json = None,
     resume: Annotated[
-        Path | None, typer.Option(help="Of faults: keep each here, and go on from there.")
+        Path | None, typer.Option(help="With faults: file of results to continue from.")
     ] = None,
 ) -> None:
-    """Measure speed and accuracy, each figure beside its bar and what it is compared to.
+    """Measure speed and accuracy against the stated limits.
 
-    `faults`, which takes hours, is not among all: each of the daemon's world, 40 times.
+    Needs a checkout. `faults` takes hours: each fault of the daemon's surroundings, 40 times.
     """
     known = (*AREAS, FAULTS)
     if area is not None and area not in known:

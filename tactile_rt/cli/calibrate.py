@@ -27,23 +27,23 @@ LOUDER = 3.0  # noise over that of the last tare that is worth a word
 
 Out = Annotated[
     Path | None,
-    typer.Option(help="The .toml to write or bring up to date. Default: the device's own."),
+    typer.Option(help="TOML file to write or update. Default: the device's own."),
 ]
-Device = Annotated[str, typer.Option(help="Id of the device. Default: what it calls itself.")]
+Device = Annotated[str, typer.Option(help="Id of the device. Default: the id that it reports.")]
 
 
-@app.command()
+@app.command(epilog="tactile-rt tare 'serial:///dev/ttyUSB0?codec=bota'")
 def tare(
     source: Url,
-    seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="How long to read.")] = 2.0,
+    seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="How long to read, s.")] = 2.0,
     device: Device = "",
     out: Out = None,
     json: Json = None,
 ) -> None:
-    """Measure what an untouched array reads, and store it as the zero of its device.
+    """Measure the zero of an untouched sensor and store it.
 
-    Refused if an element is touched meanwhile, or drifts. What else the
-    device's file holds (matrices, mapping, mirror) stays.
+    Refused if an element is touched or drifts meanwhile. Matrices, mapping and mirror in the
+    device's file are kept.
     """
     from tactile_rt.calibration import Calibration, calibration_path, save_calibration
     from tactile_rt.calibration import tare as measure
@@ -89,24 +89,24 @@ def tare(
     typer.echo(f"tare of {known.device} written to {path}", err=json == STDOUT)
 
 
-@app.command()
+@app.command(epilog="tactile-rt calibrate loads.csv --device my-sensor")
 def calibrate(
     table: Annotated[
-        Path, typer.Argument(help="A .csv: loads fx..mz, and raw_... or start_s,end_s.")
+        Path, typer.Argument(help="CSV file: loads fx..mz, and raw_... or start_s,end_s.")
     ],
     element: Annotated[
-        str, typer.Option(help="Which the loads were on. Default: the only one.")
+        str, typer.Option(help="Element that was loaded. Default: the only one.")
     ] = "",
     source: Annotated[
-        str, typer.Option(help="URL of the recording that start_s and end_s are times in.")
+        str, typer.Option(help="URL of the recording that start_s and end_s refer to.")
     ] = "",
     device: Device = "",
     out: Out = None,
     json: Json = None,
 ) -> None:
-    """Fit an element's matrix to known loads by least squares; show how well it fits.
+    """Fit an element's calibration matrix to known loads.
 
-    Without --device and --out nothing is written.
+    Fits by least squares and prints the residuals. Without --device and --out nothing is written.
     """
     from tactile_rt.calibration import (
         Calibration,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.app import add_group, app, check_output
 from tactile_rt.cli.options import set_option
 from tactile_rt.core.errors import ConfigError
 
@@ -24,8 +24,7 @@ USER = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 
 File = Annotated[Path, typer.Argument(help="The configuration, e.g. robot.toml.")]
 
-config = typer.Typer(help="The configuration of `tactile-rt run robot.toml`.", no_args_is_help=True)
-app.add_typer(config, name="config")
+config = add_group("config", "Write, check and print configurations of the daemon.")
 
 
 def serve(file: Path, sets: list[str], seconds: float | None) -> None:
@@ -40,9 +39,12 @@ def serve(file: Path, sets: list[str], seconds: float | None) -> None:
         leave(ExitCode.RUNNING)
 
 
-@config.command()
+@config.command(epilog="tactile-rt config check robot.toml")
 def check(file: File, sets: Settings = None) -> None:
-    """Say whether a configuration can work; no device is opened. Models are tried."""
+    """Check that a configuration can work, without opening a device.
+
+    Its models are loaded and tried.
+    """
     from tactile_rt.classifier.trial import TrialLimits, try_model
     from tactile_rt.daemon.admission import model_path
     from tactile_rt.daemon.checks import check_config
@@ -69,40 +71,40 @@ def check(file: File, sets: Settings = None) -> None:
             typer.echo(f"source {source.name} is made up: what is decided on it means nothing")
 
 
-@config.command()
+@config.command(epilog="tactile-rt config show robot.toml --set page.port=9000")
 def show(file: File, sets: Settings = None) -> None:
-    """Print the configuration in force: with what --set overrides, and defaults."""
+    """Print a configuration with its defaults and --set values."""
     from tactile_rt.daemon.config import config_text
     from tactile_rt.daemon.loading import load_config
 
     typer.echo(config_text(load_config(file, sets or []).config), nl=False)
 
 
-@config.command()
+@config.command(epilog="tactile-rt config example robot.toml")
 def example(
-    output: Annotated[Path | None, typer.Argument(help="Where to; default: print it.")] = None,
+    output: Annotated[Path | None, typer.Argument(help="File to write. Default: print it.")] = None,
 ) -> None:
-    """Give a configuration to begin with, in which every key is explained."""
+    """Write an example configuration that explains every key."""
     from tactile_rt.daemon.config import EXAMPLE
 
     _give(EXAMPLE, output, f"run it with: tactile-rt run {shlex.quote(str(output))}")
 
 
-@config.command()
+@config.command(epilog="tactile-rt config alerts alerts.yml")
 def alerts(
-    output: Annotated[Path | None, typer.Argument(help="Where to; default: print it.")] = None,
+    output: Annotated[Path | None, typer.Argument(help="File to write. Default: print it.")] = None,
 ) -> None:
-    """Give rules by which Prometheus tells what a daemon does not do; it needs [metrics]."""
+    """Write Prometheus alert rules for a daemon that serves metrics."""
     from tactile_rt.daemon.metrics import ALERTS
 
     _give(ALERTS.read_text("utf-8"), output, "name it under rule_files of prometheus.yml")
 
 
-@config.command("ros2-messages")
+@config.command("ros2-messages", epilog="tactile-rt config ros2-messages ws/src")
 def ros2_messages(
     folder: Annotated[Path, typer.Argument(help="The src folder of a ROS 2 workspace.")],
 ) -> None:
-    """Write tactile_rt_msgs, the ROS 2 package of what recordings and the publisher ros2 say."""
+    """Write tactile_rt_msgs, the ROS 2 package of our message types."""
     import shutil
 
     from tactile_rt.core.files import whole_folder
@@ -136,17 +138,18 @@ def _write(path: Path, text: str) -> None:
     write_whole(path, lambda file: file.write(text.encode()))
 
 
-@app.command("install-service")
+@app.command("install-service", epilog="tactile-rt install-service /etc/tactile/robot.toml")
 def install_service(
     file: Annotated[Path, typer.Argument(help="The configuration, e.g. /etc/tactile/robot.toml.")],
-    out: Annotated[
-        Path, typer.Option(help="Folder to write into; it must be new or empty.")
-    ] = Path("tactile-service"),
-    user: Annotated[str, typer.Option(help="Name that the service runs under.")] = "tactile",
+    out: Annotated[Path, typer.Option(help="New or empty folder to write into.")] = Path(
+        "tactile-service"
+    ),
+    user: Annotated[str, typer.Option(help="User that the service runs as.")] = "tactile",
 ) -> None:
-    """Write a systemd unit, udev rules for what is plugged in, and a script that installs them.
+    """Write a systemd service that starts the daemon at boot.
 
-    Nothing is changed outside the folder: read the script, then run it as root.
+    Also writes udev rules for the connected devices, and a script that installs both. Nothing is
+    changed outside the folder: read the script, then run it as root.
     """
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config

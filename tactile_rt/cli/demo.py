@@ -90,21 +90,21 @@ class RecordedPass:
     category: str
 
 
-@app.command()
+@app.command(epilog="tactile-rt demo --sweeps 5")
 def demo(
     sweeps: Annotated[
-        int, typer.Option(min=0, help="Leave after so many objects; 0: go on until Ctrl-C.")
+        int, typer.Option(min=0, help="Stop after this many objects; 0: at Ctrl-C.")
     ] = 0,
     seconds: Seconds = None,
     model: Model = None,
     seed: Seed = 0,
     fast: Fast = False,
     recorded: Annotated[
-        bool, typer.Option("--recorded", help="Play the recording, also if there is MuJoCo.")
+        bool, typer.Option("--recorded", help="Play the recording even if MuJoCo is installed.")
     ] = False,
     json: Json = None,
 ) -> None:
-    """Sweep objects that the model never saw past whiskers, and keep the score.
+    """Recognise simulated or recorded objects; needs no sensor.
 
     Without MuJoCo, or with --recorded, a short recording of simulated
     whiskers is played by an emulated device, over a serial port.

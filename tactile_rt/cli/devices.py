@@ -15,9 +15,9 @@ from tactile_rt.cli.tables import show_table, told_as_json
 WINDOW_S = 1.0
 
 
-@app.command("list")
+@app.command("list", epilog="tactile-rt list")
 def list_devices(json: Json = None) -> None:
-    """Show serial ports and CAN buses, what is likely there, and the URL to begin with."""
+    """List serial ports and CAN buses, and the URL of each sensor."""
     from tactile_rt.drivers.discovery import can_buses, serial_ports
 
     found = [
@@ -33,14 +33,14 @@ def list_devices(json: Json = None) -> None:
     show_table(found, {"device": "device", "likely": "likely", "url": "url"}, json)
 
 
-@app.command()
+@app.command(epilog="tactile-rt doctor --udev 99-tactile.rules")
 def doctor(
-    udev: Annotated[Path | None, typer.Option(help="Write udev rules for what is there.")] = None,
+    udev: Annotated[Path | None, typer.Option(help="Write udev rules for the devices.")] = None,
     json: Json = None,
 ) -> None:
-    """Look for what may keep devices from being opened or being fast; say what to do.
+    """Find what keeps devices from working, and say how to fix it.
 
-    Exit code 1 if there is anything to do.
+    Exit code 1 if there is anything to fix.
     """
     from rich.console import Console
     from rich.markup import escape
@@ -67,15 +67,15 @@ def doctor(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command(epilog="tactile-rt codecs xela")
 def codecs(
-    codec: Annotated[str, typer.Argument(help="Tell all of this one.")] = "",
+    codec: Annotated[str, typer.Argument(help="Describe this codec.")] = "",
     frame: Annotated[
-        str, typer.Option(help="Print the description of this device's frame, to change a copy.")
+        str, typer.Option(help="Print the TOML description of this device's frame.")
     ] = "",
     json: Json = None,
 ) -> None:
-    """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
+    """List the device protocols, or describe one of them."""
     from tactile_rt.core.errors import ConfigError
     from tactile_rt.core.settings import no_such
     from tactile_rt.drivers.catalogue import CODECS, FRAMES
@@ -107,12 +107,12 @@ def codecs(
         typer.echo(f"cannot detect: {one['cannot_detect']}")
 
 
-@app.command()
+@app.command(epilog="tactile-rt describe replay:demo")
 def describe(
     source: Url,
-    out: Annotated[Path | None, typer.Option(help="A file to write, instead of stdout.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write. Default: stdout.")] = None,
 ) -> None:
-    """Write a source's array (elements, poses, channels, units, rate) as JSON."""
+    """Write a source's elements, channels, units and rate as JSON."""
     import msgspec
 
     from tactile_rt.core.files import write_whole
@@ -126,9 +126,12 @@ def describe(
         write_whole(out, lambda file: file.write(text))
 
 
-@app.command()
+@app.command(epilog="tactile-rt echo replay:demo --seconds 1")
 def echo(source: Url, seconds: Seconds = None) -> None:
-    """Print every sample as one line of JSON: seq, t_ns, values (element by channel), valid."""
+    """Print every sample as a line of JSON.
+
+    Fields: seq; t_ns; values, element by channel; valid, of each element.
+    """
     import msgspec
 
     opened = open_url(source)
@@ -144,9 +147,9 @@ def echo(source: Url, seconds: Seconds = None) -> None:
                 typer.echo(msgspec.json.encode(line))
 
 
-@app.command()
+@app.command(epilog="tactile-rt hz replay:demo --seconds 3")
 def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
-    """Print once a second: the rate, the jitter of arrival, what was lost, the device's state."""
+    """Print rate, jitter, losses and device state every second."""
     import numpy as np
 
     from tactile_rt.core.stream import EndOfStream
@@ -187,12 +190,12 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     told_as_json(looks, json)
 
 
-@app.command()
+@app.command(epilog="tactile-rt dump 'serial:/dev/ttyUSB0?baud=115200'")
 def dump(
     line: Annotated[str, typer.Argument(help="serial:PORT?baud=115200 or can:INTERFACE:CHANNEL.")],
     seconds: Seconds = None,
 ) -> None:
-    """Print what comes over a line, undecoded: time, bytes in hex, text; or CAN frames."""
+    """Print the raw bytes or CAN frames of a line."""
     from tactile_rt.drivers.opening import open_line
 
     start = time.monotonic_ns()

@@ -19,20 +19,20 @@ LOOK_S = 0.25  # how often the count is renewed
 LINGER_S = 0.5  # for the host to read the last samples before the port disappears
 
 
-@app.command()
+@app.command(epilog="tactile-rt emulate native --source replay:demo --link /tmp/whisker0")
 def emulate(
     codec: Annotated[
-        str | None, typer.Argument(help="What it speaks: native, bota, xela, ...")
+        str | None, typer.Argument(help="Protocol of the device: native, bota, xela, ...")
     ] = None,
     source: Annotated[
-        str | None, typer.Option(help="What it measures: sim:mouse, replay:FILE. Default: waves.")
+        str | None, typer.Option(help="What the device measures, e.g. replay:FILE. Default: waves.")
     ] = None,
     project: ProjectFolder = None,
     wire: Annotated[
-        str | None, typer.Option(help="serial, slcan or can. Default: serial, else slcan.")
+        str | None, typer.Option(help="Wire: serial, slcan or can. Default: serial, else slcan.")
     ] = None,
     link: Annotated[
-        Path | None, typer.Option(help="A name for the port, e.g. /tmp/whisker0.")
+        Path | None, typer.Option(help="Link to make to the port, e.g. /tmp/whisker0.")
     ] = None,
     bus: Annotated[
         str | None, typer.Option(help="For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
@@ -40,23 +40,20 @@ def emulate(
     faults: Faults = None,
     sets: Annotated[
         list[str] | None,
-        set_option("An option of codec or line: format=int16, baud=9600, bitrate=0 (no speed)"),
+        set_option("An option of the codec or line: format=int16, baud=9600, bitrate=0 (no speed)"),
     ] = None,
     fast: Fast = False,
     seconds: Annotated[
         float | None,
-        typer.Option(min=0.001, max=1e9, help="Send so many seconds of samples, then leave."),
+        typer.Option(min=0.001, max=1e9, help="Stop after this many seconds of samples."),
     ] = None,
 ) -> None:
-    """Emulate a device: whoever opens the port that is printed meets it.
+    """Emulate a device on a serial port or CAN bus.
 
-    It sends once it is listened to and, if that is its protocol, asked to.
-    With --faults it misbehaves as scheduled. Each fault has a kind
-    (bit_flip, truncate, duplicate, burst, stall, drop, clock_drift,
-    clock_jump, sequence_reset, unplug, gather, can_error), a rate per second or
-    at_s, and, where the kind has them, duration_s and amount.
-
-    Ctrl-C leaves.
+    It prints its port, and sends once a program has opened it and, where the protocol demands
+    that, has asked for samples. Each fault of --faults has a kind (bit_flip, truncate, duplicate,
+    burst, stall, drop, clock_drift, clock_jump, sequence_reset, unplug, gather, can_error), a rate
+    per second or at_s, and, where the kind has them, duration_s and amount. Ctrl-C ends it.
     """
     from tactile_rt.drivers.catalogue import CODECS
     from tactile_rt.drivers.codec import codec_class

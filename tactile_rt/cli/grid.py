@@ -12,20 +12,18 @@ from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 
 
-@app.command()
+@app.command(epilog="tactile-rt grid wide24 grid --processes 2")
 def grid(
-    plan: Annotated[
-        str, typer.Argument(help="A TOML file, or a shipped one: wide24, wide24-full.")
-    ],
-    folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
-    processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
+    plan: Annotated[str, typer.Argument(help="TOML file, or a shipped plan: wide24, wide24-full.")],
+    folder: Annotated[Path, typer.Argument(help="Output folder; finished tasks are kept.")],
+    processes: Annotated[int, typer.Option(min=1, help="Networks to train in parallel.")] = 2,
     accelerator: Accelerator = "cpu",
     json: Json = None,
 ) -> None:
-    """Train encoder x attender x objective, each tuned alike, and draw how well they do.
+    """Train and compare many networks, each tuned alike.
 
-    Killed at any time, it goes on where it was. FOLDER gets results.json, results.md and
-    task_performance.png.
+    A plan combines encoders, attenders and objectives. An interrupted grid continues. FOLDER gets
+    results.json, results.md and task_performance.png.
     """
     from tactile_rt.models.grid.outcomes import Outcome, waiting_tasks
     from tactile_rt.models.grid.plan import read_grid

@@ -22,38 +22,37 @@ if TYPE_CHECKING:
 SWEEPS = 6  # unless told otherwise
 
 
-@app.command()
+@app.command(epilog="tactile-rt hil --wire slcan --sweeps 3")
 def hil(
     source: Annotated[
         str | None,
-        typer.Option(help="What the device measures. Default: sim:mouse with new objects."),
+        typer.Option(help="What the device measures. Default: sim:mouse, new objects."),
     ] = None,
     wire: Annotated[
         str | None,
-        typer.Option(help="serial, slcan or virtual (a CAN bus). Default: serial, or a project's."),
+        typer.Option(help="Wire: serial, slcan or virtual (CAN). Default: serial, or a project's."),
     ] = None,
     codec: Annotated[
-        str | None, typer.Option(help="What the device speaks. Default: native, or a project's.")
+        str | None, typer.Option(help="Protocol of the device. Default: native, or a project's.")
     ] = None,
     sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
     faults: Faults = None,
     sweeps: Annotated[
-        int | None, typer.Option(min=1, help=f"Of sim:, how many objects pass. Default: {SWEEPS}.")
+        int | None, typer.Option(min=1, help=f"Objects that pass, with sim:. Default: {SWEEPS}.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
+        float | None,
+        typer.Option(min=0.001, max=1e9, help="Stop after this many seconds of the stream."),
     ] = None,
     model: Model = None,
     project: ProjectFolder = None,
     json: Json = None,
 ) -> None:
-    """Run a simulated array through an emulated device and its real driver.
+    """Test decisions through an emulated device and a real driver.
 
-    The classifier's decisions on what the driver delivers are compared with
-    those on the same samples without device and wire. Native float32 must be
-    equal in every bit; of what a format rounds, 99 % of the decisions must
-    have the same label; with --faults, each loss must be counted. Exit code
-    1 if it is not so.
+    The decisions on the driver's samples are compared with those on the same samples without device
+    and wire. Native float32 must be equal in every bit; with a format that rounds, 99 % of the
+    decisions must keep their label; with --faults, each loss must be counted. Exit code 1 if not.
     """
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.drivers.emulation.faults import read_faults

@@ -14,41 +14,42 @@ from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError
 
 
-@app.command("import")
+@app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
 def import_file(
-    log: Annotated[Path, typer.Argument(help="Bytes, a CAN log, a table of numbers, a bag.")],
+    log: Annotated[Path, typer.Argument(help="Raw bytes, a CAN log, a table of numbers or a bag.")],
     output: Annotated[
-        Path | None, typer.Argument(help="The recording. Default: LOG.mcap, in this folder.")
+        Path | None, typer.Argument(help="The recording. Default: LOG.mcap in this folder.")
     ] = None,
     decoded_as: Annotated[
-        str, typer.Option("--as", help="What a device spoke: codec=NAME&OPTION=VALUE.")
+        str, typer.Option("--as", help="Codec of the device: codec=NAME&OPTION=VALUE.")
     ] = "",
     columns: Annotated[
         str,
-        typer.Option(help="Of a table or bag: NAME=ELEMENT.CHANNEL*SCALE:UNIT,... or FILE.toml."),
+        typer.Option(help="Columns to read: NAME=ELEMENT.CHANNEL*SCALE:UNIT,... or FILE.toml."),
     ] = "",
-    topic: Annotated[str, typer.Option(help="Of a bag: which topic.")] = "",
+    topic: Annotated[str, typer.Option(help="Topic to read from a bag.")] = "",
     rate: Annotated[
-        float, typer.Option(min=0, help="Samples a second, Hz, where nothing tells the time.")
+        float, typer.Option(min=0, help="Samples per second, if the log has no times.")
     ] = 0,
-    bus: Annotated[str, typer.Option(help="Of a log of several buses: which, e.g. can0.")] = "",
-    form: Annotated[str, typer.Option(help="Of the log, if it is taken for another.")] = "",
-    delimiter: Annotated[str, typer.Option(help="Of a table: a character, tab or space.")] = "",
-    decimal: Annotated[str, typer.Option(help="Of a table: , or . in numbers.")] = "",
-    skip: Annotated[int, typer.Option(min=0, help="Of a table: lines to pass over.")] = 0,
+    bus: Annotated[str, typer.Option(help="Bus to read from a log of several, e.g. can0.")] = "",
+    form: Annotated[str, typer.Option(help="Format of the log, if it is detected wrongly.")] = "",
+    delimiter: Annotated[str, typer.Option(help="Column delimiter: character, tab or space.")] = "",
+    decimal: Annotated[str, typer.Option(help="Decimal mark of a table: a comma or a point.")] = "",
+    skip: Annotated[int, typer.Option(min=0, help="Lines of a table to skip.")] = 0,
     lines: Annotated[
-        int, typer.Option(min=1, max=1000, help="Of a table: lines of text that are one row.")
+        int, typer.Option(min=1, max=1000, help="Lines of text per row of a table.")
     ] = 1,
     force: Force = False,
     json: Json = None,
 ) -> None:
-    """Make a recording of what is on the disk; `tactile-rt sniff` tells how.
+    """Make a recording from a log, a table or a ROS bag.
 
-    Raw bytes, hexadecimal text, what a terminal logged, and logs of a CAN
-    bus (candump, asc, blf, trc, SavvyCAN) are decoded --as a codec. Tables
-    (CSV, what a board or yarpdatadumper printed) need --columns. Of ROS 1
-    and ROS 2 bags (the extra "import") wrenches, arrays and our own
-    messages need nothing more. gzip is unpacked.
+    `tactile-rt sniff` proposes the options.
+
+    Raw bytes, hexadecimal text, logs of a terminal and logs of a CAN bus (candump, asc, blf, trc,
+    SavvyCAN) are decoded --as a codec. Tables (CSV, output of a board or of yarpdatadumper) need
+    --columns. Wrenches, arrays and our own messages of ROS 1 and ROS 2 bags (extra "import") need
+    no option. gzip is unpacked.
     """
 
     if not log.exists():

@@ -14,40 +14,41 @@ from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, RecordingError
 
 
-@app.command()
+@app.command(epilog="tactile-rt label mug-1.mcap box-1.mcap touches --by-name")
 def label(
     files: Annotated[
         list[Path],
         typer.Argument(
             metavar="RECORDING... OUT",
-            help="Recordings, .mcap; then the folder of the sweep set.",
+            help="Recordings (.mcap), then the folder of the sweep set.",
         ),
     ],
     labels: Annotated[
-        Path | None, typer.Option(help="What was touched when; default: labels.csv beside them.")
+        Path | None,
+        typer.Option(help="CSV file of labels. Default: labels.csv beside them."),
     ] = None,
     by_name: Annotated[
-        bool, typer.Option("--by-name", help="The file's name is the label: mug-3.mcap is of mugs.")
+        bool, typer.Option("--by-name", help="Take labels from file names: mug-3.mcap is of a mug.")
     ] = False,
     unlabelled: Annotated[
-        bool, typer.Option("--unlabelled", help="Every touch, to pretrain on by --recipe simclr.")
+        bool,
+        typer.Option("--unlabelled", help="All touches, to pretrain with --recipe simclr."),
     ] = False,
     like: Annotated[
         Path | None,
-        typer.Option(help="A sweep set or model of the array: its sensor and sample period."),
+        typer.Option(help="Sweep set or model whose sensor and sample period to use."),
     ] = None,
     shares: Annotated[
-        str, typer.Option(help="Shares of the objects: train,validation,test.")
+        str, typer.Option(help="Shares of the objects in train,validation,test.")
     ] = "0.7,0.15,0.15",
     seed: Seed = 0,
     force: Force = False,
     json: Json = None,
 ) -> None:
-    """Make a sweep set of recordings, to train and evaluate on.
+    """Make a sweep set from labelled recordings, to train on.
 
-    labels.csv says what was touched when: recording,start_s,end_s,label
-    and, if you like, object; times are seconds since the recording's
-    first sample. What cannot be used is counted on stderr.
+    The columns of labels.csv: recording,start_s,end_s,label and, optionally, object; times are
+    seconds since the recording's first sample. Touches that cannot be used are counted on stderr.
     """
     from tactile_rt.recording.labelled_set import write_set
     from tactile_rt.recording.labelling import (

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import add_group, app, check_output, needing
 from tactile_rt.cli.options import STDOUT, Json, Quick
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
@@ -17,16 +17,15 @@ from tactile_rt.core.errors import ModelError
 
 __all__ = []
 
-model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
-app.add_typer(model, name="model")
+model = add_group("model", "Inspect, verify and time a model file.")
 
-File = Annotated[Path, typer.Argument(help="An .onnx model.")]
+File = Annotated[Path, typer.Argument(help="Model file, .onnx.")]
 MANY = 8  # classes named before "..."
 
 
-@model.command()
+@model.command(epilog="tactile-rt model show model.onnx")
 def show(file: File, json: Json = None) -> None:
-    """What a model is: read, not run."""
+    """Show what a model file contains, without running it."""
     from tactile_rt.classifier.model_card import one_line
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.core.stream import NS_PER_S
@@ -79,13 +78,13 @@ def show(file: File, json: Json = None) -> None:
     print_table(table)
 
 
-@model.command()
+@model.command(epilog="tactile-rt model verify model.onnx")
 def verify(file: File, json: Json = None) -> None:
-    """Whether a file is whole, and computes here what it did where it was made.
+    """Check that a model file is whole and computes the same here.
 
-    Reads it within bounds, checks its metadata against its graph, tries it in a
-    process of its own as the daemon does, runs an episode of built-in input, and
-    compares the logits with those in the file.
+    Reads it within size limits, checks its metadata against its graph, loads it in a separate
+    process as the daemon does, runs an episode of built-in input, and compares the logits with
+    those in the file.
     """
     import hashlib
 
@@ -119,13 +118,13 @@ def verify(file: File, json: Json = None) -> None:
     told_as_json(told, json)
 
 
-@model.command()
+@model.command(epilog="tactile-rt model bench model.onnx --steps 500")
 def bench(
     file: File,
     steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
     json: Json = None,
 ) -> None:
-    """Measure it here: size, loading, memory, CPU time of a step."""
+    """Measure a model's size, loading, memory and time per step."""
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.export.model_steps import Subject, measure_model
 
@@ -163,21 +162,23 @@ def _pairs(values: dict[str, Any]) -> str:
     return "\n".join(f"{key}: {said(value)}" for key, value in values.items())
 
 
-@app.command(name="eval")
+@app.command("eval", epilog="tactile-rt eval model.onnx sweeps --pictures pictures")
 def evaluate(
-    model: Annotated[Path, typer.Argument(help="An .onnx model.")],
+    model: File,
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
     svm: Annotated[
-        bool, typer.Option("--svm", help="Fit an RBF SVM on the same windows too.")
+        bool, typer.Option("--svm", help="Also fit an RBF SVM on the same windows.")
     ] = False,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for confusion and accuracy over time.")
+        Path | None, typer.Option(help="Folder for pictures of confusion and accuracy over time.")
     ] = None,
     quick: Quick = False,
     json: Json = None,
 ) -> None:
-    """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
-    and what else goes wrong with a sensor."""
+    """Measure a model on the test objects of a sweep set.
+
+    Reports accuracy, fusion of touches, calibration, noise and faults of the sensor.
+    """
     from tactile_rt.sets.manifest import SweepManifest
 
     SweepManifest.read(data)

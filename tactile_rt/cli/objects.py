@@ -7,34 +7,28 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from tactile_rt.cli.app import app, needing
+from tactile_rt.cli.app import add_group, needing
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
-objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
-app.add_typer(objects, name="objects")
+objects = add_group("objects", "Download objects to simulate, and check meshes of your own.")
 
 
-@objects.callback()
-def _objects() -> None:
-    """Objects that others made: get those of a list, and see how well they can be used."""
-
-
-@objects.command()
+@objects.command(epilog="tactile-rt objects get real objects")
 def get(
-    wanted: Annotated[str, typer.Argument(metavar="LIST", help="real, or a .csv file.")],
-    folder: Annotated[Path, typer.Argument(help="Where they are put: FOLDER/CATEGORY/NAME.ply.")],
+    wanted: Annotated[str, typer.Argument(metavar="LIST", help="The list: real, or a CSV file.")],
+    folder: Annotated[Path, typer.Argument(help="Folder to write: FOLDER/CATEGORY/NAME.ply.")],
     clones: Annotated[
         Path | None,
-        typer.Option(help="A folder of clones of the repositories, instead of GitHub."),
+        typer.Option(help="Folder of cloned repositories to use instead of GitHub."),
     ] = None,
     json: Json = None,
 ) -> None:
-    """Get the objects of a list into a folder, every file checked by its hash.
+    """Download the objects of a list and check every file's hash.
 
-    Called again it goes on with what is missing. Exit code 1 if anything is.
+    A second call fetches what is missing. Exit code 1 if anything still is.
     """
     from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
 
@@ -59,14 +53,14 @@ def get(
     raise typer.Exit(1 if missing else 0)
 
 
-@objects.command()
+@objects.command(epilog="tactile-rt objects check objects")
 def check(
-    folder: Annotated[Path, typer.Argument(help="CATEGORY/OBJECT.stl, or ShapeNetCore's layout.")],
+    folder: Annotated[Path, typer.Argument(help="Folder: CATEGORY/OBJECT.stl, or ShapeNetCore.")],
     json: Json = None,
 ) -> None:
-    """Load every object of a folder once: how many can be used, how near, and why others cannot.
+    """Load every object of a folder and report which can be used.
 
-    Exit code 1 if some cannot.
+    Also reports how near the simulated surfaces are. Exit code 1 if some cannot be used.
     """
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}")

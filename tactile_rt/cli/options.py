@@ -61,28 +61,26 @@ Json = Annotated[
     Path | None,
     typer.Option(help="Also write results as JSON; `-` prints JSON only.", callback=_check_json),
 ]
-Model = Annotated[
-    Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
-]
+Model = Annotated[Path | None, typer.Option(help="Model file, .onnx. Default: the shipped model.")]
 Seconds = Annotated[
-    float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
+    float | None, typer.Option(min=0.001, max=1e9, help="Stop after this many seconds.")
 ]
-Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of what is drawn at random.")]
-Fast = Annotated[bool, typer.Option("--fast", help="As fast as it goes, not in real time.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace a file that is there.")]
-Quick = Annotated[bool, typer.Option("--quick", help="Measure less: a look, not a figure.")]
-Faults = Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")]
+Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the random numbers.")]
+Fast = Annotated[bool, typer.Option("--fast", help="Run as fast as possible, not in real time.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Measure less, for a first look.")]
+Faults = Annotated[Path | None, typer.Option(help="TOML file of the faults to inject.")]
 ProjectFolder = Annotated[
-    Path | None, typer.Option(help="A folder of `tactile-rt new`: its array, device and model.")
+    Path | None, typer.Option(help="Folder of `tactile-rt new`: its array, device and model.")
 ]
-Array = Annotated[str, typer.Option(help="mouse, rat, rat-left, ..., or a file.")]
-Accelerator = Annotated[str, typer.Option(help="auto, cpu, cuda ...")]
-Page = Annotated[Path | None, typer.Option("--out", help="Write it as a page here, .html.")]
+Array = Annotated[str, typer.Option(help="Array: mouse, rat, rat-left, ..., or a file.")]
+Accelerator = Annotated[str, typer.Option(help="Processor to train on: auto, cpu, cuda, ...")]
+Page = Annotated[Path | None, typer.Option("--out", help="Also write an HTML page here.")]
 Stimuli = Annotated[
     Path | None,
-    typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
+    typer.Option(help="File of `tactile-rt whisk`. Default: the shipped file of the mouse array."),
 ]
 Sessions = Annotated[
     list[str] | None,
-    typer.Option("--session", help="Only sessions whose name has this; * and ? fit any."),
+    typer.Option("--session", help="Only sessions with this in their name; wildcards * and ?."),
 ]

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 ABOUT = ("top-1", "top-1 at rated noise", "RBF SVM top-1", "points above the SVM")
 
 
-@app.command()
+@app.command(epilog="tactile-rt new my-robot --array mouse --classes mug,bottle")
 def new(
-    folder: Annotated[Path, typer.Argument(help="Where the project begins: a new folder.")],
+    folder: Annotated[Path, typer.Argument(help="New folder of the project.")],
     array: Annotated[
-        str, typer.Option(help="A .toml file, or one of `array list`; default: an example.")
+        str, typer.Option(help="TOML file, or a name of `array list`. Default: an example.")
     ] = "",
     classes: Annotated[
-        str, typer.Option(help="Categories of objects to tell apart, comma-separated.")
+        str, typer.Option(help="Object categories to tell apart, comma-separated.")
     ] = "",
 ) -> None:
-    """Begin a project: your whiskers, what touches them, your robot."""
+    """Begin a project: a model for your own array, by simulation."""
     with needing("sim"):
         from tactile_rt.project.folder import KINDS, new_project
     chosen = tuple(k.strip() for k in classes.split(",") if k.strip()) or KINDS
@@ -37,17 +37,17 @@ def new(
     typer.echo(f"{folder}: edit array.toml and sweeps.toml, then `{again}`")
 
 
-@app.command()
+@app.command(epilog="tactile-rt make my-robot --minutes 60")
 def make(
-    folder: Annotated[Path, typer.Argument(help="A project: see `tactile-rt new`.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of `tactile-rt new`.")],
     minutes: Annotated[
-        float, typer.Option(help="For all of it; less time makes a smaller model.")
+        float, typer.Option(help="Time for all steps; less time makes a smaller model.")
     ] = 60.0,
     json: Json = None,
 ) -> None:
-    """Make a project's model: sweeps, training, export, evaluation, report.
+    """Make a project's model: simulate, train, export, evaluate.
 
-    What is there is not made again; what was interrupted goes on.
+    Finished steps are not repeated; an interrupted step continues.
     """
     console = Console(stderr=True, soft_wrap=True)
     with needing("sim,train"):

@@ -22,22 +22,21 @@ POLL_S = 0.1
 TELL_S = 1.0
 
 
-@app.command()
+@app.command(epilog="tactile-rt record replay:demo touches.mcap --seconds 5")
 def record(
     source: Url,
-    output: Annotated[Path, typer.Argument(help="The recording, a .mcap.")],
+    output: Annotated[Path, typer.Argument(help="The recording to write, .mcap.")],
     seconds: Seconds = None,
     note: Annotated[
-        list[str] | None, typer.Option(help="To keep with it: NAME=VALUE; may be repeated.")
+        list[str] | None, typer.Option(help="Note to store: NAME=VALUE; may be repeated.")
     ] = None,
     force: Force = False,
     json: Json = None,
 ) -> None:
-    """Record a source's samples and, of a device, its raw packets and health.
+    """Record a source's samples, raw packets and device health.
 
-    A line a second goes to stderr. Ctrl-C ends it; what is in the file
-    then is whole. Of a recorder that was killed, `tactile-rt recover`
-    makes a whole file, too.
+    A line a second goes to stderr. Ctrl-C ends it and leaves a whole file; `tactile-rt recover`
+    repairs the file of a recorder that was killed.
     """
     from tactile_rt.recording import StreamWriter
 
@@ -108,16 +107,16 @@ def _notes(given: list[str]) -> dict[str, str]:
     return notes
 
 
-@app.command()
+@app.command(epilog="tactile-rt recover touches.mcap")
 def recover(
-    recording: Annotated[Path, typer.Argument(help="One that was cut short, or is damaged.")],
+    recording: Annotated[Path, typer.Argument(help="Recording that was cut short or is damaged.")],
     out: Annotated[
-        Path | None, typer.Option(help="Where to; default: beside it, NAME.recovered.mcap.")
+        Path | None, typer.Option(help="File to write. Default: NAME.recovered.mcap beside it.")
     ] = None,
     force: Force = False,
     json: Json = None,
 ) -> None:
-    """Make a whole recording of what is left of one; the old file stays."""
+    """Repair a damaged recording in a new file."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording import recover as recovered
 
@@ -139,38 +138,35 @@ def recover(
         typer.echo(f"{made}: {n} samples, {(last - first) / 1e9:.1f} s")
 
 
-@app.command()
+@app.command(epilog="tactile-rt convert touches.mcap touches.npz")
 def convert(
     files: Annotated[
         list[Path],
         typer.Argument(
             metavar="RECORDING... OUTPUT",
-            help="A .mcap; then a .npz, .csv or .h5, or a folder.",
+            help="Recordings (.mcap), then a .npz, .csv or .h5 file or a folder.",
         ),
     ],
-    to: Annotated[
-        str, typer.Option(help="ros2 or lerobot: a folder, of one .mcap or of several.")
-    ] = "",
-    fps: Annotated[int, typer.Option(min=1, max=1000, help="Of lerobot: rows a second.")] = 30,
+    to: Annotated[str, typer.Option(help="Write a folder of this kind: ros2 or lerobot.")] = "",
+    fps: Annotated[int, typer.Option(min=1, max=1000, help="With lerobot: rows per second.")] = 30,
     task: Annotated[
-        str, typer.Option(help="Of lerobot: what was done; default: the note `task`.")
+        str, typer.Option(help="With lerobot: the task. Default: the note `task`.")
     ] = "",
     video: Annotated[
         list[str] | None,
         typer.Option(
-            help="Of lerobot: NAME=FILE or NAME=FILE@SECONDS, a camera's film and how long after "
-            "the first sample it begins; may be repeated."
+            help="With lerobot: a camera's film, NAME=FILE or NAME=FILE@SECONDS (its start after "
+            "the first sample); may be repeated."
         ),
     ] = None,
     force: Force = False,
     json: Json = None,
 ) -> None:
-    """Write a recording as arrays (.npz, .h5), text (.csv), bag or dataset.
+    """Convert a recording to npz, CSV, HDF5, ROS 2 or LeRobot.
 
-    Arrays hold samples, description, decisions, events and health; a .csv
-    and a dataset hold the samples; raw packets are in the .mcap and in
-    bags alone. OUTPUT may be left out with --to: RECORDING-ros2,
-    RECORDING-lerobot.
+    A .npz or .h5 holds samples, description, decisions, events and health; a .csv and a LeRobot
+    dataset hold the samples; a ROS 2 bag also holds the raw packets. With --to, OUTPUT may be left
+    out: RECORDING-ros2, RECORDING-lerobot.
     """
     from tactile_rt.recording.conversion import convert as converted
 

@@ -21,36 +21,32 @@ RECORDED = "recorded"  # the codec and options by which packets were decoded liv
 TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # of a decision's message: not the same twice
 
 
-@app.command()
+@app.command(epilog="tactile-rt replay touches.mcap --model model.onnx")
 def replay(
     files: Annotated[
-        list[Path], typer.Argument(help="A recording; or the rotated files of one source.")
+        list[Path], typer.Argument(help="A recording, or the rotated files of one source.")
     ],
     model: Annotated[
-        Path | None, typer.Option(help="An .onnx model; default: the one that decided live.")
+        Path | None, typer.Option(help="Model file, .onnx. Default: the one that decided live.")
     ] = None,
-    name: Annotated[str, typer.Option(help="Which of several models that decided live.")] = "",
-    speed: Annotated[
-        str, typer.Option(help="Times the recorded pace, 1 for as it was; or max.")
-    ] = "max",
+    name: Annotated[str, typer.Option(help="Name of the model, if several decided live.")] = "",
+    speed: Annotated[str, typer.Option(help="Speed relative to the recorded one, or max.")] = "max",
     codec: Annotated[
         str,
         typer.Option(help="Decode the raw packets: recorded (as live), NAME or NAME?OPTION=VALUE."),
     ] = "",
     check: Annotated[
-        bool, typer.Option("--check", help="Compare with the recorded decisions; 1: they differ.")
+        bool, typer.Option("--check", help="Compare with the recorded decisions.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Where decisions go; default: stdout.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File of decisions. Default: stdout.")] = None,
     force: Force = False,
 ) -> None:
-    """Let a model decide on a recording, as it did or would have done live.
+    """Run a model on a recording, as it ran or would have run live.
 
-    One line of JSON per decision, as the daemon's `decision` messages,
-    less the times that they took: the same bytes at every speed and in
-    every run. With --check they are compared with the recorded ones
-    instead of printed; exit code 1, and the first difference, if there is
-    one. With --codec the samples are decoded anew, and how they differ from
-    the recorded ones goes to stderr.
+    One line of JSON per decision, as the daemon's `decision` messages, without the times that they
+    took: the same bytes at every speed and in every run. With --check they are compared with the
+    recorded ones instead of printed; exit code 1, and the first difference, if there is one. With
+    --codec the samples are decoded anew, and their differences from the recorded ones go to stderr.
     """
     fields = {"speed": _speed(speed)} | _decoding(codec)
     if out is not None:

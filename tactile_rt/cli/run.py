@@ -11,37 +11,36 @@ from tactile_rt.cli.options import Model, Seconds
 from tactile_rt.core.errors import ConfigError, SpecMismatch
 
 
-@app.command()
+@app.command(epilog="tactile-rt run --source replay:demo --final-only")
 def run(
     file: Annotated[
-        Path | None, typer.Argument(help="A configuration: run the daemon, e.g. robot.toml.")
+        Path | None, typer.Argument(help="Configuration of the daemon, e.g. robot.toml.")
     ] = None,
     source: Annotated[
         str | None, typer.Option(help="URL of a source, e.g. sim:mouse?objects=mug.")
     ] = None,
     model: Model = None,
     final_only: Annotated[
-        bool, typer.Option("--final-only", help="Print the last decision of each touch alone.")
+        bool, typer.Option("--final-only", help="Print only the last decision of each touch.")
     ] = False,
     seconds: Seconds = None,
     sets: Settings = None,
 ) -> None:
-    """Run the daemon on a configuration, or classify what one source's array touches.
+    """Run the daemon, or print a model's decisions on one source.
 
-    With a FILE everything is said there (`tactile-rt config example`);
-    SIGHUP reads it again, SIGTERM closes it. Exit codes: 0 stopped, 2 wrong
+    With FILE, run the daemon of that configuration (`tactile-rt config example` writes one);
+    SIGHUP reads it again, SIGTERM stops the daemon. Exit codes: 0 stopped, 2 wrong
     configuration, 3 already running, 4 stopped but something hung.
 
     With --source, print one line of JSON per decision.
 
-    Fields: type ("classification"); t_ns and onset_ns, times of the last
-    sample used and of first contact on the stream's clock; step since onset,
-    from 1; final, whether it is the episode's last; label, the most probable
-    class, or a refusal to name one ("unknown"); probabilities of all of them;
-    prediction_set, the classes that are still possible, with coverage, how
-    often the true one is among them; latency_ms of the model step.
+    Fields: type ("classification"); t_ns and onset_ns, times of the last sample used and of first
+    contact on the stream's clock; step since onset, from 1; final, true for the episode's last;
+    label, the most probable class, or a refusal to name one ("unknown"); probabilities of all of
+    them; prediction_set, the classes that are still possible, and coverage, how often the true
+    one is among them; latency_ms of the model step.
 
-    A summary goes to stderr. Ctrl-C leaves.
+    A summary goes to stderr. Ctrl-C ends it.
     """
     if file is not None:
         if source is not None or model is not None or final_only:

@@ -22,35 +22,35 @@ DESCRIBE = "frames of one length can be described: codec=binary_frame"
 GUESSED_HZ = 100  # where nothing tells the time
 
 
-@app.command()
+@app.command(epilog="tactile-rt sniff /dev/ttyUSB0 --ask")
 def sniff(
     target: Annotated[
         str,
         typer.Argument(help="A port, can:INTERFACE:CHANNEL, a log, a table or a bag."),
     ],
     seconds: Annotated[
-        float, typer.Option(min=0.05, max=60, help="How long to listen, at each baud rate.")
+        float, typer.Option(min=0.05, max=60, help="How long to listen at each baud rate, s.")
     ] = 0.5,
     baud: Annotated[
-        list[int] | None, typer.Option(help="The baud rates to try; may be repeated.")
+        list[int] | None, typer.Option(help="Baud rate to try; may be repeated.")
     ] = None,
     further: Annotated[
         list[str] | None,
-        typer.Option("--try", help="Try codec=NAME&OPTION=VALUE, too; may be repeated."),
+        typer.Option("--try", help="Also try codec=NAME&OPTION=VALUE; may be repeated."),
     ] = None,
     ask: Annotated[
-        bool, typer.Option("--ask", help="Send what starts each device; without, only listen.")
+        bool, typer.Option("--ask", help="Also send the start command of each codec.")
     ] = False,
     json: Json = None,
 ) -> None:
-    """Find out what a device speaks, from half a second of it.
+    """Find the protocol of a device, a log, a table or a bag.
 
-    Every codec, with the options that change its frames, is fed with what
-    comes, on a port at every baud rate that codecs name. Those that fit are
-    listed, the best first; of lines of text, columns are proposed. The last
-    line is the command to go on with. Exit code 1: nothing fits.
+    Every codec, with the options that change its frames, decodes half a second of the data, on
+    a port at every baud rate that codecs name. Those that fit are listed, the best first; for
+    lines of text, columns are proposed. The last line is the command to continue with. Exit
+    code 1: nothing fits.
 
-    It only listens. A device that must be told to send is found with --ask.
+    It only listens. A device that waits for a start command is found with --ask.
     """
     from tactile_rt.cli.importing import codec_fields
 

@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 
 
-@app.command()
+@app.command(epilog="tactile-rt sweep sweeps --set objects.per_category=10")
 def sweep(
-    folder: Annotated[Path, typer.Argument(help="Where the set goes; an unfinished one goes on.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the set; an unfinished one continues.")],
     recipe: Annotated[
         str | None,
         typer.Option(
-            help="What to make: wide24, default24, mouse12, paper-lowvar-highfi, "
-            "paper-highvar-lowfi, or a TOML file. Default: the folder's own, or else wide24."
+            help="Recipe: wide24, default24, mouse12, paper-lowvar-highfi, "
+            "paper-highvar-lowfi, or a TOML file. Default: the folder's own, else wide24."
         ),
     ] = None,
     profile: Annotated[
-        str | None, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+        str | None, typer.Option(help="Accuracy: realtime, dataset (finer), accurate.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of the drawn sweep parameters.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the sweep parameters.")] = None,
     sets: Annotated[
         list[str] | None,
         set_option("Any key of the recipe: objects.per_category=10, sweeps.draws=2, contacts=true"),
@@ -37,21 +37,21 @@ def sweep(
     split: Annotated[
         str | None, typer.Option(help="Only these splits, comma-separated: test,withheld.")
     ] = None,
-    processes: Annotated[int, typer.Option(min=0, help="At a time; 0: one per core.")] = 0,
+    processes: Annotated[int, typer.Option(min=0, help="Processes to run; 0: one per core.")] = 0,
     ray: Annotated[
         str | None,
-        typer.Option(help="On a Ray cluster: its address; auto: the one that runs here, or none."),
+        typer.Option(help="Ray cluster: HOST:PORT, local, or auto (a running one, else local)."),
     ] = None,
     card: Annotated[
         bool,
-        typer.Option("--card", help="When all is made, describe the set: README.md with pictures."),
+        typer.Option("--card", help="Also describe the set in a README.md with pictures."),
     ] = False,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Make nothing: check the set's checksums.")
+        bool, typer.Option("--verify", help="Only check the set's checksums.")
     ] = False,
     json: Json = None,
 ) -> None:
-    """Sweep simulated objects past the whisker array and store what it feels."""
+    """Simulate sweeps of objects past an array as a training set."""
     check_output(json)
     console = Console(stderr=True, soft_wrap=True)
     if verify:

@@ -31,31 +31,31 @@ ORDERS = {"n": "next", "u": "undo", "q": "done"}
 HASTY = "that came too soon after the last touch to be one: wait a second"
 
 
-@app.command()
+@app.command(epilog="tactile-rt teach 'serial:///dev/ttyUSB0?codec=bota' lesson --classes tap,rub")
 def teach(
     source: Url,
     folder: Annotated[
-        Path, typer.Argument(help="Where the lesson is kept; one that is there goes on.")
+        Path, typer.Argument(help="Folder of the lesson; an existing one continues.")
     ],
     classes: Annotated[
-        str, typer.Option(help="What is to be touched, comma-separated; more may come by name.")
+        str, typer.Option(help="Classes to touch, comma-separated; more can be added later.")
     ] = "",
-    touches: Annotated[int, typer.Option(min=2, max=1000, help="Of each.")] = 10,
+    touches: Annotated[int, typer.Option(min=2, max=1000, help="Touches of each class.")] = 10,
     page: Annotated[
-        str, typer.Option(help="Serve buttons for a browser here, e.g. 127.0.0.1:8791.")
+        str, typer.Option(help="Serve buttons for a browser, e.g. at 127.0.0.1:8791.")
     ] = "",
     model: Annotated[
         str,
-        typer.Option(help="Class-incremental: new classes for this .onnx file, or `shipped`."),
+        typer.Option(help="Add the classes to this .onnx file, or to `shipped`."),
     ] = "",
     seconds: Seconds = None,
     json: Json = None,
 ) -> None:
-    """Touch it ten times a class (few-shot), and it knows the classes: FOLDER/model.onnx.
+    """Teach a model new classes by ten touches of each.
 
-    Keep the sensor untouched for two seconds, then touch as you are told. A line is an order: a
-    class's name or number, n (next), u (undo: takes the last touch back), or q (done: learns and
-    leaves).
+    This is few-shot learning. Keep the sensor untouched for two seconds, then touch as prompted.
+    Type a class's name or number, n (next), u (undo the last touch) or q (learn FOLDER/model.onnx,
+    and stop).
     """
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.core.locks import alone_in

@@ -32,18 +32,18 @@ COLOURS = {
 }  # fmt: skip
 
 
-@app.command()
+@app.command(epilog="tactile-rt top --once")
 def top(
     where: Annotated[
-        str, typer.Argument(help="The daemon's [metrics], or - for its jsonl on standard input.")
+        str, typer.Argument(help="URL of the daemon's metrics, or - for its JSON lines on stdin.")
     ] = "http://127.0.0.1:9464",
-    once: Annotated[bool, typer.Option("--once", help="Look once, and print.")] = False,
+    once: Annotated[bool, typer.Option("--once", help="Print once and stop.")] = False,
     json: Json = None,
 ) -> None:
-    """Show sources, models, consumers, losses and latencies of a running daemon.
+    """Show sources, models, losses and latencies of a daemon.
 
-    It asks for /state of [metrics]. Without that, let a jsonl publisher have state_s = 1:
-    tactile-rt run robot.toml | tactile-rt top -
+    It asks for /state of the daemon's metrics. Without metrics, give a jsonl publisher
+    state_s = 1: tactile-rt run robot.toml | tactile-rt top -
     """
     if json is not None and not once:
         raise ConfigError("--json is of one look: give --once, too")

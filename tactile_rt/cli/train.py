@@ -21,37 +21,37 @@ if TYPE_CHECKING:
 WAITING = 0.1  # share of an epoch: less says nothing that one could do something about
 
 
-@app.command()
+@app.command(epilog="tactile-rt train sweeps run --epochs 5 --set width=0.25")
 def train(
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
-    folder: Annotated[Path, typer.Argument(help="The run; an interrupted one goes on.")],
+    folder: Annotated[Path, typer.Argument(help="Run folder; an interrupted run continues.")],
     also: Annotated[
-        list[Path] | None, typer.Option(help="A further set to learn from; may be given again.")
+        list[Path] | None, typer.Option(help="Another set to learn from; may be repeated.")
     ] = None,
     begin: Annotated[
         Path | None,
-        typer.Option("--from", help="A checkpoint to begin with; its network, other classes."),
+        typer.Option("--from", help="Checkpoint to start from; classes may differ."),
     ] = None,
     recipe: Annotated[
-        str, typer.Option(help="See `tactile-rt recipes`; or a TOML file. Options override it.")
+        str, typer.Option(help="Name (see `recipes`) or TOML file; options override it.")
     ] = "default",
     encoder: Annotated[
         str | None,
-        typer.Option(help="zhuang-CELL, resnet18, s4, ...; or a TOML file of nodes and edges."),
+        typer.Option(help="zhuang-CELL, resnet18, s4, ..., or a TOML file of a graph."),
     ] = None,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the training split.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of weights, windows and noise.")] = None,
     sets: Annotated[
         list[str] | None,
         set_option("Any key of the recipe: width=0.25, attender=none, decoder=linear, batch=8"),
     ] = None,
     accelerator: Accelerator = "auto",
-    threads: Annotated[int, typer.Option(min=1, max=1024, help="CPU threads.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="Number of CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
-    """Train an Encoder-Attender-Decoder network on a sweep set."""
+    """Train an encoder-attender-decoder network on a sweep set."""
     from tactile_rt.models.checkpoints import describe_checkpoint, network_of
     from tactile_rt.models.training.recipes import read_recipe
 
@@ -121,9 +121,9 @@ def _text(path: Path) -> str:
         raise ConfigError(f"{path} is no text file") from None
 
 
-@app.command()
+@app.command(epilog="tactile-rt recipes")
 def recipes(json: Json = None) -> None:
-    """List the training recipes that ship, and the values that each was chosen from."""
+    """List the shipped training recipes and the values tried."""
     from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
 
     found: list[dict[str, Any]] = []
@@ -134,22 +134,22 @@ def recipes(json: Json = None) -> None:
     show_table(found, {"recipe": "recipe", "about": "what", "tried": "tried"}, json)
 
 
-@app.command()
+@app.command(epilog="tactile-rt probe run/best.pt probed --data sweeps")
 def probe(
-    checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
-    folder: Annotated[Path, typer.Argument(help="Where the probed network goes.")],
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of a run, best.pt.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of the probed network.")],
     data: Annotated[
-        Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
+        Path | None, typer.Option(help="Sweep set. Default: the one it was trained on.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
     seed: Seed = 0,
     sets: Annotated[
         list[str] | None,
-        set_option("How it is fitted: readout=mean, standardise=false, learning_rate=0.01"),
+        set_option("An option of the fit: readout=mean, standardise=false, learning_rate=0.01"),
     ] = None,
     json: Json = None,
 ) -> None:
-    """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
+    """Fit a linear classifier on a frozen network's features."""
     from tactile_rt.models.checkpoints import describe_checkpoint, probed_on
     from tactile_rt.models.training.config import ProbeConfig
 
@@ -175,11 +175,11 @@ def probe(
     )
 
 
-@app.command()
+@app.command(epilog="tactile-rt export run/best.pt model.onnx")
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
-    model: Annotated[Path, typer.Argument(help="The .onnx file to write.")],
-    name: Annotated[str, typer.Option(help="Of the model; default: the file's name.")] = "",
+    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of a run, best.pt.")],
+    model: Annotated[Path, typer.Argument(help="Model file to write, .onnx.")],
+    name: Annotated[str, typer.Option(help="Name of the model. Default: the file's name.")] = "",
     precision: Annotated[
         str, typer.Option(help="fp32, fp16 or bf16 (smaller files), int8 (also faster).")
     ] = "fp32",
@@ -188,17 +188,14 @@ def export(
     ] = "step",
     data: Annotated[
         list[Path] | None,
-        typer.Option(
-            help="Where the sweep set it was trained on lies now; default: where it lay. Of "
-            "several, all."
-        ),
+        typer.Option(help="Sweep set it was trained on, if moved; repeat for each set."),
     ] = None,
     license: Annotated[
-        str, typer.Option(help="Under which the file may be used, as Apache-2.0; to be stored.")
+        str, typer.Option(help="Licence to store in the file, e.g. Apache-2.0.")
     ] = "",
     json: Json = None,
 ) -> None:
-    """Export a trained network as a streaming ONNX step, with everything needed to run it."""
+    """Export a trained network as a self-contained ONNX model."""
     from tactile_rt.models.checkpoints import describe_checkpoint, trained_on
 
     check_output(model)

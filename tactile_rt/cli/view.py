@@ -24,29 +24,29 @@ FPS = 25
 WIDTH = 1280  # pixels
 
 
-@app.command()
+@app.command(epilog="tactile-rt view mug-17 --out sweep.png --camera side")
 def view(
-    target: Annotated[str, typer.Argument(help="What is swept past: mug-17, or a mesh file.")],
-    out: Annotated[Path, typer.Option(help=".png or .jpg: a picture; .mp4: a video.")] = Path(
+    target: Annotated[str, typer.Argument(help="Object to sweep past: mug-17, or a mesh file.")],
+    out: Annotated[Path, typer.Option(help="Picture (.png, .jpg) or video (.mp4).")] = Path(
         "sweep.png"
     ),
-    camera: Annotated[str, typer.Option(help="front, side, top or oblique.")] = "oblique",
+    camera: Annotated[str, typer.Option(help="View: front, side, top or oblique.")] = "oblique",
     at: Annotated[
-        float | None, typer.Option(help="Moment of a picture, ms. Default: of the most force.")
+        float | None, typer.Option(help="Time of a picture, ms. Default: of the largest force.")
     ] = None,
     slow: Annotated[
-        float, typer.Option(min=1, max=40, help="How much slower than real a video is.")
+        float, typer.Option(min=1, max=40, help="Slow-motion factor of a video.")
     ] = 10.0,
     array: Array = "mouse",
     profile: Annotated[
-        str, typer.Option(help="How finely: realtime, dataset (finer), accurate, mujoco.")
+        str, typer.Option(help="Accuracy: realtime, dataset (finer), accurate, mujoco.")
     ] = "dataset",
     sets: Annotated[
         list[str] | None,
-        set_option("Of the sweep or a mesh: size_mm=30, yaw_deg=45, distance_mm=8, hull=true"),
+        set_option("An option of the sweep or the mesh: size_mm=30, yaw_deg=45, hull=true"),
     ] = None,
 ) -> None:
-    """Show a sweep: the scene with force arrows, the map of forces, their traces."""
+    """Draw a simulated sweep and its forces: a picture or a video."""
     check_output(out)
     try:
         with needing("view"):

@@ -29,34 +29,35 @@ class Spacing:
     step_mm: str = "1,1,0"
 
 
-@app.command()
+@app.command(epilog="tactile-rt whisk stimuli.npz --set frequency_hz=8")
 def whisk(
-    out: Annotated[Path, typer.Argument(help="The .npz to write; a .json goes beside it.")],
+    out: Annotated[Path, typer.Argument(help="The .npz to write; a .json is written beside it.")],
     stimulus: Annotated[
         str | None,
-        typer.Option(help="convex-close, concave-far, ..., comma-separated. Default: all six."),
+        typer.Option(help="Stimuli: convex-close, ..., comma-separated. Default: all six."),
     ] = None,
     target: Annotated[
-        str | None, typer.Option("--object", help="Instead of a stimulus: mug-3, or a mesh file.")
+        str | None,
+        typer.Option("--object", help="Object, not a stimulus: mug-3, or a mesh file."),
     ] = None,
     array: Array = "mouse",
     trajectory: Annotated[
         Path | None,
-        typer.Option(help="A .csv of time_s and theta_deg, instead of regular whisking."),
+        typer.Option(help="CSV file of the trajectory to follow: time_s, theta_deg."),
     ] = None,
     profile: Annotated[
-        str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+        str, typer.Option(help="Accuracy: realtime, dataset (finer), accurate.")
     ] = "dataset",
     sets: Annotated[
         list[str] | None,
         set_option(
-            "Of the whisking, the stimuli or the object: frequency_hz=10, duration_s=2, "
+            "An option of the whisking, stimuli or object: frequency_hz=10, duration_s=2, "
             "radius_mm=60, position_mm=22,8,0, size_mm=30, hull=true"
         ),
     ] = None,
     json: Json = None,
 ) -> None:
-    """Whisk against surfaces and write what the array feels from first contact on."""
+    """Simulate whisking against surfaces, and store the loads."""
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: name a file that ends in .npz")
     if target is not None and stimulus is not None:

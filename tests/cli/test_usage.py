@@ -74,12 +74,6 @@ def test_what_a_command_reads_is_not_replaced_by_force(call, tmp_path, monkeypat
     assert (tmp_path / "run.mcap").read_text() == "kept"
 
 
-def test_no_words_at_all_are_answered_by_the_help(call):
-    code, out, err = call()
-    assert code == 2
-    assert "Usage: tactile-rt" in out + err
-
-
 def test_codecs_are_a_line_each_in_a_pipe(call):
     code, out, _ = call("codecs")
     assert code == 0
