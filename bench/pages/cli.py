@@ -28,13 +28,15 @@ KINDS = {"str": "TEXT", "int": "INTEGER"}  # of values that an option takes
 
 def make_page() -> str:
     """Return the whole page as Markdown."""
-    lines = [HEAD]
-    panel = ""
-    for name, command in _commands(typer.main.get_command(load_app())):
-        if " " not in name and command.rich_help_panel != panel:
+    lines, panel = [HEAD], ""
+    program: Any = typer.main.get_command(load_app())
+    for name, command in program.commands.items():
+        if command.rich_help_panel != panel:
             panel = command.rich_help_panel
             lines.append(f"## {panel}\n")
         lines += _section(name, command)
+        for inner, one in getattr(command, "commands", {}).items():
+            lines += _section(f"{name} {inner}", one)
     return "\n".join(lines)
 
 
@@ -43,29 +45,18 @@ def example(command: Any) -> str:
     return str(command.epilog)[str(command.epilog).index("tactile-rt ") :]
 
 
-def _commands(group: Any, words: str = "") -> Iterator[tuple[str, Any]]:
-    """Each visible command and group, with its words, as in the help."""
-    for name, command in group.commands.items():
-        if not command.hidden:
-            yield f"{words}{name}", command
-            if hasattr(command, "commands"):
-                yield from _commands(command, f"{words}{name} ")
-
-
 def _section(name: str, command: Any) -> Iterator[str]:
     """One command: what it does, its usage, its arguments and options, an example."""
     yield f"### {name}\n"
     yield f"{inspect.cleandoc(command.help)}\n"
     if hasattr(command, "commands"):
         return
-    own = [p for p in command.params if p.name != "help" and not getattr(p, "hidden", False)]
+    own = [p for p in command.params if p.name != "help"]
     arguments = [p for p in own if p.param_type_name == "argument"]
     options = [p for p in own if p.param_type_name == "option"]
     usage = ["tactile-rt", name, *map(_argument, arguments), *(["[OPTIONS]"] if options else [])]
     yield f"```text\n{' '.join(usage)}\n```\n"
-    yield "".join(f"- `{_argument(p)}`: {p.help}\n" for p in arguments) + "".join(
-        f"- {_option(p)}: {p.help}{_default(p)}\n" for p in options
-    )
+    yield "".join(map(_line, (*arguments, *options)))
     yield f"```sh\n{example(command)}\n```\n"
 
 
@@ -75,21 +66,16 @@ def _argument(one: Any) -> str:
     return name if one.required else f"[{name}]"
 
 
-def _option(one: Any) -> str:
-    """An option and what it takes."""
+def _line(one: Any) -> str:
+    """An argument or an option of the list, with its default."""
+    if one.param_type_name == "argument":
+        return f"- `{_argument(one)}`: {one.help}\n"
     kind = one.type.name.removesuffix(" range")
     value = "" if one.is_flag else f" {one.metavar or KINDS.get(kind, kind.upper())}"
-    return f"`{', '.join((*one.opts, *one.secondary_opts))}{value}`"
-
-
-def _default(one: Any) -> str:
-    known = one.default is None or one.default is False or one.default == ""
-    return "" if known or "Default" in one.help else f" Default: {one.default}."
-
-
-def main() -> None:
-    PAGE.write_text(make_page(), "utf-8")
+    plain = one.default is False or one.default in (None, "") or "Default" in one.help
+    default = "" if plain else f" Default: {one.default}."
+    return f"- `{', '.join((*one.opts, *one.secondary_opts))}{value}`: {one.help}{default}\n"
 
 
 if __name__ == "__main__":
-    main()
+    PAGE.write_text(make_page(), "utf-8")
