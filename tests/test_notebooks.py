@@ -38,7 +38,8 @@ def test_the_notebook_shows_what_it_does(notebook: Path, tmp_path: Path) -> None
     for stored, ran in zip(read_cells(notebook), read_cells(result), strict=True):
         if stored["cell_type"] == "code":
             (said, shown), (says, shows) = outputs(stored), outputs(ran)
-            assert (said, len(shown)) == (says, len(shows)), f"store it again: {stored['id']}"
+            again = f"python -m tests.helpers.notebooks {notebook} {notebook}"
+            assert (said, len(shown)) == (says, len(shows)), f"{stored['id']}: {again}"
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
