@@ -11,6 +11,7 @@ import pytest
 import tactile_rt
 from tests.helpers.commands import commands, options_of
 from tests.helpers.followed_page import follow
+from tests.helpers.notebooks import read_cells
 from tests.helpers.source_tree import ROOT
 
 DOCS = ROOT / "docs"
@@ -25,7 +26,8 @@ NEEDS = {
     "stimuli-to-alignment": ("mujoco", "torch"),
 }
 LONG = ("add-a-recipe", "stimuli-to-alignment")  # they train, and whisk
-PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *NOTEBOOKS])
 LINK = re.compile(r"(?<!`)\]\(([^)\s]+)\)|<img[^>]+src=\"([^\"]+)\"")
 
 
@@ -56,12 +58,20 @@ def test_a_page_that_lies_is_caught(tmp_path, monkeypatch) -> None:
             follow(page, here, patch)
 
 
+def text_of(page: Path) -> str:
+    """Return the text of a page; of a notebook that of its cells, code between fences."""
+    if page.suffix == ".md":
+        return page.read_text("utf-8")
+    texts = ((cell["cell_type"] == "code", cell["source"]) for cell in read_cells(page))
+    return "\n\n".join(f"```python\n{text}\n```" if code else text for code, text in texts)
+
+
 # links
 
 
 def anchors(page: Path) -> set[str]:
     """What headings of a page are linked by, as GitHub makes it of their words."""
-    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    text = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.M | re.S)
     headings = re.findall(r"^#+ (.+)$", text, re.M)
     plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", h) for h in headings)
     return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in plain}
@@ -69,7 +79,7 @@ def anchors(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_no_link_leads_nowhere(page: Path) -> None:
-    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    text = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.M | re.S)
     dead = []
     for match in LINK.finditer(text):
         target = match[1] or match[2]
@@ -81,7 +91,7 @@ def test_no_link_leads_nowhere(page: Path) -> None:
         there = Path(os.path.normpath(page.parent / path)) if path else page
         if not there.exists():
             dead.append(target)
-        elif anchor and there.suffix == ".md" and anchor not in anchors(there):
+        elif anchor and there in PAGES and anchor not in anchors(there):
             dead.append(target)
     assert dead == []
 
@@ -101,7 +111,7 @@ def test_every_command_of_a_page_is_there_with_its_options(page: Path) -> None:
     every = commands()
     groups = {name.partition(" ")[0] for name in every if " " in name}
     wrong = []
-    for call in CALL.findall(page.read_text("utf-8").replace("\\\n", " ")):
+    for call in CALL.findall(text_of(page).replace("\\\n", " ")):
         words = call.split()
         names = [w for w in words if re.fullmatch(r"[a-z][a-z0-9-]*", w)][:2]
         name = " ".join(names) if names and names[0] in groups else "".join(names[:1])
@@ -125,7 +135,8 @@ def test_every_command_of_a_page_is_there_with_its_options(page: Path) -> None:
 
 def test_every_page_is_in_the_site_s_navigation() -> None:
     listed = set(re.findall(r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.M))
-    there = {p.relative_to(DOCS).as_posix() for p in DOCS.rglob("*.md")}
+    pages = [*DOCS.rglob("*.md"), *NOTEBOOKS]
+    there = {p.relative_to(DOCS).with_suffix(".md").as_posix() for p in pages}
     assert {p for p in there if not p.startswith("decisions/")} == listed
 
 
@@ -163,6 +174,10 @@ def test_the_site_is_built_offline_without_a_warning(tmp_path, monkeypatch, capf
     with warnings.catch_warnings(action="ignore"):  # of its plugins
         build(load_config("mkdocs.yml", strict=True, site_dir=str(tmp_path)))
     assert (tmp_path / "reference" / "api" / "face.html").stat().st_size > 20_000
+    for notebook in NOTEBOOKS:
+        page = tmp_path / "notebooks" / f"{notebook.stem}.html"
+        shown = re.findall(r"<img alt=\"([^\"]+)\" src=\"([\w-]+\.png)\"", page.read_text("utf-8"))
+        assert len(shown) >= 3 and all((page.parent / name).is_file() for _, name in shown)
     html = [p.read_text("utf-8") for p in tmp_path.rglob("*.html")]
     fetched = {
         u for t in html for u in re.findall(r"(?:src|<link[^>]*href)=\"(https?://[^\"]+)", t)

@@ -2,20 +2,24 @@
 
 Pages are read in two places. In the repository a link may lead to any file of the tree; on the site
 it leads there, too, by the repository's address in pyproject.toml. The decisions are listed by
-their titles as they are in their folder, after their index and before the experiments. And a table
-without a heading has no band where it would be.
+their titles as they are in their folder, after their index and before the experiments. A notebook
+is a page of its cells and outputs, beside it its pictures and itself. And a table without a heading
+has no band where it would be.
 """
 
+import base64
+import json
 import os
 import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
-__all__ = ["on_config", "on_page_content", "on_page_markdown"]
+__all__ = ["notebook_page", "on_config", "on_files", "on_page_content", "on_page_markdown"]
 
 ROOT = Path(__file__).parents[2]
 NO_HEADING = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*></th>)+\s*</tr>\s*</thead>")
+NOTEBOOK = ".ipynb"
 LINK = re.compile(r"(!?)\[((?:[^][]|\[[^][]*\])*)\]\(([^)\s]+)\)")
 
 
@@ -31,14 +35,51 @@ def on_config(config: Any) -> Any:
     return config
 
 
+def on_files(files: Any, config: Any) -> Any:
+    """Add a page for each notebook, and its pictures."""
+    from mkdocs.structure.files import File
+
+    for uri in [file.src_uri for file in files if file.src_uri.endswith(NOTEBOOK)]:
+        page, pictures = notebook_page(Path(config.docs_dir) / uri)
+        folder = Path(uri).parent
+        files.append(File.generated(config, uri.removesuffix(NOTEBOOK) + ".md", content=page))
+        for name, png in pictures.items():
+            files.append(File.generated(config, (folder / name).as_posix(), content=png))
+    return files
+
+
+def notebook_page(notebook: Path) -> tuple[str, dict[str, bytes]]:
+    """Return a notebook as Markdown, and its pictures by the names that the page gives them."""
+    parts, pictures = [], {}
+    for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        shell = source.startswith("!")  # Jupyter's sign for a command, which Python has not
+        language, source = ("sh", source[1:].replace("\n!", "\n")) if shell else ("python", source)
+        parts.append(f"```{language}\n{source}\n```")
+        for output in cell["outputs"]:
+            if "text" in output:
+                parts.append("```text\n" + "".join(output["text"]).rstrip("\n") + "\n```")
+            elif png := output["data"].get("image/png"):
+                name = f"{notebook.stem}-{cell['id']}.png"
+                pictures[name] = base64.b64decode(png)
+                parts.append(f"![{''.join(output['data']['text/plain'])}]({name})")
+    download = f'<a href="{notebook.name}" download>Download this page as a notebook</a>'
+    return "\n\n".join([*parts, download]) + "\n", pictures
+
+
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
     """Let links out of `docs/` lead into the repository, or be words where it has no address."""
-    here = Path(page.file.abs_src_path).parent
+    here = (Path(config.docs_dir) / page.file.src_uri).parent
 
     def led(match: re.Match[str]) -> str:
         picture, words, target = match.groups()
         path = target.partition("#")[0]
         there = Path(os.path.normpath(here / path))
+        if there.suffix == NOTEBOOK and there.is_relative_to(config.docs_dir):
+            return f"{picture}[{words}]({target.replace(NOTEBOOK, '.md')})"
         if not path or "://" in path or there.is_relative_to(config.docs_dir):
             return match[0]
         if picture or not there.exists():
