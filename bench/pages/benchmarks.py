@@ -139,7 +139,7 @@ def bar_table(records: Sequence[Record], headlines: dict[str, str]) -> list[str]
     shown += [one for one in records if one.met is False and one.name not in headlines]
     words = HEADLINES["missed"] | headlines
     rows = (row(one, words.get(one.name, f"`{one.name}`")) for one in shown)
-    return ["| figure | value | bar | |", "|---|---:|---:|---|", *rows]
+    return ["| figure | value | bar |", "|---|---:|---:|", *rows]
 
 
 def row(one: Record, words: str) -> str:
@@ -148,9 +148,9 @@ def row(one: Record, words: str) -> str:
     value = f"{one.value:,.0f}" if abs(one.value) >= 1000 else f"{one.value:.3g}"
     if one.value != limit == float(value.replace(",", "")):
         value = f"{one.value:.6g}"  # on which side of its bar
-    met = {True: "met", False: "**MISSED**", None: ""}[one.met]
+    met = {True: " met", False: " **MISSED**", None: ""}[one.met]
     called = words.format(anchor=one.anchor.partition(";")[0])
-    return f"| {called} | {f'{value} {one.unit}'.strip()} | {one.bar} | {met} |"
+    return f"| {called} | {f'{value} {one.unit}'.strip()} | {one.bar}{met} |"
 
 
 def main() -> None:
