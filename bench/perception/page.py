@@ -151,7 +151,7 @@ def made(found: dict[str, Any], data: Data) -> str:
     """Make the page of all figures."""
     tests = {t: {one["method"]: one for one in found["scores"].get(t, ())} for t in TESTS}
     methods = dict.fromkeys(m for scores in tests.values() for m in scores)
-    account = ("top-5", "two", "four", "surest 50 %", "ECE", "AUROC")
+    account = ("two", "four", "surest 50 %", "ECE", "AUROC")
     models = [m for m in found["robust"] if m.partition(",")[0] in found["coverage"]]
     about = {"objects": OBJECTS, "elsewhere": ELSEWHERE, "wide": WIDE}
     lines = [
