@@ -19,6 +19,14 @@ __all__ = ["PAGE", "figures", "made", "write_page"]
 
 PAGE = Path("docs/reference/realtouch.md")
 BESIDE = "SVM, real"  # shown beside the model files where it knows the kinds
+SPLITS = {
+    "train": "learning",
+    "validation": "choosing settings",
+    "test": "testing on objects of a known kind and source",
+    SOURCE: "testing on a source that no other split has anything of",
+    OUTLIERS: "learning what is unknown, if a method does",
+    WITHHELD: "testing what a method makes of unknown kinds",
+}
 TESTS = (OBJECTS, ELSEWHERE, WIDE, SHARED, SHARED_WIDE)
 CARD = """\
 ---
@@ -190,8 +198,8 @@ def made(found: dict[str, Any], data: Data) -> str:
     return "\n".join([*lines, *_contents(data)])
 
 
-def _table(columns: Iterable[str], rows: dict[str, Iterable[Any]]) -> list[str]:
-    head = ["", *columns]
+def _table(columns: Iterable[str], rows: dict[str, Iterable[Any]], of: str = "") -> list[str]:
+    head = [of, *columns]
     said = (f"| {name} | {' | '.join(map(_said, cells))} |" for name, cells in rows.items())
     return [f"| {' | '.join(head)} |", "|---" * len(head) + "|", *said, ""]
 
@@ -206,50 +214,34 @@ def _columns(found: dict[str, dict[str, Any]], names: list[str]) -> list[str]:
 def _said(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"{value[0]:.1f} ({value[1]:.0f}-{value[2]:.0f})"
-    return "-" if value is None else f"{value:g}"
+    return "-" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _contents(data: Data) -> list[str]:
     origins = data.origins.values()
 
-    def row(split: str, what: str) -> str:
-        mine = [o for o in origins if o.split == split]
-        kinds = sorted({o.category for o in mine})
-        return (
-            f"| `{split}` | {what} | {len(kinds)} | {len(mine)} | {len(data.sets[split].sweeps)} | "
-            f"{len(data.wide[split].sweeps) if split in data.wide else '-'} |"
-        )
+    def row(split: str) -> list[Any]:
+        mine = [o.category for o in origins if o.split == split]
+        wide = len(data.wide[split].sweeps) if split in data.wide else None
+        return [SPLITS[split], len({*mine}), len(mine), len(data.sets[split].sweeps), wide]
 
     def named(split: str) -> str:
         return ", ".join(
             sorted({o.category.replace("_", " ") for o in origins if o.split == split})
         )
 
-    sources = Counter((o.source, o.licence) for o in origins)
+    sources = sorted(Counter((o.source, o.licence) for o in origins).items())
+    columns = ("for", "kinds", "objects", "sweeps", "in the wide world")
     return [
-        "## The data",
-        "",
+        "## The data\n",
         f"`bench/perception/data/{NAME}-{VERSION}.xz`, SHA-256 `{data.digest}`: made by the "
         "recipes `bench/perception/recipes/real27.toml` and `real27-source.toml` from the list "
-        "`tactile_rt/sim_backend/objects/lists/real.csv`, which has every mesh's address and hash.",
-        "",
-        "| split | for | kinds | objects | sweeps | in the wide world |",
-        "|---|---|---|---|---|---|",
-        row("train", "learning"),
-        row("validation", "choosing settings"),
-        row("test", "testing on objects of a known kind and source"),
-        row(SOURCE, "testing on a source that no other split has anything of"),
-        row(OUTLIERS, "learning what is unknown, if a method does"),
-        row(WITHHELD, "testing what a method makes of unknown kinds"),
-        "",
-        "Variants, mirror images and copies of one object, in whatever source, are in one split.",
-        "",
+        "`tactile_rt/sim_backend/objects/lists/real.csv`, which has every mesh's address and hash."
+        "\n",
+        *_table(columns, {f"`{split}`": row(split) for split in SPLITS}, "split"),
+        "Variants, mirror images and copies of one object, in whatever source, are in one split.\n",
         f"- Known: {named('train')}.",
         f"- Unknown, to learn from: {named(OUTLIERS)}.",
-        f"- Unknown, to test with: {named(WITHHELD)}.",
-        "",
-        "| source | licence | objects |",
-        "|---|---|---|",
-        *(f"| {name} | {licence} | {n} |" for (name, licence), n in sorted(sources.items())),
-        "",
+        f"- Unknown, to test with: {named(WITHHELD)}.\n",
+        *_table(("licence", "objects"), {name: [of, n] for (name, of), n in sources}, "source"),
     ]
