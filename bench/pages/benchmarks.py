@@ -15,6 +15,8 @@ import platform
 import subprocess
 import sys
 import tempfile
+import tomllib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,24 +25,26 @@ from tactile_rt.cli.bench import AREAS
 from tactile_rt.core.packages import VERSION
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["FOLDER", "PAGE", "Measurement", "measure", "read", "written"]
+__all__ = ["FOLDER", "HEADLINES", "PAGE", "Measurement", "bar_table", "measure", "read", "written"]
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "benchmarks.md"
 FOLDER = PAGE.with_suffix("")
 COMMAND = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
-HEAD = """# Every bar
+HEAD = """# Benchmarks
 
 <!-- written by `python -m bench.pages.benchmarks`; do not edit -->
 
-What `tactile-rt bench` measured, area by area, beside what is asked of it (the bar) and what that
-comes from (the anchor). *Of its bar* is the figure over the bar's: what must be small is good below
-1, what must be large above. A figure is of the machine and the day that stand above its table; run
-the command on yours. What is not met reads **MISSED**.
+What `tactile-rt bench` measured, area by area. A *bar* is the value that a figure must reach. Each
+table has the headline figures of its area, a fixed list (`bench/pages/headlines.toml`), and after
+them every other figure that misses its bar, marked **MISSED**. All figures, with what each is
+compared with and how it was measured, are in the JSON file of the area. Timings are those of the
+machine named above the table: run the command on yours.
 
-Real things, by every method, have [a page of their own](realtouch.md), and so have
-[networks that are tuned alike](../explain/results.md).
+More results: [real objects](realtouch.md), [networks compared](../explain/results.md),
+[the physics](../explain/physics.md).
 """
+HEADLINES = tomllib.loads(Path(__file__).with_name("headlines.toml").read_text("utf-8"))
 
 
 @dataclass(frozen=True)
@@ -115,28 +119,38 @@ def section(area: str, measured: Measurement | None) -> str:
         )
     bars = [one for one in measured.records if one.bar]
     missed = sum(not one.met for one in bars)
-    quick = " It is a quick look, not a figure to quote." if "--quick" in measured.command else ""
+    quick = " A quick look, not a figure to quote." if "--quick" in measured.command else ""
+    met = f"{len(bars) - missed} of {len(bars)} bars met" if bars else "no bars"
     lines = [
         f"## {area}",
         "",
         f"`{measured.command}`, release {measured.version}, {measured.day}. {measured.machine}. "
-        f"{len(bars) - missed} of {len(bars)} bars met.{quick}",
+        f"{met}; [all {len(measured.records)} figures](benchmarks/{area}.json).{quick}",
         "",
-        "| figure | value | bar | of its bar | | anchor; how |",
-        "|---|---:|---:|---:|---|---|",
-        *map(row, measured.records),
+        *bar_table(measured.records, HEADLINES[area]),
         "",
     ]
     return "\n".join(lines)
 
 
-def row(one: Record) -> str:
+def bar_table(records: Sequence[Record], headlines: dict[str, str]) -> list[str]:
+    """Tabulate the headlines, in their order, and then every other figure that misses its bar."""
+    shown = [one for name in headlines for one in records if one.name == name]
+    shown += [one for one in records if one.met is False and one.name not in headlines]
+    words = HEADLINES["missed"] | headlines
+    rows = (row(one, words.get(one.name, f"`{one.name}`")) for one in shown)
+    return ["| figure | value | bar |", "|---|---:|---:|", *rows]
+
+
+def row(one: Record, words: str) -> str:
     """One figure as a line of the table."""
-    limit = float(one.bar.partition(" ")[2]) if one.bar else 0.0
-    share = f"{one.value / limit:.2f}" if limit else ""
-    met = {True: "met", False: "**MISSED**", None: ""}[one.met]
-    how = "; ".join(part for part in (one.anchor, one.how) if part).replace("|", "/")
-    return f"| `{one.name}` | {one.value:.4g} {one.unit} | {one.bar} | {share} | {met} | {how} |"
+    limit = float(one.bar.partition(" ")[2]) if one.bar else None
+    value = f"{one.value:,.0f}" if abs(one.value) >= 1000 else f"{one.value:.3g}"
+    if one.value != limit == float(value.replace(",", "")):
+        value = f"{one.value:.6g}"  # on which side of its bar
+    met = {True: " met", False: " **MISSED**", None: ""}[one.met]
+    called = words.format(anchor=one.anchor.partition(";")[0])
+    return f"| {called} | {f'{value} {one.unit}'.strip()} | {one.bar}{met} |"
 
 
 def main() -> None:

@@ -1,13 +1,14 @@
-"""Measure the physics, draw its pictures and write the tables of docs/explain/physics.md.
+"""Measure the physics and draw its pictures, for docs/explain/physics.md.
 
 python -m bench.pictures.physics              # everything: some 3 minutes of CPU
 python -m bench.pictures.physics --json FILE  # the figures of `tactile-rt bench sim --json FILE`
 python -m bench.pictures.physics --only peg   # one of bars, whiskers, peg, creep, cost
+
+All figures are in docs/explain/physics.json; the page has tables of some of them.
 """
 
 import argparse
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from bench.pages.benchmarks import HEADLINES, bar_table
 from bench.sim import area as sim
 from bench.sim.beams import beams, flat, measure
 from bench.sim.catalogue import FINE, difference
@@ -26,66 +28,73 @@ from bench.sim.mechanics import HEARD_HZ
 from bench.sim.pegs import PEG_RADIUS_MM, Press, press, press_states, presses
 from bench.sim.reference_model import reference_cost
 from bench.sim.ringing import release_error, rod_ring
+from tactile_rt.models.evaluation.records import Record, as_dicts
 from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile
 from tests.helpers import beams as theory
 
 DOCS = Path(__file__).parents[2] / "docs"
+PAGE = DOCS / "explain" / "physics.md"
+DATA = PAGE.with_suffix(".json")
 INK, BLUE, ORANGE, GREY = "#20262e", "#1f6fb2", "#d95f0e", "#9aa3ad"
 BOTH = ("dataset", "realtime")
 
 
-def write_table(name: str, lines: list[str]) -> None:
-    """Replace what stands between the markers of a table in docs/explain/physics.md."""
-    path = DOCS / "explain" / "physics.md"
-    text = path.read_text(encoding="utf-8")
-    start, end = f"<!-- {name}: written by bench/pictures/physics.py -->", f"<!-- end {name} -->"
-    if text.count(start) != 1 or text.count(end) != 1:
-        raise SystemExit(f"{path}: wants one {start} and one {end}")
-    before, _, rest = text.partition(start)
-    after = rest.partition(end)[2]
-    path.write_text("\n".join([before + start, *lines, end]) + after, encoding="utf-8")
+def keep(name: str, found: Any) -> None:
+    """Write what was measured into the data, and the tables of the page anew."""
+    data = {**json.loads(DATA.read_text("utf-8")), name: found}
+    DATA.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
+    text = PAGE.read_text("utf-8")
+    for table, lines in tables(data).items():
+        start, end = (
+            f"<!-- {table}: written by bench/pictures/physics.py -->",
+            f"<!-- end {table} -->",
+        )
+        if text.count(start) != 1 or text.count(end) != 1:
+            raise SystemExit(f"{PAGE}: wants one {start} and one {end}")
+        before, _, rest = text.partition(start)
+        text = "\n".join([before + start, *lines, end]) + rest.partition(end)[2]
+    PAGE.write_text(text, "utf-8")
 
 
-def bars(records: list[dict[str, Any]]) -> None:
-    """All figures that have a bar, and those that say what they are measured against."""
-    lines = ["| figure | measured | bar | met | of what |", "|---|---:|---:|:-:|---|"]
-    for r in records:
-        if ".whisker." in r["name"]:
-            continue
-        mark = {True: "yes", False: "**no**", None: ""}[r["met"]]
-        how = "; ".join(part for part in (r["anchor"], r["how"]) if part).replace("|", "/")
-        value = f"{r['value']:.3g} {r['unit']}".strip()
-        figure = r["name"].removeprefix("sim.")
-        lines.append(f"| {figure} | {value} | {r['bar']} | {mark} | {how} |")
-    write_table("bars", lines)
+def tables(data: dict[str, Any]) -> dict[str, list[str]]:
+    """The tables of the page: headlines and missed bars, and what accuracy costs."""
+    records = [Record(**{k: v for k, v in one.items() if k != "met"}) for one in data["bars"]]
+    columns, rows = data["cost"]["columns"], data["cost"]["rows"]
+    return {
+        "bars": bar_table(records, HEADLINES["sim"]),
+        "cost": [
+            f"| {' | '.join(columns)} |",
+            "|---" + "|---:" * (len(columns) - 1) + "|",
+            *(f"| {' | '.join(map(str, row))} |" for row in rows),
+        ],
+    }
 
 
 def whiskers() -> None:
     """Both profiles, whisker by whisker."""
     head = ("static %", "resonance %", "rings %", "damping", "let go %", "sag %")
-    lines = [
-        "| | mm | Hz | " + " | ".join(f"{h} {p}" for p in BOTH for h in head) + " |",
-        "|---" * (3 + 2 * len(head)) + "|",
-    ]
+    columns = ["whisker", "mm", "Hz", *(f"{h} {p}" for p in BOTH for h in head)]
+    rows = []
     for name, beam in beams().items():
         whisker = flat(name)
-        cells = [name, f"{whisker.length:.1f}", f"{beam.resonance_hz:.0f}"]
+        cells = [name, round(whisker.length, 1), round(beam.resonance_hz)]
         for key in BOTH:
             profile = PROFILES[key]
             e = measure(whisker, beam, profile)
-            cells += [f"{100 * e.static:+.2f}", f"{100 * e.resonance:+.2f}"]
+            rings: list[float | None] = [None, None, None]
             if beam.resonance_hz < HEARD_HZ:
                 hertz, ratio = rod_ring(whisker, profile)
-                cells += [f"{100 * (hertz / beam.resonance_hz - 1):+.2f}"]
-                cells += [f"{ratio - whisker.damping_ratio:+.3f}"]
-                cells += [f"{100 * release_error(whisker, profile):.1f}"]
+                let_go = round(100 * release_error(whisker, profile), 1)
+                rings = [round(100 * (hertz / beam.resonance_hz - 1), 2), 0.0, let_go]
             else:
                 rod = make_rod(whisker, profile.links, round(SAMPLE_MS / profile.timestep_ms))
-                cells += ["", f"{rod.damping_ratio - whisker.damping_ratio:+.3f}", ""]
-            cells.append(f"{100 * e.sag:+.2f}")
-        lines.append("| " + " | ".join(cells) + " |")
-    write_table("whiskers", lines)
+                ratio = rod.damping_ratio
+            rings[1] = round(ratio - whisker.damping_ratio, 3)
+            cells += [round(100 * e.static, 2), round(100 * e.resonance, 2), *rings]
+            cells.append(round(100 * e.sag, 2))
+        rows.append(cells)
+    keep("whiskers", {"columns": columns, "rows": rows})
 
 
 def peg() -> None:
@@ -167,18 +176,20 @@ def draw_errors(axes: Axes) -> None:
 
 def creep() -> None:
     """Sliding presses at other speeds."""
-    lines = ["| slides at (mm/s) | base moment % | base force % |", "|---:|---:|---:|"]
+    rows = []
     cases = [c for c in presses() if c.friction][::40]
     for speed in (30.0, 10.0, 5.0, 2.0, 0.5):
         found = [press(c, PROFILES["dataset"], speed) for c in cases]
         moment = max(abs(p.moment_error) for p in found)
         force = max(p.force_error for p in found)
-        lines.append(f"| {speed:g} | {100 * moment:.1f} | {100 * force:.1f} |")
-    write_table("creep", lines)
+        rows.append([speed, round(100 * moment, 1), round(100 * force, 1)])
+    keep("creep", {"columns": ["slides at (mm/s)", "base moment %", "base force %"], "rows": rows})
 
 
 SETTINGS = ((7, 0.5), (10, 0.25), (15, 0.25), (20, 0.1))  # links, step (ms)
 COST_MS = 500
+COST_COLUMNS = ("links, step", "CPU s per s", "over the reference", "moments, median",
+                "moments, worst", "forces, median", "forces, worst")  # fmt: skip
 
 
 def cost() -> None:
@@ -186,10 +197,7 @@ def cost() -> None:
     profiles = {f"{n} links, {step:g} ms": Profile(n, step, 0.02) for n, step in SETTINGS}
     profiles["MuJoCo, 10 links, 0.25 ms"] = PROFILES["mujoco"]
     truths = {name: sim.simulate(name, FINE).advance(COST_MS) for name in sim.SWEEPS}
-    lines = [
-        "| links, step | CPU s per s | over the reference | moments, median and worst | forces |",
-        "|---|---:|---:|---:|---:|",
-    ]
+    rows = []
     figure, axes = plt.subplots(figsize=(8.4, 5.2), dpi=100)
     for key, profile in profiles.items():
         costs, errors, shares = [], [], []
@@ -199,17 +207,15 @@ def cost() -> None:
             shares.append(costs[-1] / reference)
             errors.append(difference(sim.simulate(name, profile).advance(COST_MS), truth))
         moments, forces = [e.moment for e in errors], [e.force for e in errors]
-        lines.append(
-            f"| {key} | {np.median(costs):.2f} | {np.median(shares):.2f} | "
-            f"{np.median(moments):.3f}, {max(moments):.3f} | "
-            f"{np.median(forces):.3f}, {max(forces):.3f} |"
-        )
+        errors_of = [f(v) for v in (moments, forces) for f in (np.median, max)]
+        spent = [round(float(np.median(v)), 2) for v in (costs, shares)]
+        rows.append([key, *spent, *(round(float(e), 3) for e in errors_of)])
         share, colour = float(np.median(shares)), ORANGE if "MuJoCo" in key else BLUE
         axes.plot([share] * len(moments), moments, "-", color=colour, alpha=0.3)
         axes.plot([share] * len(moments), moments, "o", ms=6, color=colour, alpha=0.8)
         axes.annotate(key, (share, max(moments)), (0, 7), fontsize=8, color=INK,
                       textcoords="offset points", ha="center")  # fmt: skip
-    write_table("cost", lines)
+    keep("cost", {"columns": list(COST_COLUMNS), "rows": rows})
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(0.15, 2)
@@ -232,12 +238,8 @@ def main() -> None:
     options = parser.parse_args()
     wanted = [options.only] if options.only else ["bars", "whiskers", "peg", "creep", "cost"]
     if "bars" in wanted:
-        records = (
-            json.loads(options.json.read_text(encoding="utf-8"))
-            if options.json
-            else [{**asdict(r), "met": r.met} for r in sim.run(quick=False)]
-        )
-        bars(records)
+        given = options.json
+        keep("bars", json.loads(given.read_text()) if given else as_dicts(sim.run(quick=False)))
     for part in (whiskers, peg, creep, cost):
         if part.__name__ in wanted:
             part()

@@ -1,6 +1,7 @@
 """The benchmark: its data keep what they promise, its figures are right, its page says them."""
 
 import csv
+import json
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +12,16 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sklearn")
 
+from bench.perception.area import OBJECTS, BenchmarkResults
 from bench.perception.data import FILE, SOURCE, SPLITS, Data, Portion, load, pack
 from bench.perception.generator import _without, measured
 from bench.perception.methods import Method, of_kinds
-from bench.perception.scores import accuracy_by_source, score
+from bench.perception.page import PAGE, figures, made
+from bench.perception.scores import Figures, accuracy_by_source, score
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation.coverage import Coverage
+from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
 from tactile_rt.sets.objects import write_object
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
@@ -189,3 +194,28 @@ def test_of_several_conditions_the_worst_counts_and_strangers_are_left_out(data:
     assert found["sound"].value == 1
     assert found["worst"].value == pytest.approx(np.mean(test.sweeps.labels == 0))
     assert measured(replace(method, kinds=data.kinds[1:]), wanted) == {}
+
+
+def test_the_page_is_made_of_the_figures_beside_it(data: Data) -> None:
+    page = ROOT / PAGE
+    found = json.loads(page.with_suffix(".json").read_text("utf-8"))
+    assert page.read_text("utf-8") == made(found, data)
+
+
+def test_figures_are_in_percent_and_what_is_none_is_null(data: Data) -> None:
+    none, one = Interval(*[float("nan")] * 3), Interval(0.1234, 0.1, 0.2)
+    method = Method("m", "real", data.kinds, lambda *_: np.zeros(0), None)
+    score = Figures(one, one, one, one, one, one, {50: one}, none)
+    coverage = Coverage(float("nan"), none, none, one, one)
+    found = figures(
+        BenchmarkResults(
+            data, {OBJECTS: {method: score}}, {}, {method: {"a": one}}, {}, {"m": {"t": coverage}},
+            {"m": {"f": one}},
+        )
+    )  # fmt: skip
+    (row,) = found["scores"][OBJECTS]
+    assert row["method"] == "m, real" and row["surest 50 %"] == [12.3, 10, 20]
+    assert row["AUROC"] is None and found["coverage"]["m"]["t"]["set"] is None
+    text = made(json.loads(json.dumps(found)), data)
+    assert "| m, real | 12.3 (10-20) | - | - | - | - |" in text
+    assert "| m, t | - | - | - | 12.3 (10-20) | 12.3 (10-20) |" in text
