@@ -1,32 +1,27 @@
 """Hooks of the documentation's site, see mkdocs.yml.
 
 Pages are read in two places. In the repository a link may lead to any file of the tree; on the site
-it leads there, too, by the repository's address in pyproject.toml. The decisions are listed by
-their titles as they are in their folder, after their index and before the experiments. A notebook
-is a page of its cells and outputs, beside it its pictures and itself. And a table without a heading
-has no band where it would be.
+such a link is words. The decisions are listed by their titles as they are in their folder, after
+their index and before the experiments. A notebook is a page of its cells and outputs, beside it its
+pictures and itself. And a table without a heading has no band where it would be.
 """
 
 import base64
 import json
 import os
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
 __all__ = ["notebook_page", "on_config", "on_files", "on_page_content", "on_page_markdown"]
 
-ROOT = Path(__file__).parents[2]
 NO_HEADING = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*></th>)+\s*</tr>\s*</thead>")
 NOTEBOOK = ".ipynb"
 LINK = re.compile(r"(!?)\[((?:[^][]|\[[^][]*\])*)\]\(([^)\s]+)\)")
 
 
 def on_config(config: Any) -> Any:
-    """Add the decisions to the navigation, and the address of the repository."""
-    config.repo_url = repository()
-    config.repo_name = "/".join(config.repo_url.split("/")[-2:])
+    """Add the decisions to the navigation."""
     docs = Path(config.docs_dir)
     decided = docs / "decisions"
     pages = [decided / "README.md", *sorted(decided.glob("0*.md")), decided / "experiments.md"]
@@ -71,7 +66,7 @@ def notebook_page(notebook: Path) -> tuple[str, dict[str, bytes]]:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
-    """Let links out of `docs/` lead into the repository, or be words where it has no address."""
+    """Make links to notebooks lead to their pages, and links out of `docs/` words."""
     here = (Path(config.docs_dir) / page.file.src_uri).parent
 
     def led(match: re.Match[str]) -> str:
@@ -82,12 +77,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
             return f"{picture}[{words}]({target.replace(NOTEBOOK, '.md')})"
         if not path or "://" in path or there.is_relative_to(config.docs_dir):
             return match[0]
-        if picture or not there.exists():
-            return match[0]  # the build says that it leads nowhere
-        if not config.repo_url:
-            return words
-        kind = "tree" if there.is_dir() else "blob"
-        return f"[{words}]({config.repo_url}/{kind}/main/{there.relative_to(ROOT).as_posix()})"
+        # What is not there is left to the build, which says that it leads nowhere.
+        return match[0] if picture or not there.exists() else words
 
     return LINK.sub(led, markdown)
 
@@ -95,14 +86,6 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
 def on_page_content(html: str, **_: Any) -> str:
     """Take away the headings of tables that have none."""
     return NO_HEADING.sub("", html)
-
-
-def repository() -> str:
-    """The address of the source in pyproject.toml; empty if it has none."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    urls = {key.lower(): url for key, url in project.get("urls", {}).items()}
-    found = next((urls[key] for key in ("source", "repository") if key in urls), "")
-    return str(found).rstrip("/")
 
 
 def title(page: Path) -> str:
