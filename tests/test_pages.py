@@ -23,7 +23,7 @@ NEEDS = {
     "add-a-recipe": ("mujoco", "torch"),
     "add-an-object-category": ("mujoco", "trimesh"),
     "add-a-whisker-species": ("mujoco",),
-    "stimuli-to-alignment": ("mujoco", "torch"),
+    "stimuli-to-alignment": ("torch",),
 }
 LONG = ("add-a-recipe", "stimuli-to-alignment")  # they train, and whisk
 NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
