@@ -72,9 +72,10 @@ def commands(name: str, codecs: list[Any], facts: dict[str, str]) -> str:
     port = f"serial:///dev/{'ttyACM0' if getattr(codecs[0], 'usb', False) else 'ttyUSB0'}"
     lines = ["can:socketcan:can0" if can else port for can in of_can]
     lines.append(f"{'can:slcan:' if of_can[0] else 'serial://'}/tmp/{name}")
-    urls = [f"tactile-rt hz '{line}?{query}'" for line in lines]
+    urls = [f"tactile-rt hz '{line}?{query}' --seconds 5" for line in lines]
     emulate = f"tactile-rt emulate {name} {twin}" + f"--set '{option}' " * bool(option)
-    urls.insert(-1, f"\n# its twin; read it in another terminal\n{emulate}--link /tmp/{name}")
+    said = "# its twin, touched again and again; read it in another terminal"
+    urls.insert(-1, f"\n{said}\n{emulate}--link /tmp/{name}")
     return "\n".join(["```sh", *urls, "```"])
 
 

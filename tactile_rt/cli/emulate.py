@@ -25,7 +25,8 @@ def emulate(
         str | None, typer.Argument(help="Protocol of the device: native, bota, xela, ...")
     ] = None,
     source: Annotated[
-        str | None, typer.Option(help="What the device measures, e.g. replay:FILE. Default: waves.")
+        str | None,
+        typer.Option(help="What the device measures, e.g. replay:FILE. Default: made-up presses."),
     ] = None,
     project: ProjectFolder = None,
     wire: Annotated[

@@ -154,7 +154,7 @@ class ConsumerPart(Part):
         consumer.open(self._view)
         self._busy_ns = 0
         box.taking = True
-        self._up()
+        self._up(str(consumer.details().get("url", "")))
         tick = consumer.tick_s or None
         due = time.monotonic() + consumer.tick_s
         while True:

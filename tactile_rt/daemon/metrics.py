@@ -75,7 +75,7 @@ class Metrics(Consumer):
     def details(self) -> dict[str, str | int | float]:
         server = self._server
         return {
-            "url": f"http://{self._config.host}:{self._config.port}",
+            "url": f"http://{self._config.host}:{self._config.port}/health",
             "requests": server.answered if server else 0,
             "refused": server.refused + server.dropped if server else 0,
         }

@@ -96,9 +96,9 @@ class Part(abc.ABC):
         """Whether what it failed of has changed, so that it is worth another try."""
         return False
 
-    def _up(self) -> None:
-        """It works."""
-        self._turn("running", "")
+    def _up(self, where: str = "") -> None:
+        """Report that it works, and where it can be reached."""
+        self._turn("running", where)
 
     def _run(self) -> None:
         while not self._stop.is_set():

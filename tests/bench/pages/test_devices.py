@@ -34,7 +34,7 @@ def test_every_protocol_has_the_same_entries() -> None:
 
 def test_every_url_is_taken() -> None:
     pytest.importorskip("cantools")
-    urls = re.findall(r"^tactile-rt hz '(.+)'$", TEXT, re.M)
+    urls = re.findall(r"^tactile-rt hz '(.+)' --seconds 5$", TEXT, re.M)
     assert len(urls) == len(CODECS) + len({name for _, name in CODECS})
     for scheme, _, fields in map(split_url, urls):
         make_codec(scheme, fields.pop("codec"), fields)
