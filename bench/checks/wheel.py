@@ -37,7 +37,7 @@ def main() -> None:
             page = email.message_from_bytes(packed.read(metadata)).get_payload()
         assert sorted(folders - {"tactile_rt"}) == [f"{wheel.name.rsplit('-', 3)[0]}.dist-info"]
         leads = [a or b for a, b in TARGET.findall(str(page))]
-        assert leads and [t for t in leads if not t.startswith(("https://", "#"))] == [], leads
+        assert page and [t for t in leads if not t.startswith(("https://", "#"))] == [], leads
         check_sdist(out)
         environment = out / "env"
         venv.create(environment, with_pip=True)
