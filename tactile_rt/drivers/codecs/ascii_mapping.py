@@ -6,7 +6,8 @@ A column is written in one word:
     count[:BITS]                      the sample's number, which wraps at 2^BITS (32)
     time[*SCALE]:s                    seconds, with decimals
     time:ms|us|ns[:BITS]              whole milli-, micro- or nanoseconds, wrapping at 2^BITS (32)
-    time:iso                          2024-05-10 09:48:16.222, or a time of day
+    time:iso                          2024-05-10 09:48:16.222, or a time of day, also with AM, PM
+    time:mdy, time:dmy                05/10/2024 09:48:16, of May or of October
     ELEMENT.CHANNEL[*SCALE][:UNIT]    a measurement
 
 or, where names stand before the numbers, ``NAME=COLUMN``: ``X=M0.bx:uT``. Then numbers are found
@@ -131,7 +132,7 @@ class Column:
         kind: What the column is: ``value``, ``count``, ``s`` (decimal time), ``iso`` (a date),
             ``ms``, ``us``, ``ns`` or ``-``.
         bits: Width of a counter or of a whole-numbered time, in bits.
-        unit: SI unit of the measured value.
+        unit: SI unit of the measured value; of a date the order of its numbers, ``mdy`` or ``dmy``.
         label: Name that stands before the number; empty where places tell.
     """
 
@@ -173,8 +174,8 @@ def parse_column(word: str, where: str) -> Column:
         return replace(parse_column(plain.strip(), where), label=label.strip())
     if word == "-":
         return Column("-")
-    if word == "time:iso":
-        return Column("iso")
+    if word in ("time:iso", "time:mdy", "time:dmy"):
+        return Column("iso", unit=word[5:].removeprefix("iso"))
     if found := _COUNT.fullmatch(word):
         return Column("count", bits=_bits(found[1], where))
     if found := _SECONDS.fullmatch(word):

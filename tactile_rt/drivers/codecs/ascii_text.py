@@ -16,16 +16,24 @@ __all__ = ["Names", "fields", "in_seconds", "number", "quoted"]
 NAN: Final = float("nan")
 # What boards print in place of a number; ovf is Arduino's for what is over 4e9.
 MISSING: Final = frozenset(
-    "ovf null none na n/a - -- --- ---- err error fail failed timeout undefined".split()
+    "ovf null none na n/a n.a. n.a nil (null) <null> <na> - -- --- ---- err error fail failed "
+    "timeout undefined missing #n/a #na #value! #div/0! #num! #ref! #null! #name? -nan(ind) "
+    "nan(ind) 1.#qnan 1.#ind -1.#ind 1.#inf -1.#inf".split()
 )
 NUMBER: Final = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _WITH_UNIT: Final = re.compile(rf"({NUMBER})[A-Za-z%°µμ\ufffd]+(?:/[A-Za-z]+[²2]?)?")
 _HEX: Final = re.compile(r"[+-]?0[xX][0-9A-Fa-f]+")
 _DATE: Final = re.compile(
-    r"(?:(\d{4})[-/.](\d\d)[-/.](\d\d)|(\d\d)\.(\d\d)\.(\d{4}))"
-    r"[T ]+(\d\d):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?"
+    r"(?:(\d{4})[-/.](\d\d?)[-/.](\d\d?)|(\d\d?)\.(\d\d?)\.(\d{4}))"
+    r"[T ]+(\d\d?):(\d\d?)(?::(\d\d?)(?:[.,](\d{1,9}))?)?(Z|[+-]\d\d:?\d\d)?(?![\d:])"
 )
-_CLOCK: Final = re.compile(r"(?<![\d:.-])(\d\d?):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(?![\d:])")
+_CLOCK: Final = re.compile(
+    r"(?<![\d:.-])(\d\d?):([0-5]?\d):([0-5]?\d|60)(?:[.,](\d{1,9}))?(?![\d:])"
+)
+_DAY: Final = re.compile(r"(?<![\d/.-])(\d\d?)([-/])(\d\d?)\2(\d{4}),?[T ]+(?=\d\d?:)")
+_HALF_DAY: Final = re.compile(
+    r"(?<![\d:.-])(1[0-2]|0?[1-9])(:\d\d?)(:\d\d?(?:[.,]\d{1,9})?)?\s*([AaPp])\.?[Mm]\b\.?"
+)
 _NAME: Final = re.compile(r"[A-Za-z_]\w*\s*[:=](?!=)")
 _NAMES: Final = re.compile(r"[A-Za-z_]\w*(?:[ \t]+[A-Za-z_]\w*)*\s*[:=](?!=)")
 _NOTHING: Final = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;])")  # between two commas, or before one
@@ -141,19 +149,39 @@ def _pattern(name: str) -> re.Pattern[str]:
     )
 
 
-def in_seconds(line: str) -> str:
+def in_seconds(line: str, order: str = "") -> str:
     """The line with dates and times of day in seconds: since 1970 (UTC unless it says), or since
-    midnight."""
+    midnight.
+
+    Args:
+        order: of the numbers of 05/10/2024, ``mdy`` or ``dmy``; empty: as a number over 12 tells.
+    """
     if ":" not in line:
         return line
+    if "m" in line or "M" in line:
+        line = _HALF_DAY.sub(_of_half_day, line)
+    if "/" in line or "-" in line:
+        line = _DAY.sub(lambda found: _year_first(found, order), line)
     return _CLOCK.sub(_of_day, _DATE.sub(_since_1970, line))
+
+
+def _of_half_day(found: re.Match[str]) -> str:
+    hour = int(found[1]) % 12 + 12 * (found[4] in "pP")
+    return f"{hour}{found[2]}{found[3] or ':00'}"
+
+
+def _year_first(found: re.Match[str], order: str) -> str:
+    first, second = int(found[1]), int(found[3])
+    order = order or ("mdy" if second > 12 >= first else "dmy" if first > 12 else "")
+    month, day = (first, second) if order == "mdy" else (second, first)
+    return f"{found[4]}-{month:02}-{day:02} " if order else found[0]
 
 
 def _since_1970(found: re.Match[str]) -> str:
     *whole, part, zone = found.groups()
     date = whole[:3] if whole[0] else whole[5:2:-1]
     try:
-        year, month, day, hour, minute, second = map(int, (*date, *whole[6:]))
+        year, month, day, hour, minute, second = map(int, (*date, *whole[6:8], whole[8] or 0))
         at = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return found[0]

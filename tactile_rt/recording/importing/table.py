@@ -6,13 +6,17 @@ What a column may be is told in `ascii_mapping`; here a time may have decimals i
 not wrap, and may be of two columns, seconds and the rest in us or ns. Columns are found by their
 names or, without names, by their places.
 
-Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Where
-a time goes back, another stretch begins, one period after the row before.
+Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Rows
+that changed places are sorted, and a stamp that is early or late among others that are right is
+replaced by one between its neighbours. A time that goes back for good begins another stretch, one
+period after the row before; a time of day that falls by more than half a day is of the next day.
 """
 
 import re
+from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,6 +45,12 @@ NS: Final = {"s": NS_PER_S, "iso": NS_PER_S, "ms": 10**6, "us": 1000, "ns": 1}
 GAP: Final = 10  # typical steps: what is longer is no period
 BLOCK: Final = 1024  # rows that are kept as Python's numbers
 BESIDE: Final = ("header.", "layout.", "field.header.")  # of a message, besides what it tells
+NEAR: Final = 64  # rows within which a time that went back is made good for
+MADE_GOOD: Final = 0.4  # part of a step back
+EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
+MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
+UNLIKE: Final = 1.2  # how far a rate may be from the one that is claimed
+DAY_NS: Final = 86_400 * NS_PER_S
 SHOWN: Final = 600  # characters of the names that a message tells
 _DECIMAL: Final = re.compile(r"([+-]?)(\d+)(?:\.(\d*))?")
 
@@ -51,6 +61,7 @@ class Table:
 
     Attributes:
         rows: The rows, each with as many cells as there are columns: texts or numbers.
+        width: Number of cells of every row that is whole; 0 where rows may be of any.
         times_ns: The times of the rows that were read so far, ns, of a table that has times beside
             its columns; None for one that has not.
         notes: What could not be read, a sentence each; complete once all rows were read.
@@ -61,6 +72,7 @@ class Table:
     rows: Iterable[Sequence[Any]]
     times_ns: list[int] | None = None
     notes: list[str] = field(default_factory=list)
+    width: int = 0
 
 
 def shown_names(names: Sequence[str]) -> str:
@@ -119,6 +131,43 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     Raises:
         ConfigError: the columns cannot be, or nothing tells the time.
     """
+    parsed, spec, read, notes = read_samples(table, columns, rate_hz)
+    account = Import(intact=len(read.values), corrupt=read.corrupt, notes=[*table.notes, *notes])
+    values, times, count = read.values, read.times, read.count
+    if times is not None:
+        if any(c.kind == "iso" for c in parsed) and times.max() < DAY_NS:
+            times = times + DAY_NS * np.cumsum(np.diff(times, prepend=times[0]) < -DAY_NS // 2)
+        order, times = _sort_rows(times, account)
+        values, count = values[order], None if count is None else count[order]
+    seq, keep = _numbers(count, parsed, len(values), account)
+    values, times = values[keep], None if times is None else times[keep]
+    if read.complaint and read.corrupt:
+        account.notes.append(f"the first line that is no sample: {read.complaint}")
+    if times is None:
+        t_ns, zero = np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64), 0
+    else:
+        zero = clock_of(int(times[0]))
+        t_ns, told = _strictly(times - zero, rate_hz, account)
+        if rate_hz and not 1 / UNLIKE < told / rate_hz < UNLIKE:
+            account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
+        spec = replace(spec, rate_hz=rate_hz or told)
+    valid = np.logical_and.reduce(np.isfinite(values), axis=2)
+    about = Description(
+        spec, zero, table.path.name,
+        session={"imported": table.path.name, "columns": columns},
+    )  # fmt: skip
+    return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+
+
+def read_samples(
+    table: Table, columns: str, rate_hz: float = 0.0
+) -> tuple[tuple[Column, ...], ArraySpec, "ReadRows", list[str]]:
+    """Read the rows of a table: its columns, the array, what was read, and notes.
+
+    Raises:
+        ConfigError: the columns cannot be, or nothing tells the time.
+        RecordingError: no row is a sample.
+    """
     mapping = mapping_of(columns, table.path.stem)
     where = columns if columns.endswith(".toml") else "--columns"
     parsed = parse_columns(mapping.columns, where)
@@ -136,27 +185,13 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
             f"{table.path}: no line has the {len(parsed)} columns that are described{why}"
             + (f" ({read.complaint})" if read.complaint else "")
         )
-    account = Import(intact=len(read.values), corrupt=read.corrupt, notes=[*table.notes, *notes])
-    seq, keep = _numbers(read.count, parsed, len(read.values), account)
-    values, times = read.values[keep], None if read.times is None else read.times[keep]
-    if read.complaint and read.corrupt:
-        account.notes.append(f"the first line that is no sample: {read.complaint}")
-    if times is None:
-        t_ns, zero = np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64), 0
-    else:
-        zero = clock_of(int(times[0]))
-        t_ns, told = _strictly(times - zero, rate_hz, account)
-        spec = replace(spec, rate_hz=rate_hz or told)
-    valid = np.logical_and.reduce(np.isfinite(values), axis=2)
-    about = Description(
-        spec, zero, table.path.name,
-        session={"imported": table.path.name, "columns": columns},
-    )  # fmt: skip
-    return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+    return parsed, spec, read, notes
 
 
 @dataclass
-class _Read:
+class ReadRows:
+    """What the rows of a table hold."""
+
     values: NDArray[np.float32]
     times: NDArray[np.int64] | None
     count: NDArray[np.int64] | None
@@ -164,7 +199,7 @@ class _Read:
     complaint: str
 
 
-def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec) -> _Read:
+def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec) -> ReadRows:
     at = {(c.element, c.channel): k for k, c in enumerate(columns)}
     order = [at[e, c] for e in spec.elements for c in spec.channels]
     scale = np.array([columns[k].scale for k in order])
@@ -173,7 +208,8 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
     clocks = [(places[k], c) for k, c in enumerate(columns) if c.kind in NS]
     counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
     need = max(places) + 1
-    width = len(table.names) or need
+    width = table.width or len(table.names) or need
+    least = table.width or need
     blocks: list[NDArray[np.float32]] = []
     rows: list[list[float]] = []
     times: list[int] = []
@@ -188,7 +224,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
 
     for cells in table.rows:
         try:
-            if len(cells) < need or (table.names and len(cells) > width):
+            if len(cells) < least or (len(cells) > width and (table.width or table.names)):
                 raise ValueError(f"{len(cells)} columns, not {width}")
             row = [_number(cells[k]) for k in measured]
             t_ns = sum(_time(cells[place], column) for place, column in clocks)
@@ -206,7 +242,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
             close()
     close()
     timed = bool(clocks) or table.times_ns is not None
-    return _Read(
+    return ReadRows(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
         np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
     )  # fmt: skip
@@ -252,7 +288,7 @@ def _time(cell: Any, column: Column) -> int:
     elif not isinstance(cell, str):
         return round(float(cell) * column.scale * unit)
     else:
-        text = in_seconds(cell.strip()) if column.kind == "iso" else cell.strip()
+        text = in_seconds(cell.strip(), column.unit) if column.kind == "iso" else cell.strip()
     found = _DECIMAL.fullmatch(text) if column.scale == 1.0 else None
     if found is None:
         try:
@@ -287,6 +323,64 @@ def _numbers(
         account.notes.append(f"the count goes back {resets} times")
     advance = np.where(forward, steps, 1)[keep[1:]]
     return np.concatenate([[0], np.cumsum(advance)]).astype(np.int64), keep
+
+
+def _sort_rows(
+    times: NDArray[np.int64], account: Import
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the order of rows, and times that go back only where another stretch begins."""
+    order, steps = np.arange(len(times)), np.diff(times)
+    back = np.flatnonzero(steps < 0)
+    if not len(back):
+        return order, times
+    if (steps <= 0).all():
+        account.notes.append("its first line is its newest: read from its end")
+        return order[::-1], times[::-1]
+    ends = np.flatnonzero(steps)
+    paces = steps[ends] / np.diff(ends, prepend=-1)
+    period = float(np.median(paces[paces > 0]))
+    over = steps - period
+    lasting = [k for k in back if over[max(0, k - NEAR) : k + NEAR].max() < -MADE_GOOD * over[k]]
+    times, moved, dated = times.copy(), 0, 0
+    for a, b in pairwise([0, *(k + 1 for k in lasting), len(times)]):
+        part, of_part = times[a:b], order[a:b]
+        low = np.minimum.accumulate(part[::-1])[::-1]
+        mixed = np.flatnonzero((low < part) | (np.maximum.accumulate(part) > part))
+        wrong: list[int] = []
+        for run in np.split(mixed, np.flatnonzero(np.diff(mixed) > 1) + 1) if len(mixed) else ():
+            i, j = int(run[0]), int(run[-1]) + 1
+            rank = np.argsort(part[i:j], kind="stable")
+            between = np.diff(np.sort(part[max(0, i - 1) : j + 1]))
+            if between.min() < EVEN[0] * period and between.max() > EVEN[1] * period:
+                wrong += [i + k for k in _leave_out(part[i:j].tolist())]
+            else:
+                part[i:j], of_part[i:j] = part[i:j][rank], of_part[i:j][rank]
+                moved += int((rank != np.arange(j - i)).sum())
+        if wrong and len(wrong) <= MOST_LOOSE * len(part):
+            right = np.delete(np.arange(len(part)), wrong)
+            part[wrong] = np.interp(wrong, right, part[right] - part[0]).astype(np.int64) + part[0]
+            dated += len(wrong)
+    if moved:
+        account.notes.append(f"{moved} lines stand in another order than their times: sorted")
+    if dated:
+        account.notes.append(f"{dated} times do not fit those beside them: put between these")
+    return order, times
+
+
+def _leave_out(times: Sequence[int]) -> list[int]:
+    """Return the fewest places without which times do not go back."""
+    ends: list[int] = []
+    last: list[int] = []
+    before: list[int] = []
+    for k, t in enumerate(times):
+        n = bisect_right(ends, t)
+        before.append(last[n - 1] if n else -1)
+        ends[n : n + 1], last[n : n + 1] = [t], [k]
+    kept, k = set(), last[-1]
+    while k >= 0:
+        kept.add(k)
+        k = before[k]
+    return [k for k in range(len(times)) if k not in kept]
 
 
 def _strictly(
