@@ -2,8 +2,10 @@
 
 What is looked at is the beginning. Most of its lines are rows, so the delimiter is that which cuts
 most lines into one number of cells, most of them numbers. Names stand in the last line above the
-rows that has as many cells, a remark (``# time fx fy``) as well as not; what is above that is told
-and passed over. Cells between spaces may stand in brackets and have units, as boards print them.
+rows that has as many cells, a remark (``# time fx fy``) as well as not; what is above that is
+passed over, also where it comes once more. All else but remarks and blank lines is a row, and each
+has as many cells as the table. Cells that many rows lack at their end are empty, a list in a cell is
+as many cells. Cells between spaces may stand in brackets and have units, as boards print them.
 """
 
 import csv
@@ -26,9 +28,10 @@ __all__ = ["CsvForm", "csv_form", "read_table"]
 
 LOOKED_AT: Final = 200  # lines
 ENOUGH: Final = 0.5  # of the lines that are looked at are rows
+OFTEN: Final = 0.2  # of the rows lack the same cells: they are not cut
 DELIMITERS: Final = (";", "\t", ",", "|", " ")
 NAMES: Final = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}
-REMARKS: Final = ("#", "%", "//")
+_REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a spreadsheet
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
@@ -36,6 +39,7 @@ _UNIT: Final = re.compile(
     r"|[mu]?N[ .*\u00b7-]?m{1,2}|deg|degC|kgf?|%|bar|counts?"
 )
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
+_LIST: Final = re.compile(r"[\[(]+\s*[-+.\d][^\[\]()A-DF-Za-df-z:]*[\s,;][^\[\]()A-Za-z:]*[\])]+")
 _NUMBER_COMMA: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
@@ -45,6 +49,8 @@ class CsvForm:
 
     Attributes:
         delimiter: What stands between cells; a space stands for any of spaces and tabs.
+        widths: How many cells a row may have; those that it lacks of `width` are empty.
+        heads: The lines above the first row.
     """
 
     delimiter: str
@@ -54,6 +60,8 @@ class CsvForm:
     width: int
     lines: int = 1
     units: tuple[str, ...] = ()
+    widths: frozenset[int] = frozenset()
+    heads: frozenset[str] = frozenset()
 
 
 def csv_form(
@@ -99,7 +107,7 @@ def csv_form(
 
 def read_table(path: Path, form: CsvForm) -> Table:
     """The rows of a table."""
-    table = Table(path, form.names, ())
+    table = Table(path, form.names, (), width=form.width)
     table.rows = _rows(table, form)
     return table
 
@@ -107,13 +115,14 @@ def read_table(path: Path, form: CsvForm) -> Table:
 def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
     with open_log_file(table.path) as file, _text(file) as text:
         for line in _joined(text, form.first, form.lines):
-            if line.startswith(REMARKS) or not line.strip(" \t,;"):
+            if _REMARK.match(line) or not line.strip(" \t,;") or line.strip() in form.heads:
                 continue
             cells = _cells(line, form.delimiter, form.comma)
-            if len(cells) == form.width - 1 and line.rstrip(" ").endswith(form.delimiter):
-                cells.append("")
-            if form.names and all(number(c.strip()) is None for c in cells):
-                continue  # units below the names, or names once more
+            if (n := len(cells)) != form.width:
+                if n in form.widths or (
+                    n == form.width - 1 and line.rstrip(" ").endswith(form.delimiter)
+                ):
+                    cells = [*cells, *[""] * (form.width - n)][: form.width]
             yield cells
         if getattr(getattr(file, "raw", None), "broken", False):
             table.notes.append("it is cut short or damaged: what unpacks of it was read")
@@ -142,16 +151,27 @@ def _joined(text: TextIOWrapper, skip: int, lines: int) -> Iterator[str]:
 
 
 def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
+    lists = delimiter != " " and ("[" in line or "(" in line)
+    if lists:
+        line = _LIST.sub(lambda found: re.sub(r"[\s,;]+", " ", found[0]), line)
     if delimiter == " ":
         cells = fields(re.sub(r"(?<=\d),(?=\d)", ".", line) if comma else line)
     elif '"' in line:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     else:
         cells = line.split(delimiter)
+    if lists:
+        cells = [x for c in cells for x in (_split_list(c) if _LIST.search(c) else (c,))]
     if len(cells) > 1 and line.rstrip(" ").endswith(delimiter):
         del cells[-1]  # a delimiter at the end of each line
     return [c.replace(",", ".") if _NUMBER_COMMA.fullmatch(c.strip()) else c for c in cells] \
         if comma else cells  # fmt: skip
+
+
+def _split_list(cell: str) -> list[str]:
+    """Split a list of numbers; a cell that holds more is one."""
+    plain = cell.strip().strip('"')
+    return re.sub(r"[\[\](),;]", " ", plain).split() if _LIST.fullmatch(plain) else [cell]
 
 
 def _is_there(cell: str) -> bool:
@@ -177,7 +197,7 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     rows = [
         (k, _cells(x, delimiter, comma))
         for k, x in enumerate(head)
-        if x.strip(" \t,;") and not x.startswith(REMARKS)
+        if x.strip(" \t,;") and not _REMARK.match(x)
     ]
     numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_there, c)) >= len(c) > 0]
     widths = Counter(len(c) for _, c in numeric)
@@ -191,33 +211,50 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
         width, often = width + 1, often + widths[width + 1]  # its last column is seldom there
         numeric = [(k, [*c, ""] if len(c) == width - 1 else c) for k, c in numeric]
     whole = [c for _, c in numeric if len(c) == width]
-    usual = [j for j in range(width) if 2 * sum(_is_number(c[j]) for c in whole) > len(whole)]
-    first = next(
-        (k for k, c in numeric if len(c) == width and all(_is_there(c[j]) for j in usual)),
-        numeric[0][0],
-    )
+    for there in (_is_there, _is_number):  # what stands above may have words where nothing is
+        usual = [j for j in range(width) if 2 * sum(there(c[j]) for c in whole) > len(whole)]
+        first = next(
+            (k for k, c in numeric if len(c) == width and all(_is_there(c[j]) for j in usual)),
+            numeric[0][0],
+        )
+        spans = _spans(head[first], delimiter, comma)
+        names, units, below_names = _names(head[:first], delimiter, width, spans)
+        if names:
+            break
     lines = sum(k >= first for k, _ in rows)
     if often < ENOUGH * lines:
         return None
     share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
-    names, units, below_names = _names(head[:first], delimiter, width)
-    if names:  # the first rows may lack what is usual
-        below = (k for k, c in numeric if k >= below_names and any(map(_is_number, c)))
-        first = next(below, first)
+    widths = {n for n, times in widths.items() if times >= OFTEN * len(numeric)} | {width}
+    if names:  # the first rows may lack what is usual, and all rows what is seldom there
+        below = (k for k, c in rows if k >= below_names and any(map(_is_number, c)))
+        first, width = next(below, first), len(names)
+        widths = {n for n in widths if n <= width}
     # one cell a line is a table, too, but only if nothing else is
     score = often / lines * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
     if delimiter == " ":  # which cuts what all others cut, too
         score -= 0.3 if 2 * sum(len(x.split()) > 1 for x in head) > len(head) else 0.6
-    return score, CsvForm(delimiter, comma, names, first, width, units=units)
+    heads = frozenset(x.strip() for x in head[:first])
+    return score, CsvForm(
+        delimiter, comma, names, first, width, units=units, widths=frozenset(widths), heads=heads
+    )
+
+
+def _spans(line: str, delimiter: str, comma: bool) -> list[int]:
+    """Return how many cells each cell of a line is: a list is several."""
+    if delimiter == " " or not _LIST.search(line):
+        return []
+    packed = _LIST.sub(lambda found: "~" * len(_split_list(found[0])), line)
+    return [max(1, c.count("~")) for c in _cells(packed, delimiter, comma)]
 
 
 def _names(
-    above: list[str], delimiter: str, width: int
+    above: list[str], delimiter: str, width: int, spans: list[int]
 ) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     """The names of the columns, and the units below them; empty: there are none. The line after
     these."""
     units: tuple[str, ...] = ()
-    end = 0
+    end, next_above = 0, True
     for k, line in reversed(list(enumerate(above, start=1))):
         text = line
         for mark in ("#", "//"):
@@ -231,8 +268,18 @@ def _names(
             cells = cells[1:] if cells[:1] == ["%"] else cells
         if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
             cells.append("")
-        words = [c for c in cells if c and not _is_number(c)]
+        if len(cells) == len(spans):  # the names of lists
+            cells = [
+                f"{c}.{i}" if n > 1 else c
+                for c, n in zip(cells, spans, strict=True)
+                for i in range(n)
+            ]
+        words = [c for c in cells if c and number(c) is None and not _is_number(c)]
         numbers = sum(map(_is_number, cells))
+        longer = next_above and delimiter != " " and width < len(cells) <= 1.5 * width
+        next_above &= not line.strip()
+        if longer and line[:1] != "#" and len(set(words)) == len(cells):
+            return tuple(cells), units, k  # its last columns are seldom there
         if len(cells) != width or 2 * len(words) < width or 2 * numbers >= width:
             continue
         if all(_UNIT.fullmatch(c) for c in cells):

@@ -209,7 +209,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
     counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
     need = max(places) + 1
     width = table.width or len(table.names) or need
-    least = table.width or need
+    least = max(table.width, need)
     blocks: list[NDArray[np.float32]] = []
     rows: list[list[float]] = []
     times: list[int] = []
