@@ -291,6 +291,8 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     if proposed is None:
         return False
+    if not proposed.columns:
+        told.nothing(f"no columns are found with which it is read: {proposed.said}"[:200])
     told.say(f"{proposed.said}: names and units are for you to say")
     quoted = shlex.quote(str(path))
     if not proposed.table:

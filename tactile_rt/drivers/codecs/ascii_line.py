@@ -2,8 +2,8 @@
 
 Numbers stand at their places in a line, between spaces, tabs, commas, semicolons and brackets; or
 after their names, in one line, in several, or in JSON. Lines end with a carriage return, a line
-feed or both. The first line after joining is not believed, for it may have lost its beginning;
-banners and headers are known by their words.
+feed or both. The first line after joining is not believed, for it may have lost its beginning (a
+file is read as if a line end came before it); banners and headers are known by their words.
 """
 
 import re
@@ -35,6 +35,7 @@ EXACT: Final = 2.0**53  # whole numbers up to here are exact
 NAN: Final = float("nan")
 
 _SPACES: Final = bytes.maketrans(b",;\t", b"   ")
+_WORDS: Final = re.compile(r"[^:=]*\w[^:=]*")
 _PLAIN: Final = re.compile(rb"[-+0-9.eE \t;,]*")
 
 
@@ -74,6 +75,7 @@ class AsciiLine(SerialCodec):
 
     Options = AsciiLineOptions
     baud = 115200
+    line_end = b"\n"
     cannot_detect = (
         "changed digits (no checksum); lost and repeated lines without a count column; the first "
         "line after each connection is not used"
@@ -87,6 +89,7 @@ class AsciiLine(SerialCodec):
             mapping = LineMapping(columns=(options.columns,))
         if options.rate_hz:
             mapping = msgspec.structs.replace(mapping, rate_hz=options.rate_hz)
+        self.claims_rate = bool(options.mapping or options.rate_hz)
         columns = parse_columns(mapping.columns, f"{where}: columns" if options.mapping else where)
         spec = array_of(mapping, columns, where)
         super().__init__(spec)
@@ -130,6 +133,7 @@ class AsciiLine(SerialCodec):
             self._overlong = True
             self._data.clear()
             self.complaint = f"{self._longest} bytes came without a line end"
+        self.unfinished = len(self._data) + (self._open_bytes if self._open else 0)
         self.stats.intact += len(self._rows)
         return self._samples() if self._rows else None
 
@@ -139,7 +143,7 @@ class AsciiLine(SerialCodec):
         self._damaged = 0
         self._open: dict[int, float] = {}  # of a sample of several lines: what has come
         self._begun = False  # not in the middle of it
-        self._open_ns = 0
+        self._open_ns = self._open_bytes = 0
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         send = {Command.START: self._start, Command.STOP: self._stop, Command.POLL: self._poll}[
@@ -282,14 +286,17 @@ class AsciiLine(SerialCodec):
         if not found:
             self.stats.skipped += len(text)
             if text.strip():
+                if (self.stats.intact or self._rows) and _WORDS.fullmatch(text):
+                    self.passed += 1
                 names = ", ".join(repr(c.label) for c in self._columns)
                 self.complaint = f"line {quoted(text)} has none of {names}"
             return
         if 0 in found or not found.keys().isdisjoint(self._open):
             if self._open and self._begun:
                 self._end_sample()
-            self._open, self._begun = {}, True
+            self._open, self._open_bytes, self._begun = {}, 0, True
         self._open |= found
+        self._open_bytes += len(text) + 1
         self._open_ns = t_ns
         if len(self._open) == self._width:
             self._end_sample()
@@ -312,6 +319,7 @@ class AsciiLine(SerialCodec):
             self.complaint = self._why(text, words)
         if 2 * len(numbers) < len(words):  # mostly words: not meant as a sample
             self.stats.skipped += len(text)
+            self.passed += bool(words and (self.stats.intact or self._rows))
         elif words:
             self._refuse()
 

@@ -23,11 +23,14 @@ __all__ = ["guess_columns", "guess_line_columns"]
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
+WRAPS: Final = (8, 16)  # bits of a counter that is seen to wrap
+NEAR_WRAP: Final = 8  # counts that may be lost where it does
+SELDOM: Final = 50  # one row in so many: a counter is set back
 Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
-    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed)"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
@@ -52,6 +55,7 @@ _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
             "",
         ),
         (r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
+        (r"^(?:force|load|weight)$", "force", ""),
         (r"(?<=[\W_])([xyz])(?:$|[\W_])", "{}", ""),
         (r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", "pressure", ""),
         (r"(?:^|(?<=\d))([xyz])$", "{}", ""),
@@ -61,11 +65,16 @@ _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
 _ALIASES: Final = {
     "n·m": "Nm", "n*m": "Nm", "n.m": "Nm", "n-m": "Nm", "nm": "Nm", "newton": "N", "newtons": "N",
     "°c": "degC", "c": "degC", "celsius": "degC", "µt": "uT", "μt": "uT", "utesla": "uT",
-    "kg": "kgf", "volt": "V", "volts": "V", "m/s^2": "m/s2", "m/s²": "m/s2", "n": "N",
+    "kg": "kgf", "gram": "gf", "grams": "gf", "volt": "V", "volts": "V",
+    "m/s^2": "m/s2", "m/s²": "m/s2", "n": "N",
 }  # fmt: skip
+ALONE: Final = ("temperature", "pressure", "force")
+_LABELLED: Final = re.compile(
+    r"([A-Za-z_][\w ()\[\]/°%]*?(?:\s*[\[(][^\d\])=:][^\])=:]*[\])])?)\s*[:=\[]\s*([^\s,;|\]]+)"
+    rf"(?: (?:{'|'.join(map(re.escape, [*UNITS, *_ALIASES, 'C']))})(?= ))?"
+)
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
 _NAMED: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
-_LABELLED: Final = re.compile(r"([A-Za-z_][\w ()\[\]/°%]*?)\s*[:=\[]\s*([^\s,;|\]]+)")
 
 
 def guess_columns(
@@ -84,7 +93,7 @@ def guess_columns(
         kinds[time[0]] = time[1]
     count = _place_count(names, series, kinds)
     if count is not None:
-        kinds[count] = "count"
+        kinds[count[0]] = count[1]
     for k, name in enumerate(names):  # times and counts beside those
         if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _COUNT.fullmatch(_bare(name))):
             kinds[k] = "-"
@@ -102,7 +111,7 @@ def guess_line_columns(data: bytes) -> list[str] | None:
     label = _LABELLED.match(first)
     if label and any(line.startswith(label[1]) for line in lines):  # whole; it may begin a sample
         lines.insert(0, first)
-    lines = [x for x in lines[:-1] if x.strip()][:LOOKED_AT]
+    lines = [x for x in lines[:-1] if re.search(r"\w", x)][:LOOKED_AT]
     if len(lines) < LEAST or _unprintable(lines):
         return None
     return _of_objects(lines) or _of_places(lines) or _of_labels(lines)
@@ -170,7 +179,7 @@ def _of_places(lines: list[str]) -> list[str] | None:
     numeric = [k for k in range(width) if share[k] >= MOSTLY]
     if 2 * len(numeric) < width or (2 * len(numeric) == width and width > 2):
         return None
-    if sum(_NAMED.search(line) is not None for line, _ in same) > len(same) / 2 and width > 1:
+    if sum(_NAMED.search(line) is not None for line, _ in same) > len(same) / 2:
         labelled = _of_labels(lines)  # names tell more than places
         if labelled is not None and len(labelled) >= len(numeric) - 1:
             return labelled
@@ -274,13 +283,20 @@ def _time_unit(name: str, v: NDArray[np.float64]) -> str:
 
 def _place_count(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], kinds: Sequence[str]
-) -> int | None:
+) -> tuple[int, str] | None:
     for k, v in enumerate(series):
         if v is None or kinds[k] or (names and not _COUNT.fullmatch(_bare(names[k]))):
             continue
-        if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all():
-            if (np.diff(v) == 1).mean() > MOSTLY and (v >= 0).all():
-                return k
+        if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all() and (v >= 0).all():
+            steps = np.diff(v)
+            if (steps == 1).mean() <= MOSTLY:
+                continue
+            falls = int((steps < 0).sum())
+            bits = [b for b in WRAPS if v.max() < 1 << b and steps.min() + (1 << b) <= NEAR_WRAP]
+            if falls and bits:
+                return k, f"count:{bits[0]}"
+            if falls * SELDOM <= len(v):  # else it is a reading that goes round
+                return k, "count"
     return None
 
 
@@ -289,6 +305,14 @@ def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     parsed = {k: _parsed(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())
+    others = {k: p for k, p in parsed.items() if not p[1]}
+    units = {p[2] for p in others.values() if p[2]}
+    if others and (len(units) > 1 or 2 * len(known) >= len(parsed)):
+        # quantities of one place, such as force and temperature, each in its own unit
+        told = {k: p[1] or p[0].lower() for k, p in parsed.items()}
+        alone = all(p[0] == "S" and p[1] in ALONE for p in known.values())
+        if alone and len(set(told.values())) == len(told):
+            return {k: f"S.{channel}:{parsed[k][2] or '1'}" for k, channel in told.items()}
     if 2 * len(known) < len(parsed) and not loads:  # where something is, beside what it feels
         known = {k: (e, "value", u) for k, (e, c, u) in parsed.items() if not c}
     chosen = known or {k: (e, "value", u) for k, (e, _, u) in parsed.items()}
@@ -323,6 +347,10 @@ def _parsed(name: str) -> tuple[str, str, str]:
         if (found := pattern.search(bare)) is None:
             continue
         axis = next((g for g in found.groups() if g), "").lower()
+        if channel == "temperature" and unit not in ("K", "degC"):
+            unit = ""  # F is farad, and no unit of a temperature
+        elif channel == "force" and unit == "g":
+            unit = "gf"
         rest = bare[: found.start()] + " " + bare[found.end() :]
         rest = re.sub(r"(?i)(?:^|\W)(?:field|wrench|data|msg)(?=\W|$)", " ", rest)
         element = _PLAIN.sub("_", rest).strip("_-") or "S"

@@ -3,9 +3,9 @@
 What is looked at is the beginning. Most of its lines are rows, so the delimiter is that which cuts
 most lines into one number of cells, most of them numbers. Names stand in the last line above the
 rows that has as many cells, a remark (``# time fx fy``) as well as not; what is above that is
-passed over, also where it comes once more. All else but remarks and blank lines is a row, and each
-has as many cells as the table. Cells that many rows lack at their end are empty, a list in a cell is
-as many cells. Cells between spaces may stand in brackets and have units, as boards print them.
+passed over, also where it comes once more. All else but remarks and blank lines is a row, and has as
+many cells as the table; those that many rows lack at their end are empty, a list in a cell is as
+many cells. Cells between spaces may stand in brackets and have units, as boards print them.
 """
 
 import csv
@@ -39,7 +39,10 @@ _UNIT: Final = re.compile(
     r"|[mu]?N[ .*\u00b7-]?m{1,2}|deg|degC|kgf?|%|bar|counts?"
 )
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
-_LIST: Final = re.compile(r"[\[(]+\s*[-+.\d][^\[\]()A-DF-Za-df-z:]*[\s,;][^\[\]()A-Za-z:]*[\])]+")
+_LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
+    r"[\[(](?=[\s\[(]*(?:[-+.]*\d|nan\b))(?=[^\])]*[\s,;])"
+    r"(?:[-+.\deEnNaAiIfF\s,;]|[\[(][-+.\deEnNaAiIfF\s,;]*[\])])*[\])]"
+)
 _NUMBER_COMMA: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
@@ -218,7 +221,7 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
             numeric[0][0],
         )
         spans = _spans(head[first], delimiter, comma)
-        names, units, below_names = _names(head[:first], delimiter, width, spans)
+        names, units, below_names = _names(head[:first], delimiter, comma, width, spans)
         if names:
             break
     lines = sum(k >= first for k, _ in rows)
@@ -249,7 +252,7 @@ def _spans(line: str, delimiter: str, comma: bool) -> list[int]:
 
 
 def _names(
-    above: list[str], delimiter: str, width: int, spans: list[int]
+    above: list[str], delimiter: str, comma: bool, width: int, spans: list[int]
 ) -> tuple[tuple[str, ...], tuple[str, ...], int]:
     """The names of the columns, and the units below them; empty: there are none. The line after
     these."""
@@ -262,7 +265,7 @@ def _names(
         if delimiter == " ":
             cells = re.findall(r'"[^"]*"|[^\s,;]+', text)
         else:
-            cells = _cells(text, delimiter, False)
+            cells = _cells(text, delimiter, comma)
         cells = [c.strip().strip('"').strip() for c in cells]
         if line.startswith("%") and len(cells) != width:
             cells = cells[1:] if cells[:1] == ["%"] else cells
@@ -277,7 +280,7 @@ def _names(
         words = [c for c in cells if c and number(c) is None and not _is_number(c)]
         numbers = sum(map(_is_number, cells))
         longer = next_above and delimiter != " " and width < len(cells) <= 1.5 * width
-        next_above &= not line.strip()
+        next_above &= not line.strip() or 2 * numbers >= len(cells)
         if longer and line[:1] != "#" and len(set(words)) == len(cells):
             return tuple(cells), units, k  # its last columns are seldom there
         if len(cells) != width or 2 * len(words) < width or 2 * numbers >= width:

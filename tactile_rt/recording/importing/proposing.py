@@ -1,8 +1,12 @@
 """Columns for a table, or for what a board printed, for a user to look at and change."""
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+
+import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
@@ -10,11 +14,14 @@ from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, gue
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
+from tactile_rt.recording.importing.table import read_samples
 
 __all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_columns"]
 
+_CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
-DATED = 20  # rows that are looked at for dates
+DATED = 0.9  # of the cells of a column of dates
+ORDERS = {"mdy": "month", "dmy": "day"}
 
 
 @dataclass(frozen=True)
@@ -22,6 +29,7 @@ class ProposedColumns:
     """What may be in the columns of a file.
 
     Attributes:
+        columns: The columns in words; empty where none were found with which the file is read.
         table: Whether the file is to be read as a table; else as what a board prints.
     """
 
@@ -53,19 +61,22 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
         form = csv_form(path)
     except RecordingError:
         form = None
-    if form is not None and (form.names or form.delimiter != " "):
+    told = propose_line_columns(data)
+    labelled = told is not None and "=" in told.columns
+    if form is None or (labelled and not form.names):
+        return told
+    if form.names or form.delimiter != " ":
         proposed = _of_table(path, form)
         if proposed is not None:
             return proposed
-    told = propose_line_columns(data)
-    if form is None or (told is not None and "=" in told.columns):
-        return told
-    return _of_table(path, form) if told is None else replace(told, table=True)
+    if told is None or labelled:
+        return told or _of_table(path, form)
+    return _tried(path, form, replace(told, table=True))
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
     """The columns of what a board printed; None where it printed no samples."""
-    told = line_columns(data)
+    told = line_columns(b"\n" + data)  # a file begins with a line
     if told is None:
         return None
     columns, n = told
@@ -74,22 +85,55 @@ def propose_line_columns(data: bytes) -> ProposedColumns | None:
 
 def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     rows = [r for r in islice(read_table(path, form).rows, LOOKED_AT) if len(r) == form.width]
-    cells = [[number(in_seconds(c.strip()) or "nan") for c in row] for row in rows]
+    clocks = {k: order for k in range(form.width) if (order := _find_order([r[k] for r in rows]))}
+    cells = [
+        [number(in_seconds(c.strip(), clocks.get(k, "")) or "nan") for k, c in enumerate(row)]
+        for row in rows
+    ]
     numbers = sum(c is not None for row in cells for c in row)
     if len(rows) < LEAST or 2 * numbers < len(rows) * form.width:
         return None
-    dated = {
-        k
-        for k in range(form.width)
-        if all(":" in row[k] and in_seconds(row[k]) != row[k] for row in rows[:DATED])
-    }
     names = form.names
     if form.units:  # said as names say them
         names = tuple(f"{n} [{u}]" if u else n for n, u in zip(names, form.units, strict=True))
-    words, timed = guess_columns(names, cells, dated)
+    words, timed = guess_columns(names, cells, clocks)
     if not any("." in word for word in words if not word.startswith("time")):
         return None
+    said = f"{path} is a table of {form.width} columns"
+    for k, order in clocks.items():
+        if words[k] == "time:iso" and order != "iso":
+            words[k] = f"time:{order}"
+            said += f", {rows[0][k].strip()} with the {ORDERS[order]} first"
+    for k in sorted(set(range(form.width)) - clocks.keys()):
+        if rows and sum(bool(_CLOCK.search(row[k])) for row in rows) >= len(rows) * DATED:
+            said += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
     if form.names:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    said = f"{path} is a table of {form.width} columns"
-    return ProposedColumns(compress_columns(words), True, timed, said)
+    return _tried(path, form, ProposedColumns(compress_columns(words), True, timed, said))
+
+
+def _find_order(cells: Sequence[str]) -> str:
+    """Return the order of the numbers of dates, ``iso``, ``mdy`` or ``dmy``; empty: no dates."""
+    cells = [c for c in cells if c.strip()]
+    if not cells or sum(":" in c for c in cells) < len(cells) * DATED:
+        return ""
+    read = {
+        order: sum(number(in_seconds(c.strip(), order)) is not None for c in cells)
+        for order in ("", "mdy", "dmy")
+    }
+    half_days = cells[0].rstrip(". ")[-1:] in "mM"
+    best = max(read, key=lambda order: (read[order], not order, (order == "mdy") == half_days))
+    return (best or "iso") if read[best] >= len(cells) * DATED else ""
+
+
+def _tried(path: Path, form: CsvForm, proposed: ProposedColumns) -> ProposedColumns:
+    """Return what is proposed, without columns where the first rows are not read by them."""
+    table = read_table(path, form)
+    table.rows = islice(table.rows, LOOKED_AT)
+    try:
+        _, _, read, _ = read_samples(table, proposed.columns, 0.0 if proposed.timed else 1.0)
+    except (ConfigError, RecordingError) as error:
+        return replace(proposed, columns="", said=str(error))
+    if len(read.values) > read.corrupt and np.isfinite(read.values).any():
+        return proposed
+    return replace(proposed, columns="", said=f"{path}: most lines are no rows: {read.complaint}")

@@ -48,6 +48,7 @@ BESIDE: Final = ("header.", "layout.", "field.header.")  # of a message, besides
 NEAR: Final = 64  # rows within which a time that went back is made good for
 MADE_GOOD: Final = 0.4  # part of a step back
 EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
+FAR: Final = 3  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 UNLIKE: Final = 1.2  # how far a rate may be from the one that is claimed
 DAY_NS: Final = 86_400 * NS_PER_S
@@ -133,10 +134,12 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     """
     parsed, spec, read, notes = read_samples(table, columns, rate_hz)
     account = Import(intact=len(read.values), corrupt=read.corrupt, notes=[*table.notes, *notes])
-    values, times, count = read.values, read.times, read.count
+    values, times, count, number = read.values, read.times, read.count, read.number
     if times is not None:
         if any(c.kind == "iso" for c in parsed) and times.max() < DAY_NS:
-            times = times + DAY_NS * np.cumsum(np.diff(times, prepend=times[0]) < -DAY_NS // 2)
+            steps = np.diff(times, prepend=times[0])
+            days = np.cumsum((steps < -DAY_NS // 2).astype(int) - (steps > 23 * DAY_NS // 24))
+            times = times + DAY_NS * np.maximum(0, days)
         order, times = _sort_rows(times, account)
         values, count = values[order], None if count is None else count[order]
     seq, keep = _numbers(count, parsed, len(values), account)
@@ -147,9 +150,10 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         t_ns, zero = np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64), 0
     else:
         zero = clock_of(int(times[0]))
-        t_ns, told = _strictly(times - zero, rate_hz, account)
+        t_ns, told = _strictly(times - zero, rate_hz, account, number[keep])
         if rate_hz and not 1 / UNLIKE < told / rate_hz < UNLIKE:
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
+            account.came_hz = told
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     about = Description(
@@ -190,16 +194,23 @@ def read_samples(
 
 @dataclass
 class ReadRows:
-    """What the rows of a table hold."""
+    """What the rows of a table hold.
+
+    Attributes:
+        number: Which row each sample is, those that are corrupt counted as well.
+    """
 
     values: NDArray[np.float32]
     times: NDArray[np.int64] | None
     count: NDArray[np.int64] | None
     corrupt: int
     complaint: str
+    number: NDArray[np.int64]
 
 
-def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec) -> ReadRows:
+def _read(
+    table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec
+) -> ReadRows:
     at = {(c.element, c.channel): k for k, c in enumerate(columns)}
     order = [at[e, c] for e in spec.elements for c in spec.channels]
     scale = np.array([columns[k].scale for k in order])
@@ -214,6 +225,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
     rows: list[list[float]] = []
     times: list[int] = []
     counts: list[int] = []
+    number: list[int] = []
     corrupt, complaint = 0, ""
 
     def close() -> None:
@@ -238,6 +250,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
             continue
         rows.append(row)
         times.append(t_ns)
+        number.append(len(times) + corrupt)
         if len(rows) == BLOCK:
             close()
     close()
@@ -245,6 +258,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
     return ReadRows(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
         np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
+        np.array(number, np.int64),
     )  # fmt: skip
 
 
@@ -296,7 +310,8 @@ def _time(cell: Any, column: Column) -> int:
         except ValueError:
             value = np.inf
         if not abs(value) < 2.0**62:
-            raise ValueError(f"{cell!r:.40} is no time")
+            hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
+            raise ValueError(f"{cell!r:.40} is no time{hint}")
         return round(value)
     part = found[3] or ""
     scale: int = 10 ** len(part)
@@ -351,11 +366,13 @@ def _sort_rows(
             i, j = int(run[0]), int(run[-1]) + 1
             rank = np.argsort(part[i:j], kind="stable")
             between = np.diff(np.sort(part[max(0, i - 1) : j + 1]))
-            if between.min() < EVEN[0] * period and between.max() > EVEN[1] * period:
-                wrong += [i + k for k in _leave_out(part[i:j].tolist())]
+            out, places = _leave_out(part[i:j].tolist()), int((rank != np.arange(j - i)).sum())
+            squeezed = between.min() < EVEN[0] * period or places > FAR * len(out)
+            if squeezed and between.max() > EVEN[1] * period:
+                wrong += [i + k for k in out]
             else:
                 part[i:j], of_part[i:j] = part[i:j][rank], of_part[i:j][rank]
-                moved += int((rank != np.arange(j - i)).sum())
+                moved += places
         if wrong and len(wrong) <= MOST_LOOSE * len(part):
             right = np.delete(np.arange(len(part)), wrong)
             part[wrong] = np.interp(wrong, right, part[right] - part[0]).astype(np.int64) + part[0]
@@ -384,7 +401,7 @@ def _leave_out(times: Sequence[int]) -> list[int]:
 
 
 def _strictly(
-    times: NDArray[np.int64], rate_hz: float, account: Import
+    times: NDArray[np.int64], rate_hz: float, account: Import, number: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], float]:
     """Times that increase strictly, and the rate that they tell, Hz."""
     if len(times) == 1:
@@ -397,7 +414,10 @@ def _strictly(
     stretches = int((steps < 0).sum())
     repeats = int((steps == 0).sum())
     usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
-    period = float(steps[ends][usual].sum() / np.diff(ends, prepend=-1)[usual].sum())
+    rows = np.diff(ends, prepend=-1)
+    long = steps[ends] / rows > EVEN[1] * np.median((steps[ends] / rows)[usual])
+    rows = np.where(long, np.diff(number[ends + 1], prepend=number[0]), rows)  # with corrupt ones
+    period = float(steps[ends][usual].sum() / rows[usual].sum())
     if stretches:
         account.notes.append(f"times go back {stretches} times: there they go on a period later")
         jump = np.where(steps < 0, round(period) - steps, 0)

@@ -68,8 +68,11 @@ def import_wire(
             account.samples += len(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
-        if log.wire == "serial" and decoded.unfinished:
-            account.notes.append(f"it ends with {decoded.unfinished} bytes of no whole sample")
+        rest = getattr(codec, "unfinished", None)
+        if log.wire == "serial" and (rest := decoded.unfinished if rest is None else rest):
+            account.notes.append(f"it ends with {rest} bytes of no whole sample")
+        if passed := getattr(codec, "passed", 0):
+            account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
         account.seconds = (last - first) / NS_PER_S
@@ -83,7 +86,11 @@ def import_wire(
     if stats.duplicates:
         account.notes.append(f"{stats.duplicates} samples came twice")
     came_hz = (account.samples + account.missing - 1) / (account.seconds or 1.0)
+    if account.samples >= FEW and not getattr(codec, "claims_rate", True):
+        if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
+            return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
+        account.came_hz = came_hz
         account.notes.append(
             f"they came at {came_hz:.4g} Hz: --rate says what the device was set to"
         )
@@ -142,6 +149,8 @@ class _Decoded:
         self._count: int | None = None  # of the newest sample
         codec.commands(Command.START)  # some note what they have asked for
         packets = log.packets()
+        if log.form in ("raw", "terminal"):  # which begin with their first line
+            packets = _lead(packets, getattr(codec, "line_end", b""))
         waiting: list[tuple[Any, int | None, Samples | None]] = []
         for packet, t_ns in packets:
             waiting.append((packet, t_ns, codec.feed(packet, t_ns or 0)))
@@ -219,6 +228,12 @@ class _Decoded:
             return n
         ahead = (self._count - before) % (1 << bits)
         return ahead if n <= ahead <= 1 << (bits - 1) else n
+
+
+def _lead(packets: Iterator[tuple[Any, int | None]], lead: bytes) -> Iterator[Any]:
+    """Put bytes before the first packet."""
+    for k, (packet, t_ns) in enumerate(packets):
+        yield packet if k else lead + packet, t_ns
 
 
 def _joined(parts: list[Samples]) -> Samples:
