@@ -9,7 +9,7 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 
-__all__ = ["DayClock", "Found", "of_candump", "of_gvret", "of_heard", "of_hex", "of_slcan"]
+__all__ = ["DAY_NS", "Found", "of_candump", "of_gvret", "of_heard", "of_hex", "of_slcan"]
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
@@ -36,7 +36,6 @@ _HEX: Final = re.compile(
     r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
 )
 DAY_NS: Final = 86_400 * NS_PER_S
-BACK_NS: Final = 60 * NS_PER_S
 _ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
 
 Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns
@@ -97,28 +96,6 @@ def of_heard(line: str) -> Found:
     t_ns = _time((found["arduino"] or found["t"]).replace(",", "."))
     text = found["a"] if found["b"] is None else found["b"]
     return None if t_ns is None else ("", f"{text}\n".encode(), t_ns)
-
-
-class DayClock:
-    """Carries times of day, and a clock that was set back, on past midnight."""
-
-    def __init__(self) -> None:
-        self.set_back = self._before = self._latest = 0
-
-    def carry(self, t_ns: int) -> int:
-        """Return a time, ns, that has never gone back by a minute or more."""
-        now = t_ns + self._before
-        if self._before and now - self._latest > 23 * DAY_NS // 24:  # a line that midnight passed
-            now -= DAY_NS
-        elif now < self._latest - DAY_NS // 2 and t_ns < DAY_NS:
-            self._before += DAY_NS
-            now += DAY_NS
-        elif now < self._latest - BACK_NS:
-            self.set_back += 1
-            self._before += self._latest - now
-            now = self._latest
-        self._latest = max(self._latest, now)
-        return now
 
 
 def of_hex(line: str) -> Found:

@@ -22,7 +22,7 @@ from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import (
-    DayClock,
+    DAY_NS,
     Found,
     of_candump,
     of_gvret,
@@ -118,7 +118,6 @@ class LineLog:
         parse, errors, buses = LINES[self.form], 0, self.buses
         others = -(self.form == "gvret")  # whose first line names the columns
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
-        clock = DayClock() if self.form == "terminal" else None
         with TextIOWrapper(file, "utf-8", "replace") as lines:
             for line in lines:
                 found = parse(line.rstrip("\r\n"))
@@ -129,15 +128,13 @@ class LineLog:
                 if packet is None:
                     errors += 1
                     continue
-                if clock is not None and t_ns is not None:
-                    t_ns = clock.carry(t_ns)
+                if self.form == "terminal" and t_ns is not None:  # on after midnight
+                    now = t_ns = t_ns + DAY_NS * max(0, -((t_ns - now + DAY_NS // 4) // DAY_NS))
                 if apart:
                     t_ns = now = now + (t_ns or 0)
                 buses[bus] += 1
                 if not self._bus or bus == self._bus:
                     yield packet, t_ns
-        if clock is not None and clock.set_back:
-            self.notes.append(f"its clock goes back {clock.set_back} times: times go on from there")
         self._tell(others, "line", errors)
 
     def _logged(self, file: LogFile) -> Iterator[Timed]:

@@ -69,6 +69,38 @@ FILES = {
         lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
         "--columns Zeit=time:s,Fx=S.fx:mN",
     ),
+    "labels with units, one a line": (
+        lambda: b"".join(
+            b"Force [N]:\t%d\r\nTemp (C):\t%d.5\r\n" % (k % 7, k * k % 5) for k in range(40)
+        ),
+        "--as codec=ascii_line&columns=Force [N]%3DS.force:N,Temp (C)%3DS.temperature:degC",
+    ),
+    "lists in cells": (
+        lambda: b"t,f\n" + b"".join(
+            b'0.%02d,"[%d, %d.5, nan, 2]"\n' % (k, k % 7, k) for k in range(40)
+        ),
+        "--columns t=time:s,f.{0..1}=f_{0..1}.value:1,f.3=f_3.value:1",
+    ),
+    "half days": (
+        lambda: b"Time,Fx\n" + b"".join(
+            b"9/16/2023 12:59:%02d PM,%d\n" % (k, k) for k in range(40)
+        ),
+        "--columns Time=time:iso,Fx=S.fx:N",
+    ),
+    "days before months": (
+        lambda: b"Time,Fx\n" + b"".join(b"5/10/2023 23:59:%02d,%d\n" % (k, k) for k in range(40)),
+        "--columns Time=time:dmy,Fx=S.fx:N",
+    ),
+    "a reading that goes round": (
+        lambda: b"".join(b"%d %d\n" % (k % 5, k * k % 17) for k in range(60)),
+        "--columns T{0..1}.value --rate 100",
+    ),
+    "one bad cell": (
+        lambda: b"t,Fx\n" + b"".join(
+            b"0.%02d,%s\n" % (k, b"?!" if k == 7 else b"%d" % k) for k in range(20)
+        ),
+        "--columns t=time:s,Fx=S.fx:N",
+    ),
     "columns that are there in turn, or never": (
         lambda: b"t,a,b,c\n" + b"".join(
             b"0.%02d,%s,\n" % (k, b"%d," % k if k % 2 else b",%d" % k) for k in range(40)
@@ -88,6 +120,18 @@ def test_the_command_for_a_file_imports_it(call, here, name):
     assert " ".join(command) == f"import file.log {options}"
     code, told, _ = call(*command)
     assert code == 0 and int(told.split()[1]) >= 15
+
+
+def test_what_cannot_be_read_is_told_and_not_proposed(call, here):
+    (here / "a.csv").write_text(
+        "t,Fx\n" + "".join(f"16/9/23 12:00:{k},{k}\n" for k in range(10, 40))
+    )
+    code, said, _ = call("sniff", "a.csv")
+    assert code == 0 and "'16/9/23 12:00:10' in column 1 is no time that is read" in said
+    assert "t=time" not in said and "--rate" in said
+    (here / "b.csv").write_text("a,b,a\n" + "".join(f"{k},[{k},x],{k * k}\n" for k in range(40)))
+    code, said, _ = call("sniff", "b.csv")
+    assert code == 1 or call(*next_command(said))[0] == 0
 
 
 @pytest.mark.parametrize(

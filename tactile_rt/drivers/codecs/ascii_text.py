@@ -31,8 +31,6 @@ _CLOCK: Final = re.compile(
     r"(?<![\d:.-])(\d\d?):([0-5]?\d):([0-5]?\d|60)(?:[.,](\d{1,9}))?(?![\d:])"
 )
 _DAY: Final = re.compile(r"(?<![\d/.-])(\d\d?)([-/])(\d\d?)\2(\d{4}),?[T ]+(?=\d\d?:)")
-_MONTHS: Final = "jan feb mar apr may jun jul aug sep oct nov dec".split()
-_MONTH: Final = re.compile(r"(?<![\w-])(\d\d?)[- /]([A-Za-z]{3})[- /](\d{4})(?=[T ]+\d\d?:)")
 _HALF_DAY: Final = re.compile(
     r"(?<![\d:.-])(1[0-2]|0?[1-9])(:\d\d?)(:\d\d?(?:[.,]\d{1,9})?)?\s*([AaPp])\.?[Mm]\b\.?"
 )
@@ -160,22 +158,18 @@ def in_seconds(line: str, order: str = "") -> str:
     """
     if ":" not in line:
         return line
-    if "m" in line or "M" in line:
-        line = _HALF_DAY.sub(_of_half_day, line)
-    if (found := _MONTH.search(line)) and (month := found[2].lower()) in _MONTHS:
-        day = f"{found[3]}-{_MONTHS.index(month) + 1}-{found[1]}"
-        line = line[: found.start()] + day + line[found.end() :]
+    line = _HALF_DAY.sub(_count_hours, line) if "m" in line or "M" in line else line
     if "/" in line or "-" in line:
-        line = _DAY.sub(lambda found: _year_first(found, order), line)
+        line = _DAY.sub(lambda found: _put_year_first(found, order), line)
     return _CLOCK.sub(_of_day, _DATE.sub(_since_1970, line))
 
 
-def _of_half_day(found: re.Match[str]) -> str:
+def _count_hours(found: re.Match[str]) -> str:
     hour = int(found[1]) % 12 + 12 * (found[4] in "pP")
     return f"{hour}{found[2]}{found[3] or ':00'}"
 
 
-def _year_first(found: re.Match[str], order: str) -> str:
+def _put_year_first(found: re.Match[str], order: str) -> str:
     first, second = int(found[1]), int(found[3])
     order = order or ("mdy" if second > 12 >= first else "dmy" if first > 12 else "")
     month, day = (first, second) if order == "mdy" else (second, first)

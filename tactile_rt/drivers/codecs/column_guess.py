@@ -23,9 +23,7 @@ __all__ = ["guess_columns", "guess_line_columns"]
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
-WRAPS: Final = (8, 16)  # bits of a counter that is seen to wrap
-NEAR_WRAP: Final = 8  # counts that may be lost where it does
-SELDOM: Final = 50  # one row in so many: a counter is set back
+SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
 Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
@@ -93,7 +91,7 @@ def guess_columns(
         kinds[time[0]] = time[1]
     count = _place_count(names, series, kinds)
     if count is not None:
-        kinds[count[0]] = count[1]
+        kinds[count] = "count"
     for k, name in enumerate(names):  # times and counts beside those
         if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _COUNT.fullmatch(_bare(name))):
             kinds[k] = "-"
@@ -283,20 +281,14 @@ def _time_unit(name: str, v: NDArray[np.float64]) -> str:
 
 def _place_count(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], kinds: Sequence[str]
-) -> tuple[int, str] | None:
+) -> int | None:
     for k, v in enumerate(series):
         if v is None or kinds[k] or (names and not _COUNT.fullmatch(_bare(names[k]))):
             continue
         if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all() and (v >= 0).all():
-            steps = np.diff(v)
-            if (steps == 1).mean() <= MOSTLY:
-                continue
-            falls = int((steps < 0).sum())
-            bits = [b for b in WRAPS if v.max() < 1 << b and steps.min() + (1 << b) <= NEAR_WRAP]
-            if falls and bits:
-                return k, f"count:{bits[0]}"
-            if falls * SELDOM <= len(v):  # else it is a reading that goes round
-                return k, "count"
+            steps = np.diff(v)  # what falls more often is a reading that goes round
+            if (steps == 1).mean() > MOSTLY and (steps < 0).sum() <= 1 + len(v) // SELDOM:
+                return k
     return None
 
 

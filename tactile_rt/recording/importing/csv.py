@@ -3,9 +3,9 @@
 What is looked at is the beginning. Most of its lines are rows, so the delimiter is that which cuts
 most lines into one number of cells, most of them numbers. Names stand in the last line above the
 rows that has as many cells, a remark (``# time fx fy``) as well as not; what is above that is
-passed over, also where it comes once more. All else but remarks and blank lines is a row, and has as
-many cells as the table; those that many rows lack at their end are empty, a list in a cell is as
-many cells. Cells between spaces may stand in brackets and have units, as boards print them.
+passed over, also where it comes again. All else but remarks and blank lines is a row, of as many
+cells as the table; those that many rows lack at their end are empty, a list is as many cells. Cells
+between spaces may stand in brackets and have units, as boards print them.
 """
 
 import csv

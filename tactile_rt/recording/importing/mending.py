@@ -103,7 +103,6 @@ class Import:
 
     Attributes:
         missing: The number of samples that never came, by the device's counter.
-        came_hz: The rate that the times tell, Hz, where it is far from the one that is claimed.
     """
 
     samples: int = 0
@@ -112,17 +111,13 @@ class Import:
     missing: int = 0
     seconds: float = 0.0
     rate_hz: float = 0.0
-    came_hz: float = 0.0
     notes: list[str] = field(default_factory=list)
 
     def line(self) -> str:
         """It in one line."""
-        rate = f"{self.came_hz or self.rate_hz:.6g} Hz"
-        if self.came_hz:
-            rate += f" (claimed: {self.rate_hz:.6g} Hz)"
         return (
             f"{self.samples} samples in, {self.intact} intact, {self.corrupt} corrupt, "
-            f"{self.missing} missing; {self.seconds:.6g} s at {rate}"
+            f"{self.missing} missing; {self.seconds:.6g} s at {self.rate_hz:.6g} Hz"
         )
 
 

@@ -71,7 +71,7 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
             return proposed
     if told is None or labelled:
         return told or _of_table(path, form)
-    return _tried(path, form, replace(told, table=True))
+    return _try_import(path, form, replace(told, table=True))
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
@@ -109,7 +109,7 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
             said += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
     if form.names:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    return _tried(path, form, ProposedColumns(compress_columns(words), True, timed, said))
+    return _try_import(path, form, ProposedColumns(compress_columns(words), True, timed, said))
 
 
 def _find_order(cells: Sequence[str]) -> str:
@@ -126,7 +126,7 @@ def _find_order(cells: Sequence[str]) -> str:
     return (best or "iso") if read[best] >= len(cells) * DATED else ""
 
 
-def _tried(path: Path, form: CsvForm, proposed: ProposedColumns) -> ProposedColumns:
+def _try_import(path: Path, form: CsvForm, proposed: ProposedColumns) -> ProposedColumns:
     """Return what is proposed, without columns where the first rows are not read by them."""
     table = read_table(path, form)
     table.rows = islice(table.rows, LOOKED_AT)

@@ -48,7 +48,7 @@ BESIDE: Final = ("header.", "layout.", "field.header.")  # of a message, besides
 NEAR: Final = 64  # rows within which a time that went back is made good for
 MADE_GOOD: Final = 0.4  # part of a step back
 EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
-FAR: Final = 3  # rows that all move for one that does not fit
+FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 UNLIKE: Final = 1.2  # how far a rate may be from the one that is claimed
 DAY_NS: Final = 86_400 * NS_PER_S
@@ -134,7 +134,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     """
     parsed, spec, read, notes = read_samples(table, columns, rate_hz)
     account = Import(intact=len(read.values), corrupt=read.corrupt, notes=[*table.notes, *notes])
-    values, times, count, number = read.values, read.times, read.count, read.number
+    values, times, count = read.values, read.times, read.count
     if times is not None:
         if any(c.kind == "iso" for c in parsed) and times.max() < DAY_NS:
             steps = np.diff(times, prepend=times[0])
@@ -150,10 +150,9 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         t_ns, zero = np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64), 0
     else:
         zero = clock_of(int(times[0]))
-        t_ns, told = _strictly(times - zero, rate_hz, account, number[keep])
+        t_ns, told = _strictly(times - zero, rate_hz, account)
         if rate_hz and not 1 / UNLIKE < told / rate_hz < UNLIKE:
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
-            account.came_hz = told
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     about = Description(
@@ -166,12 +165,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
 def read_samples(
     table: Table, columns: str, rate_hz: float = 0.0
 ) -> tuple[tuple[Column, ...], ArraySpec, "ReadRows", list[str]]:
-    """Read the rows of a table: its columns, the array, what was read, and notes.
-
-    Raises:
-        ConfigError: the columns cannot be, or nothing tells the time.
-        RecordingError: no row is a sample.
-    """
+    """Read the rows of a table: its columns, the array, what was read, and notes."""
     mapping = mapping_of(columns, table.path.stem)
     where = columns if columns.endswith(".toml") else "--columns"
     parsed = parse_columns(mapping.columns, where)
@@ -194,18 +188,13 @@ def read_samples(
 
 @dataclass
 class ReadRows:
-    """What the rows of a table hold.
-
-    Attributes:
-        number: Which row each sample is, those that are corrupt counted as well.
-    """
+    """What the rows of a table hold."""
 
     values: NDArray[np.float32]
     times: NDArray[np.int64] | None
     count: NDArray[np.int64] | None
     corrupt: int
     complaint: str
-    number: NDArray[np.int64]
 
 
 def _read(
@@ -225,7 +214,6 @@ def _read(
     rows: list[list[float]] = []
     times: list[int] = []
     counts: list[int] = []
-    number: list[int] = []
     corrupt, complaint = 0, ""
 
     def close() -> None:
@@ -250,7 +238,6 @@ def _read(
             continue
         rows.append(row)
         times.append(t_ns)
-        number.append(len(times) + corrupt)
         if len(rows) == BLOCK:
             close()
     close()
@@ -258,7 +245,6 @@ def _read(
     return ReadRows(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
         np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
-        np.array(number, np.int64),
     )  # fmt: skip
 
 
@@ -385,23 +371,23 @@ def _sort_rows(
 
 
 def _leave_out(times: Sequence[int]) -> list[int]:
-    """Return the fewest places without which times do not go back."""
+    """Return the fewest places without which times do not go back, late ones rather than early."""
     ends: list[int] = []
     last: list[int] = []
-    before: list[int] = []
-    for k, t in enumerate(times):
-        n = bisect_right(ends, t)
-        before.append(last[n - 1] if n else -1)
-        ends[n : n + 1], last[n : n + 1] = [t], [k]
+    after = [-1] * len(times)
+    for k in reversed(range(len(times))):
+        n = bisect_right(ends, -times[k])
+        after[k] = last[n - 1] if n else -1
+        ends[n : n + 1], last[n : n + 1] = [-times[k]], [k]
     kept, k = set(), last[-1]
     while k >= 0:
         kept.add(k)
-        k = before[k]
+        k = after[k]
     return [k for k in range(len(times)) if k not in kept]
 
 
 def _strictly(
-    times: NDArray[np.int64], rate_hz: float, account: Import, number: NDArray[np.int64]
+    times: NDArray[np.int64], rate_hz: float, account: Import
 ) -> tuple[NDArray[np.int64], float]:
     """Times that increase strictly, and the rate that they tell, Hz."""
     if len(times) == 1:
@@ -415,8 +401,9 @@ def _strictly(
     repeats = int((steps == 0).sum())
     usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
     rows = np.diff(ends, prepend=-1)
-    long = steps[ends] / rows > EVEN[1] * np.median((steps[ends] / rows)[usual])
-    rows = np.where(long, np.diff(number[ends + 1], prepend=number[0]), rows)  # with corrupt ones
+    long = steps[ends] > EVEN[1] * np.median((steps[ends] / rows)[usual]) * rows
+    if (long & usual).sum() <= account.corrupt:
+        usual &= ~long  # rows are missing there
     period = float(steps[ends][usual].sum() / rows[usual].sum())
     if stretches:
         account.notes.append(f"times go back {stretches} times: there they go on a period later")

@@ -90,10 +90,11 @@ def import_wire(
         if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
             return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
-        account.came_hz = came_hz
         account.notes.append(
-            f"they came at {came_hz:.4g} Hz: --rate says what the device was set to"
+            f"they came at {came_hz:.4g} Hz, not at {account.rate_hz:g} Hz as is claimed: --rate "
+            "says what the device was set to"
         )
+        account.rate_hz = came_hz
     return account
 
 

@@ -30,6 +30,13 @@ def lines(form: str) -> bytes:
         ('{{"t": {t}, "f": {{"x": {a}, "y": {b}}}}}\n', "t=time:ms,f.x=S.fx:N,f.y=S.fy:N"),
         ("left:{a}\tright:{b}\r\n", "left=left.value:1,right=right.value:1"),
         ("{t},{a},kg,\n", "time:ms,T0.value,-"),
+        ("Force(N):{a} Temp(C):{b}\r\n", "Force(N)=S.force:N,Temp(C)=S.temperature:degC"),
+        ("Force [N] = {a}; Temp [C] = {b}\n", "Force [N]=S.force:N,Temp [C]=S.temperature:degC"),
+        ("Load(kg): {a} kg Gap(mm): {b}\n", "Load(kg)=S.force:kgf,Gap(mm)=S.gap:mm"),
+        ("Weight(g): {a} Temp(F): {b}\n", "Weight(g)=S.force:gf,Temp(F)=S.temperature:1"),
+        ("Humidity: {a}, Temp: {b}\n", "Humidity=S.humidity:1,Temp=S.temperature:1"),
+        ("Force (N): {a}\r\n", "Force (N)=S.force:N"),
+        ("Temp:\t{a}\r\nForce:\t{b}\r\n---\n", "Force=S.force:1,Temp=S.temperature:1"),
     ],
 )
 def test_what_a_board_prints_has_columns_that_read_it(form, columns):

@@ -154,8 +154,32 @@ def test_lines_have_the_time_at_which_a_terminal_had_them(tmp_path):
     path.write_text("".join(f"[12:00:{k / 50:06.3f}] {k},{k + 1}\n" for k in range(100)))
     fields = {"codec": "ascii_line", "columns": "A0.fx,A0.fy"}
     made = import_wire(read_log(path), tmp_path / "out.mcap", fields)
-    assert made.samples == 99  # the first line may be half a line
-    assert made.seconds == pytest.approx(1.96)
-    assert made.notes == ["they came at 50 Hz: --rate says what the device was set to"]
+    assert (made.samples, made.rate_hz, made.notes) == (100, 50, [])  # nobody told another rate
+    assert made.seconds == pytest.approx(1.98)
     chunk = concatenate(list(Recording(tmp_path / "out.mcap")))
-    assert chunk.values[7, 0].tolist() == [8, 9]
+    assert chunk.values[7, 0].tolist() == [7, 8]
+    made = import_wire(read_log(path), tmp_path / "out.mcap", fields, 1000)
+    assert "at 50 Hz" in made.line() and made.notes[0].startswith("they came at 50 Hz, not at 1000")
+
+
+@pytest.mark.parametrize(
+    "pattern", ["{:02}:{:02}:{:06.3f} -> ", "{}:{}:{:.3f} -> ", "[{:02}:{}:{:.3f}] "]
+)
+@pytest.mark.parametrize("begin", [32_703, 86_390])
+def test_times_of_day_of_a_terminal_go_on_after_midnight(tmp_path, pattern, begin):
+    times = [begin + k / 2 for k in range(60)]
+    times[21], times[22] = times[22], times[21]
+    lines = (
+        pattern.format(int(t) // 3600 % 24, int(t) // 60 % 60, t % 60) + f"{k},{k % 7}\n"
+        for k, t in enumerate(times)
+    )
+    (tmp_path / "t.txt").write_text("".join(lines))
+    made, chunk = imported(
+        tmp_path / "t.txt", tmp_path / "o.mcap", codec="ascii_line", columns="A0.v,A1.v"
+    )
+    assert (made.samples, made.seconds, made.rate_hz) == (60, 29.5, 2)
+    assert (chunk.t_ns[[20, 23, 59]] - chunk.t_ns[0]).tolist() == [
+        10 * 10**9,
+        115 * 10**8,
+        295 * 10**8,
+    ]
