@@ -228,18 +228,10 @@ class SerialCodec(Codec[bytes]):
         baud: Speed of the line that the device has by default, bit/s.
         parity: Parity that the device has by default: ``N``, ``E`` or ``O``.
         usb: Whether the device is attached by USB itself, so that its speed means nothing.
-        line_end: What ends a line of a device that prints text; a file begins behind one.
-        unfinished: Number of bytes that came of a sample not yet whole; None: it is not known.
-        passed: Number of lines of words that came between samples.
-        claims_rate: Whether the rate of `spec` is one that somebody told.
     """
 
     wire = "serial"
     usb: ClassVar[bool] = False
-    line_end: ClassVar[bytes] = b""
-    unfinished: int | None = None
-    passed = 0
-    claims_rate = True
     baud: ClassVar[int] = 115200
     parity: ClassVar[str] = "N"
 

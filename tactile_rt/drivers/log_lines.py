@@ -9,7 +9,7 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 
-__all__ = ["DAY_NS", "Found", "of_candump", "of_gvret", "of_heard", "of_hex", "of_slcan"]
+__all__ = ["Found", "of_candump", "of_gvret", "of_heard", "of_hex", "of_slcan"]
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
@@ -35,7 +35,6 @@ _HEX: Final = re.compile(
     r"\s*(?:\[?(?P<t>\d+\.\d+)\]?(?:\s*s)?[\s,:;]+)?"
     r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
 )
-DAY_NS: Final = 86_400 * NS_PER_S
 _ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
 
 Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns

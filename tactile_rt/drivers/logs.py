@@ -21,15 +21,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.log_lines import (
-    DAY_NS,
-    Found,
-    of_candump,
-    of_gvret,
-    of_heard,
-    of_hex,
-    of_slcan,
-)
+from tactile_rt.drivers.log_lines import Found, of_candump, of_gvret, of_heard, of_hex, of_slcan
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
@@ -57,6 +49,7 @@ OTHERS: Final = {
 }
 CSV_HEADER: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
 SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
+DAY_NS: Final = 86_400 * NS_PER_S
 FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
 LINES: Final[dict[str, Callable[[str], Found]]] = {

@@ -71,11 +71,19 @@ class AsciiLineOptions:
 
 
 class AsciiLine(SerialCodec):
-    """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter."""
+    """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter.
+
+    Attributes:
+        line_end: What stands before the first line of a file.
+        claims_rate: Whether somebody told at what rate the board prints.
+        unfinished: Number of bytes that came of a sample not yet whole.
+        passed: Number of lines of words that came between samples.
+    """
 
     Options = AsciiLineOptions
     baud = 115200
     line_end = b"\n"
+    passed = unfinished = 0
     cannot_detect = (
         "changed digits (no checksum); lost and repeated lines without a count column; the first "
         "line after each connection is not used"

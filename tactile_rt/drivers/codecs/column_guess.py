@@ -63,8 +63,7 @@ _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
 _ALIASES: Final = {
     "n·m": "Nm", "n*m": "Nm", "n.m": "Nm", "n-m": "Nm", "nm": "Nm", "newton": "N", "newtons": "N",
     "°c": "degC", "c": "degC", "celsius": "degC", "µt": "uT", "μt": "uT", "utesla": "uT",
-    "kg": "kgf", "gram": "gf", "grams": "gf", "volt": "V", "volts": "V",
-    "m/s^2": "m/s2", "m/s²": "m/s2", "n": "N",
+    "kg": "kgf", "volt": "V", "volts": "V", "m/s^2": "m/s2", "m/s²": "m/s2", "n": "N",
 }  # fmt: skip
 ALONE: Final = ("temperature", "pressure", "force")
 _LABELLED: Final = re.compile(
@@ -297,9 +296,8 @@ def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     parsed = {k: _parsed(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())
-    others = {k: p for k, p in parsed.items() if not p[1]}
-    units = {p[2] for p in others.values() if p[2]}
-    if others and (len(units) > 1 or 2 * len(known) >= len(parsed)):
+    others = [unit for _, channel, unit in parsed.values() if not channel]
+    if others and (len({*others} - {""}) > 1 or 2 * len(known) >= len(parsed)):
         # quantities of one place, such as force and temperature, each in its own unit
         told = {k: p[1] or p[0].lower() for k, p in parsed.items()}
         alone = all(p[0] == "S" and p[1] in ALONE for p in known.values())

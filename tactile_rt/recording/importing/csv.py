@@ -121,11 +121,10 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
             if _REMARK.match(line) or not line.strip(" \t,;") or line.strip() in form.heads:
                 continue
             cells = _cells(line, form.delimiter, form.comma)
-            if (n := len(cells)) != form.width:
-                if n in form.widths or (
-                    n == form.width - 1 and line.rstrip(" ").endswith(form.delimiter)
-                ):
-                    cells = [*cells, *[""] * (form.width - n)][: form.width]
+            lack = form.width - len(cells)
+            ended = lack == 1 and line.rstrip(" ").endswith(form.delimiter)
+            if lack and (ended or len(cells) in form.widths):
+                cells = [*cells, *[""] * lack][: form.width]
             yield cells
         if getattr(getattr(file, "raw", None), "broken", False):
             table.notes.append("it is cut short or damaged: what unpacks of it was read")
@@ -228,19 +227,21 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     if often < ENOUGH * lines:
         return None
     share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
-    widths = {n for n, times in widths.items() if times >= OFTEN * len(numeric)} | {width}
+    usual = [n for n, times in widths.items() if times >= OFTEN * len(numeric)]
     if names:  # the first rows may lack what is usual, and all rows what is seldom there
         below = (k for k, c in rows if k >= below_names and any(map(_is_number, c)))
         first, width = next(below, first), len(names)
-        widths = {n for n in widths if n <= width}
+        usual = [n for n in usual if n <= width]
     # one cell a line is a table, too, but only if nothing else is
     score = often / lines * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
     if delimiter == " ":  # which cuts what all others cut, too
         score -= 0.3 if 2 * sum(len(x.split()) > 1 for x in head) > len(head) else 0.6
-    heads = frozenset(x.strip() for x in head[:first])
-    return score, CsvForm(
-        delimiter, comma, names, first, width, units=units, widths=frozenset(widths), heads=heads
+    heads = frozenset(
+        x.strip() for x in head[:first] if not all(map(_is_there, x.split(delimiter)))
     )
+    return score, CsvForm(
+        delimiter, comma, names, first, width, 1, units, frozenset(usual), heads
+    )  # fmt: skip
 
 
 def _spans(line: str, delimiter: str, comma: bool) -> list[int]:
@@ -272,11 +273,8 @@ def _names(
         if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
             cells.append("")
         if len(cells) == len(spans):  # the names of lists
-            cells = [
-                f"{c}.{i}" if n > 1 else c
-                for c, n in zip(cells, spans, strict=True)
-                for i in range(n)
-            ]
+            each = zip(cells, spans, strict=True)
+            cells = [f"{c}.{i}" if n > 1 else c for c, n in each for i in range(n)]
         words = [c for c in cells if c and number(c) is None and not _is_number(c)]
         numbers = sum(map(_is_number, cells))
         longer = next_above and delimiter != " " and width < len(cells) <= 1.5 * width

@@ -21,7 +21,7 @@ __all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_c
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
 DATED = 0.9  # of the cells of a column of dates
-ORDERS = {"mdy": "month", "dmy": "day"}
+ORDERS = {"": "year", "mdy": "month", "dmy": "day"}
 
 
 @dataclass(frozen=True)
@@ -114,15 +114,12 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
 
 def _find_order(cells: Sequence[str]) -> str:
     """Return the order of the numbers of dates, ``iso``, ``mdy`` or ``dmy``; empty: no dates."""
-    cells = [c for c in cells if c.strip()]
-    if not cells or sum(":" in c for c in cells) < len(cells) * DATED:
-        return ""
+    cells = [c.strip() for c in cells if c.strip()] or ["no date"]
     read = {
-        order: sum(number(in_seconds(c.strip(), order)) is not None for c in cells)
-        for order in ("", "mdy", "dmy")
+        o: sum(":" in c and number(in_seconds(c, o)) is not None for c in cells) for o in ORDERS
     }
-    half_days = cells[0].rstrip(". ")[-1:] in "mM"
-    best = max(read, key=lambda order: (read[order], not order, (order == "mdy") == half_days))
+    half_days = cells[0].rstrip(".")[-1:] in "mM"
+    best = max(read, key=lambda o: (read[o], not o, (o == "mdy") == half_days))
     return (best or "iso") if read[best] >= len(cells) * DATED else ""
 
 

@@ -50,7 +50,6 @@ MADE_GOOD: Final = 0.4  # part of a step back
 EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
 FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
-UNLIKE: Final = 1.2  # how far a rate may be from the one that is claimed
 DAY_NS: Final = 86_400 * NS_PER_S
 SHOWN: Final = 600  # characters of the names that a message tells
 _DECIMAL: Final = re.compile(r"([+-]?)(\d+)(?:\.(\d*))?")
@@ -151,7 +150,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     else:
         zero = clock_of(int(times[0]))
         t_ns, told = _strictly(times - zero, rate_hz, account)
-        if rate_hz and not 1 / UNLIKE < told / rate_hz < UNLIKE:
+        if rate_hz and not 0.8 < told / rate_hz < 1.2:
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
@@ -371,7 +370,7 @@ def _sort_rows(
 
 
 def _leave_out(times: Sequence[int]) -> list[int]:
-    """Return the fewest places without which times do not go back, late ones rather than early."""
+    """Return the fewest places without which times do not go back, the last of several."""
     ends: list[int] = []
     last: list[int] = []
     after = [-1] * len(times)
