@@ -223,7 +223,7 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
         names, units, below_names = _names(head[:first], delimiter, comma, width, spans)
         if names:
             break
-    lines = sum(k >= first for k, _ in rows)
+    lines = sum(k >= (below_names if names else first) for k, _ in rows)
     if often < ENOUGH * lines:
         return None
     share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
@@ -275,8 +275,8 @@ def _names(
         if len(cells) == len(spans):  # the names of lists
             each = zip(cells, spans, strict=True)
             cells = [f"{c}.{i}" if n > 1 else c for c, n in each for i in range(n)]
-        words = [c for c in cells if c and number(c) is None and not _is_number(c)]
-        numbers = sum(map(_is_number, cells))
+        numbers = sum(bool(_is_number(c) or _COMMA.fullmatch(c)) for c in cells)
+        words = [c for c in cells if not (_is_there(c) or _COMMA.fullmatch(c))]
         longer = next_above and delimiter != " " and width < len(cells) <= 1.5 * width
         next_above &= not line.strip() or 2 * numbers >= len(cells)
         if longer and line[:1] != "#" and len(set(words)) == len(cells):

@@ -67,11 +67,12 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
         return told
     if form.names or form.delimiter != " ":
         proposed = _of_table(path, form)
-        if proposed is not None:
+        if proposed is not None and proposed.columns:
             return proposed
     if told is None or labelled:
         return told or _of_table(path, form)
-    return _try_import(path, form, replace(told, table=True))
+    tried = _try_import(path, form, replace(told, table=True))
+    return tried if tried.columns else _of_table(path, form) or tried
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:

@@ -207,8 +207,8 @@ def _read(
     clocks = [(places[k], c) for k, c in enumerate(columns) if c.kind in NS]
     counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
     need = max(places) + 1
-    width = table.width or len(table.names) or need
-    least = max(table.width, need)
+    width = max(need, table.width or len(table.names))
+    least = width if table.width else need
     blocks: list[NDArray[np.float32]] = []
     rows: list[list[float]] = []
     times: list[int] = []
