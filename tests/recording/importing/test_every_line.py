@@ -103,17 +103,12 @@ TABLES = {  # lines, columns, samples, corrupt, elements that are not valid
         "t=time:s,Fx=A0.fx,Fy=B0.fx", N, 0, 26,
     ),
     "placeholders first": (
-        ["t,Fx,Fy", *(f"{k / 100},{'--' if k < 3 else k},{'#N/A' if k < 5 else k}"
+        ["t,Fx,Fy", *(f"{k / 100},{'NULL' if k < 3 else k},{'n.a.' if k < 5 else k}"
                       for k in range(N))],
         "t=time:s,Fx=A0.fx,Fy=B0.fx", N, 0, 8,
     ),
     "an error of a spreadsheet begins no remark": (
         ["Fx,t", *(f"{'#N/A' if k < 3 else k},{k / 100}" for k in range(N))], "", N, 0, 3
-    ),
-    "other placeholders": (
-        ["t;Fx;Fy", *(f"{k / 100};{'NULL' if k < 3 else k};{'n.a.' if k < 3 else ''}"
-                      for k in range(N))],
-        "t=time:s,Fx=S.fx,Fy=S.fy", 0, 0, 0,
     ),
     "LabVIEW, no times": (
         ["LabVIEW Measurement\t", "Date\t2024/03/05\t", "***End_of_Header***\t", "\t",
@@ -135,9 +130,6 @@ def test_rows_have_the_width_of_their_table(tmp_path, name):
     path, rate = tmp_path / "t.csv", 1000 if "LabVIEW" in name else 0
     path.write_text("\n".join(lines) + "\n")
     table = read_table(path, csv_form(path))
-    if not samples:  # it is a table, and not one of its numbers is there
-        assert table.names == ("t", "Fx", "Fy")
-        return
     made = import_table(table, tmp_path / "o.mcap", columns or "t=time:s,Fx=S.fx", rate)
     assert (made.samples, made.corrupt) == (samples, corrupt)
     assert made.rate_hz == (rate or 100)
