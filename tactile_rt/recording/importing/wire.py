@@ -68,9 +68,8 @@ def import_wire(
             account.samples += len(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
-        rest = getattr(codec, "unfinished", None)
-        if log.wire == "serial" and (rest := decoded.unfinished if rest is None else rest):
-            account.notes.append(f"it ends with {rest} bytes of no whole sample")
+        if log.wire == "serial" and decoded.unfinished:
+            account.notes.append(f"it ends with {decoded.unfinished} bytes of no whole sample")
         if passed := getattr(codec, "passed", 0):
             account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
@@ -146,7 +145,7 @@ class _Decoded:
     def __init__(
         self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
     ) -> None:
-        self._codec, self._now, self.unfinished = codec, 0, 0
+        self._codec, self._now, self._rest = codec, 0, 0
         self._count: int | None = None  # of the newest sample
         codec.commands(Command.START)  # some note what they have asked for
         packets = log.packets()
@@ -179,10 +178,15 @@ class _Decoded:
             clock="device" if own_clock else "host",
         )  # fmt: skip
 
+    @property
+    def unfinished(self) -> int:
+        """Count the bytes after the last sample or line of text."""
+        return int(getattr(self._codec, "unfinished", self._rest))
+
     def _fed(
         self, packets: Iterator[tuple[Any, int | None]]
     ) -> Iterator[tuple[Any, int | None, Samples | None]]:
-        """Packets and what they complete; `unfinished` is what follows the last sample, bytes."""
+        """Packets and what they complete; `_rest` is what follows the last sample, bytes."""
         packet, t_ns = next(packets, (None, None))
         while packet is not None:
             following, later = next(packets, (None, None))
@@ -190,7 +194,7 @@ class _Decoded:
                 yield packet, t_ns, self._fed_slowly(packet, t_ns or 0)
             else:
                 samples = self._codec.feed(packet, t_ns or 0)
-                self.unfinished = 0 if samples is not None else self.unfinished + len(packet)
+                self._rest = 0 if samples is not None else self._rest + len(packet)
                 yield packet, t_ns, samples
             packet, t_ns = following, later
 
@@ -199,10 +203,10 @@ class _Decoded:
         found = []
         for k in range(len(packet)):
             samples = self._codec.feed(packet[k : k + 1], t_ns)
-            self.unfinished += 1
+            self._rest += 1
             if samples is not None:
                 found.append(samples)
-                self.unfinished = 0
+                self._rest = 0
         return _joined(found) if found else None
 
     def __iter__(self) -> Iterator[tuple[Any, int, Chunk | None]]:
