@@ -172,7 +172,7 @@ def check_appendable(path: Path) -> None:
     Raises:
         ConfigError: it has other columns.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         columns = _cells(file.readline(LONGEST_LINE))
     if columns != COLUMNS:
         raise ConfigError(

@@ -47,6 +47,7 @@ def import_wire(
         ConfigError: no such codec or option, or a device that describes itself did not.
     """
     codec, about = _prepared(log, fields, rate_hz)
+    log.names = getattr(codec, "names", {})
     if log.form == "raw":
         log.piece = _bytes_of_a_sample(log, make_codec(log.wire, about.codec, _own(fields)))
     account, stats = Import(), SourceStats()
