@@ -80,7 +80,8 @@ class CanLines:
     def __init__(
         self, lines: TextIO, form: str, names: Mapping[str, tuple[int, bool]], symbolic: bool
     ) -> None:
-        self._lines, self._form, self._names, self._symbolic = lines, form, names, symbolic
+        self._file, self._lines = lines, iter(lines)
+        self._form, self._names, self._symbolic = form, names, symbolic
         self._prepare = {"asc": self._asc, "csv": self._csv, "trc": self._trc}[form]
         self.number = self.filled = self._pending = 0
         self.lost = Tally("line")
@@ -117,13 +118,14 @@ class CanLines:
 
     def close(self) -> None:
         """Close the file."""
-        self._lines.close()
+        self._file.close()
 
-    def settle(self, why: str = "") -> None:
-        """Count the newest frame as lost, unless a message came of it."""
-        if self._pending:
-            self.lost.add(self._pending, why)
-        self._pending = 0
+    def settle(self, why: str = "") -> bool:
+        """Count the newest frame as lost, unless a message came of it; return whether it is."""
+        pending, self._pending = self._pending, 0
+        if pending:
+            self.lost.add(pending, why)
+        return pending > 0
 
     def resume(self) -> None:
         """Let a reader begin once more, after a line that it could not read."""
@@ -169,7 +171,7 @@ class CanLines:
                         f"version {self.version[:20]!r} of a .trc is not read: there are "
                         f"{', '.join(TRC_VERSIONS)}"
                     )
-                    raise StopIteration
+                    self._lines = iter(())
                 return line.replace("1.2", "1.3")
             return line
         if _TRC_STATUS.match(line):

@@ -124,7 +124,7 @@ class LineLog:
         parse, errors, buses = LINES[self.form], 0, self.buses
         others, blank, number = Tally("line"), 0, 0
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
-        with TextIOWrapper(file, "utf-8", "replace") as lines:
+        with TextIOWrapper(file, "utf-8-sig", "replace") as lines:
             for number, line in enumerate(lines, 1):
                 found = parse(line.rstrip("\r\n"))
                 if found is None:
@@ -227,21 +227,22 @@ class LineLog:
                 if lines is None or lines.number == at:
                     self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
                     return
-                lines.settle(why)
+                if not lines.settle(why):
+                    self.notes.append(f"line {lines.number} of its header is not read ({why:.60})")
                 lines.resume()
 
     def _check_end(self, file: LogFile, made: Any, n: int) -> None:
         """Note that a .blf is shorter than its header says, or ends within an object."""
-        if any("cut short" in note for note in self.notes):
-            return
-        if file.tell() < made.file_size or made._tail.strip(b"\0"):
+        short = file.seekable() and file.tell() < made.file_size  # one that is cut is noted
+        if (short or made._tail.strip(b"\0")) and not self.notes:
             of = f" of {made.object_count}" if n < made.object_count else ""
             self.notes.append(f"it ends before its end: {n} frames{of} were read")
 
     def _tell(self, others: Tally, what: str, errors: int) -> None:
         buses = self.buses
         if others.n:
-            self.notes.append(f"passed over, no {what} of a {self.form} log: {others}")
+            a = "an" if self.form == "asc" else "a"
+            self.notes.append(f"passed over, no {what} of {a} {self.form} log: {others}")
         if errors:
             self.notes.append(f"{errors} error frames")
         if self._bus and self._bus not in buses:
@@ -326,7 +327,7 @@ def _head(path: Path) -> bytes:
 
 
 def _lines(head: bytes) -> list[str]:
-    lines = [x for x in head.decode("utf-8", "replace").splitlines() if x.strip()]
+    lines = [x for x in head.decode("utf-8-sig", "replace").splitlines() if x.strip()]
     return lines[:-1] if len(head) == HEAD else lines  # the last one was cut
 
 

@@ -1,5 +1,6 @@
 """Columns for a table, or for what a board printed, for a user to look at and change."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -11,7 +12,13 @@ from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 
-__all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_columns"]
+__all__ = [
+    "ProposedColumns",
+    "line_columns",
+    "propose_columns",
+    "propose_fields",
+    "propose_line_columns",
+]
 
 LEAST = 3  # rows
 DATED = 20  # rows that are looked at for dates
@@ -93,3 +100,26 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
     said = f"{path} is a table of {form.width} columns"
     return ProposedColumns(compress_columns(words), True, timed, said)
+
+
+def propose_fields(paths: Sequence[str]) -> str:
+    """Propose columns for the numbers of a message: those of its largest array, or its fields.
+
+    Args:
+        paths: Path of each number, as ``sensors.0.values.3``.
+    """
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for path in paths:
+        steps = path.split(".")
+        array = [s for s in steps if not s.isdecimal()] if any(map(str.isdecimal, steps)) else []
+        groups.setdefault(tuple(array), []).append(path)
+    words = []
+    for path in max(groups.values(), key=len, default=[]):
+        places = [s for s in path.split(".") if s.isdecimal()]
+        if not places:
+            words.append(f"{path}=S.{path.replace('.', '_')}")
+        elif len(places) == 1:
+            words.append(f"{path}=T{places[0]}.value")
+        else:
+            words.append(f"{path}=T{'_'.join(places[:-1])}.c{places[-1]}")
+    return compress_columns(words)
