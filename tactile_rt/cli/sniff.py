@@ -238,6 +238,8 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         fits = sniff_frames(frames, further)
         if not fits:
             _show_identifiers(frames, told)
+            for note in log.notes:
+                told.say(note)
             told.nothing(
                 f"no codec fits {path}",
                 "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'",

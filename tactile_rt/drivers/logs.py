@@ -85,6 +85,7 @@ class LineLog:
         self.buses: Counter[str] = Counter()
         self.names: Mapping[str, tuple[int, bool]] = {}
         self.total = self.frames = 0
+        self.back = Tally("packet")  # times that go back
 
     def packets(self) -> Iterator[Timed]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
@@ -93,7 +94,7 @@ class LineLog:
         self.notes.clear()
         self.buses.clear()
         self.total = self.frames = 0
-        latest, self.back = -(1 << 62), Tally("packet")
+        latest, self.back = -(1 << 62), Tally("frame" if self.wire == "can" else "packet")
         with open_log_file(self.path) as file:
             for number, (packet, t_ns) in enumerate(self._read(file), 1):
                 if t_ns is not None:
@@ -104,7 +105,7 @@ class LineLog:
                 yield packet, t_ns
         if self.back.n:
             self.notes.append(
-                f"{self.back.n} times go back (packet {self.back.first} is the first); "
+                f"{self.back.n} times go back ({self.back.what} {self.back.first} is the first); "
                 "these packets have the time before"
             )
 

@@ -197,7 +197,7 @@ def test_times_never_go_back(tmp_path):
     log = read_log(path)
     assert [t for _, t in log.packets()] == [2_000_000_000, 2_000_000_000, 3_000_000_000]
     assert log.notes == [
-        "1 times go back (packet 2 is the first); these packets have the time before"
+        "1 times go back (frame 2 is the first); these packets have the time before"
     ]
 
 

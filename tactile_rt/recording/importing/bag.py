@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.files import open_regular
+from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
@@ -83,6 +83,7 @@ class OpenBag:
 
     reader: Any
     notes: list[str] = field(default_factory=list)
+    back: int = 0  # times that go back
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         """Read (time in ns, bytes, message) of a topic; a damaged message is None."""
@@ -138,6 +139,8 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         raise lacking("bags need", "import", error) from None
+    for file in path.iterdir() if path.is_dir() else ():
+        check_no_pointer(file)
     with ExitStack() as stack:
         notes: list[str] = []
         store = get_typestore(Stores.LATEST)
@@ -221,7 +224,19 @@ def import_bag(
                 f"{path}: {chosen.name} has {chosen.type}: say with --columns what is what, e.g. "
                 f"{paths[-1]}=S.value; its fields are {shown_names(paths)}"
             )
-        return import_table(_table(path, bag, chosen, paths, channels), output, words, rate_hz)
+        made = import_table(_table(path, bag, chosen, paths, channels), output, words, rate_hz)
+        made.report.out_of_order = bag.back
+        return _counted(made, chosen)
+
+
+def _counted(made: Import, topic: BagTopic) -> Import:
+    """Count the messages that the bag's index tells, also those that were not read."""
+    report, unread = made.report, topic.messages - made.intact - made.corrupt
+    report.unit, report.total = "messages", max(topic.messages, made.intact + made.corrupt)
+    report.passed_over = report.total - report.read
+    if unread > 0:
+        made.notes.append(f"{unread} of {topic.messages} messages were not read")
+    return made
 
 
 def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> BagTopic:
@@ -321,8 +336,11 @@ def _table(path: Path, bag: OpenBag, topic: BagTopic, paths: list[str], channels
         times = table.times_ns
         assert times is not None
         fewer, other = Tally("message"), Tally("message")
+        bag.back = 0
         for number, (t_ns, _, message) in enumerate(bag.messages(topic.name), 1):
+            before = times[-1:]
             times[:] = [_stamp(message) or t_ns]
+            bag.back += before > times
             if message is None:
                 yield ()
                 continue
@@ -400,7 +418,7 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
         spec, zero, f"{path.name}:{topic.name}",
         session={"imported": path.name, "topic": topic.name},
     )  # fmt: skip
-    return write_chunks(output, about, whole, account, str(path))
+    return _counted(write_chunks(output, about, whole, account, str(path)), topic)
 
 
 def _array_in(bag: OpenBag, samples: str) -> ArraySpec | None:
