@@ -77,6 +77,8 @@ def import_file(
 
         check_output(plot)
         check_picture(plot)
+    if decimal not in ("", ",", "."):
+        raise ConfigError(f"--decimal is , or ., not {decimal!r}")
     with ExitStack() as stack:
         target = output
         if strict:  # hidden until it is known to be good
@@ -106,8 +108,8 @@ def _import(
     wanted: tuple[str, str, str, float, str, str],
     form: tuple[str, str, int, int],
 ) -> "Import":
-    decoded_as, columns, topic, rate, bus, log_form = wanted
     """Write the recording of a file, whatever it is."""
+    decoded_as, columns, topic, rate, bus, log_form = wanted
     with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
         from tactile_rt.drivers.logs import read_log
         from tactile_rt.recording.importing.bag import import_bag, is_bag

@@ -216,7 +216,7 @@ def import_bag(
         if chosen.type == messages.SAMPLES and not columns:
             return _own(path, bag, chosen, output)
         chosen, paths, channels = _describe(bag, chosen.name, chosen.type, chosen.messages)
-        if not paths:
+        if all(path.startswith(BESIDE) for path in paths) and not columns:
             raise RecordingError(f"{path}: no message of {chosen.name} is whole and holds a number")
         words = columns or chosen.columns
         if not words:

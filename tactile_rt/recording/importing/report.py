@@ -103,7 +103,7 @@ class Measurer:
 def show_time(t_ns: int) -> str:
     """Write a time as UTC where it counts from 1970, else in seconds."""
     if t_ns < 10**17:
-        return f"{t_ns / NS_PER_S:.9g} s"
+        return f"{round(t_ns / NS_PER_S, 6):.12g} s"
     return datetime.fromtimestamp(t_ns // NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S") + (
         f".{t_ns % NS_PER_S // 1000:06d} UTC"
     )
