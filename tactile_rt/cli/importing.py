@@ -86,7 +86,7 @@ def import_file(
             target = Path(hidden) / output.name
         wanted = (decoded_as, columns, topic, rate, bus, form)
         made = _import(log, target, wanted, (delimiter, decimal, skip, lines))
-        odd = _odd(made)
+        odd = _list_odd(made)
         for note in made.notes:
             typer.echo(f"{log}: {note}", err=True)
         if strict and odd:
@@ -142,8 +142,8 @@ def _import(
     return made
 
 
-def _odd(made: "Import") -> list[str]:
-    """What is odd about a file, a line each."""
+def _list_odd(made: "Import") -> list[str]:
+    """List what is odd about a file, a line each."""
     odd = [note for note in made.notes if not note.startswith("left out: ")]
     if made.corrupt and not any("corrupt" in note for note in odd):
         odd.append(f"{made.corrupt} corrupt {made.report.unit}")

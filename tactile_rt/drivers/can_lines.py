@@ -12,7 +12,7 @@ from typing import Any, Final, TextIO
 
 from tactile_rt.core.errors import name_some
 
-__all__ = ["TRC_1_0", "CanLines", "Tally", "find_asc_frame", "has_names"]
+__all__ = ["TRC_1_0", "CanLines", "Occurrences", "find_asc_frame", "has_names"]
 
 TRC_VERSIONS: Final = ("1.0", "1.1", "1.2", "1.3", "2.0", "2.1")
 NAMES_HELP: Final = "codec=can-dbc knows those of its DBC file"
@@ -30,7 +30,7 @@ _ASC_NUMBER: Final = {10: re.compile(r"\d+[xX]?"), 16: re.compile(r"[0-9A-Fa-f]+
 _CUT: Final = re.compile(r".*\s[0-9A-Fa-f]{2} [0-9A-Fa-f]")  # in the middle of a byte
 
 
-class Tally:
+class Occurrences:
     """How many there are of something, and which is the first."""
 
     def __init__(self, what: str) -> None:
@@ -47,7 +47,7 @@ class Tally:
 
 
 def find_asc_frame(line: str) -> str:
-    """Find the identifier of a frame in a line of an .asc log; empty where there is none."""
+    """Find the identifier of a frame in a line of an .asc log; else empty."""
     time = _ASC_TIME.match(line)
     frame = None if time is None else _match_frame(line, time.end())
     return "" if frame is None else frame["id"]
@@ -84,7 +84,7 @@ class CanLines:
         self._form, self._names, self._symbolic = form, names, symbolic
         self._prepare = {"asc": self._asc, "csv": self._csv, "trc": self._trc}[form]
         self.number = self.filled = self._pending = 0
-        self.lost = Tally("line")
+        self.lost = Occurrences("line")
         self.notes: list[str] = []
         self.version = ""  # of a .trc
         self.begun = False  # a trigger block, which has not ended
@@ -121,7 +121,7 @@ class CanLines:
         self._file.close()
 
     def settle(self, why: str = "") -> bool:
-        """Count the newest frame as lost, unless a message came of it; return whether it is."""
+        """Count the newest frame as lost if no message came of it, and return whether."""
         pending, self._pending = self._pending, 0
         if pending:
             self.lost.add(pending, why)
@@ -132,7 +132,7 @@ class CanLines:
         self._first += {"asc": ["internal events logged\n"], "csv": ["\n"]}.get(self._form, [])
 
     def accept(self, message: Any) -> bool:
-        """Return whether a message is as its line tells; count it as lost if it is not."""
+        """Return whether a message is as its line tells; else it counts as lost."""
         from can.util import dlc2len
 
         told = dlc2len(message.dlc) if self._form == "trc" else message.dlc
@@ -191,7 +191,7 @@ class CanLines:
                 if text and not self.notes:
                     self.notes.append(f"its date, {text:.40}, is not read: times count from 0")
                 return ""
-            return self._opened(line) if block else line
+            return self._open_frames(line) if block else line
         if line.strip().lower().startswith("end triggerblock"):
             self.begun = False
         elif begins == "base" and self._header:
@@ -221,9 +221,9 @@ class CanLines:
             if self._apart
             else f"{time[1]}.{time[2] or 0}"
         )
-        return self._opened(f"{seconds} {frame['bus']}{name}{line[frame.end() :]}")
+        return self._open_frames(f"{seconds} {frame['bus']}{name}{line[frame.end() :]}")
 
-    def _opened(self, line: str) -> str:
+    def _open_frames(self, line: str) -> str:
         """End the header before the first line that is not of it."""
         if not self._header:
             return line

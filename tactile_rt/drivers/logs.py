@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, Final, cast
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
-from tactile_rt.drivers.can_lines import TRC_1_0, CanLines, Tally, find_asc_frame, has_names
+from tactile_rt.drivers.can_lines import TRC_1_0, CanLines, Occurrences, find_asc_frame, has_names
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import Found, of_candump, of_gvret, of_heard, of_hex, of_slcan
 
@@ -85,7 +85,7 @@ class LineLog:
         self.buses: Counter[str] = Counter()
         self.names: Mapping[str, tuple[int, bool]] = {}
         self.total = self.frames = 0
-        self.back = Tally("packet")  # times that go back
+        self.back = Occurrences("packet")  # times that go back
 
     def packets(self) -> Iterator[Timed]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
@@ -94,7 +94,7 @@ class LineLog:
         self.notes.clear()
         self.buses.clear()
         self.total = self.frames = 0
-        latest, self.back = -(1 << 62), Tally("frame" if self.wire == "can" else "packet")
+        latest, self.back = -(1 << 62), Occurrences("frame" if self.wire == "can" else "packet")
         with open_log_file(self.path) as file:
             for number, (packet, t_ns) in enumerate(self._read(file), 1):
                 if t_ns is not None:
@@ -123,7 +123,7 @@ class LineLog:
 
     def _text(self, file: LogFile) -> Iterator[Timed]:
         parse, errors, buses = LINES[self.form], 0, self.buses
-        others, blank, number = Tally("line"), 0, 0
+        others, blank, number = Occurrences("line"), 0, 0
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
         with TextIOWrapper(file, "utf-8-sig", "replace") as lines:
             for number, line in enumerate(lines, 1):
@@ -159,7 +159,7 @@ class LineLog:
             lines = CanLines(text, self.form, self.names, named)
         try:
             made = self._reader(file, lines)
-            for message in self._resumed(made, lines):
+            for message in self._read_messages(made, lines):
                 n += 1
                 bus = "" if message.channel is None else str(message.channel)
                 if message.is_error_frame:
@@ -177,7 +177,7 @@ class LineLog:
             logging.getLogger("can").removeHandler(warned)
             if lines is not None:
                 lines.close()
-        others = Tally("line")
+        others = Occurrences("line")
         self.total, self.frames = n, n
         if lines is not None:
             lines.finish()
@@ -185,7 +185,7 @@ class LineLog:
             self.notes += lines.notes
             if lines.begun:  # in its last line, most often
                 last = others.n == 1 and others.first == lines.number
-                others = Tally("line") if last else others
+                others = Occurrences("line") if last else others
                 self.notes.append(f"it ends before its end: {n} frames were read")
         elif self.form == "blf" and made is not None:
             self.total = max(n, made.object_count)
@@ -210,7 +210,7 @@ class LineLog:
         made.stop = lambda: None  # `file` is looked at once more
         return made
 
-    def _resumed(self, made: Any, lines: CanLines | None) -> Iterator[Any]:
+    def _read_messages(self, made: Any, lines: CanLines | None) -> Iterator[Any]:
         """Read messages, and go on after lines that python-can cannot read."""
         n = 0
         while True:
@@ -239,7 +239,7 @@ class LineLog:
             of = f" of {made.object_count}" if n < made.object_count else ""
             self.notes.append(f"it ends before its end: {n} frames{of} were read")
 
-    def _tell(self, others: Tally, what: str, errors: int) -> None:
+    def _tell(self, others: Occurrences, what: str, errors: int) -> None:
         buses = self.buses
         if others.n:
             a = "an" if self.form == "asc" else "a"

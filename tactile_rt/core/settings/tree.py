@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import POINTER, is_pointer
 
 __all__ = [
     "SettingNode",
@@ -108,8 +107,6 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
     try:
         with path.open("rb") as file:
             data = file.read(largest + 1)
-        if is_pointer(data):
-            raise ConfigError(f"{path} {POINTER}")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except OSError as error:

@@ -21,7 +21,7 @@ from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
-from tactile_rt.drivers.can_lines import Tally
+from tactile_rt.drivers.can_lines import Occurrences
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.mending import Import, clock_of, mend_bag, write_chunks
@@ -87,8 +87,8 @@ class OpenBag:
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         """Read (time in ns, bytes, message) of a topic; a damaged message is None."""
-        for connection, t_ns, raw in self._stored(topic):
-            yield t_ns, bytes(raw), self._decoded(connection, raw)
+        for connection, t_ns, raw in self._read_stored(topic):
+            yield t_ns, bytes(raw), self._decode(connection, raw)
 
     def samples(self, topic: str, most: float = np.inf) -> list[Any]:
         """Read one message of each size, the largest first; see `SIZES`.
@@ -97,17 +97,17 @@ class OpenBag:
             most: number of bytes of the topic to look at.
         """
         sizes: dict[int, tuple[Any, bytes]] = {}
-        for connection, _, raw in self._stored(topic):
+        for connection, _, raw in self._read_stored(topic):
             most -= len(raw)
             sizes.setdefault(len(raw), (connection, bytes(raw)))
             if len(sizes) > SIZES:
                 del sizes[min(sizes)]
             if most <= 0:
                 break
-        found = (self._decoded(*sizes[size]) for size in sorted(sizes, reverse=True))
+        found = (self._decode(*sizes[size]) for size in sorted(sizes, reverse=True))
         return [message for message in found if message is not None]
 
-    def _stored(self, topic: str) -> Iterator[tuple[Any, int, bytes]]:
+    def _read_stored(self, topic: str) -> Iterator[tuple[Any, int, bytes]]:
         which = [c for c in self.reader.connections if c.topic == topic]
         stored = self.reader.messages(connections=which)
         while True:
@@ -120,7 +120,7 @@ class OpenBag:
                 self.notes += [note] if note not in self.notes else []
                 return
 
-    def _decoded(self, connection: Any, raw: bytes) -> Any:
+    def _decode(self, connection: Any, raw: bytes) -> Any:
         try:
             return self.reader.deserialize(raw, connection.msgtype)
         except Exception:  # rosbags raises anything on bytes that are no such message
@@ -226,10 +226,10 @@ def import_bag(
             )
         made = import_table(_table(path, bag, chosen, paths, channels), output, words, rate_hz)
         made.report.out_of_order = bag.back
-        return _counted(made, chosen)
+        return _count_messages(made, chosen)
 
 
-def _counted(made: Import, topic: BagTopic) -> Import:
+def _count_messages(made: Import, topic: BagTopic) -> Import:
     """Count the messages that the bag's index tells, also those that were not read."""
     report, unread = made.report, topic.messages - made.intact - made.corrupt
     report.unit, report.total = "messages", max(topic.messages, made.intact + made.corrupt)
@@ -284,7 +284,7 @@ def _columns_of(kind: str, message: Any) -> str:
 
 
 def _channels_of(message: Any) -> int:
-    """Return the number of channels of an array, by its layout; 0 for one that is empty."""
+    """Return the number of channels of an array by its layout; 0 if empty."""
     sizes, n = [d.size for d in message.layout.dim], len(message.data)
     fits = len(sizes) > 1 and int(np.prod(sizes)) == n
     return min(n, sizes[-1] if fits else 1)
@@ -293,7 +293,7 @@ def _channels_of(message: Any) -> int:
 def _describe(
     bag: OpenBag, name: str, kind: str, n: int, most: float = np.inf
 ) -> tuple[BagTopic, list[str], int]:
-    """Describe a topic: also the paths of all numbers in its messages, and channels of an array."""
+    """Describe a topic, with the paths of its numbers and the channels of arrays."""
     if kind in KNOWN:  # of one size
         found = list(islice(_whole(bag, name), 1))
     else:
@@ -335,7 +335,7 @@ def _table(path: Path, bag: OpenBag, topic: BagTopic, paths: list[str], channels
     def rows() -> Iterator[Sequence[Any]]:
         times = table.times_ns
         assert times is not None
-        fewer, other = Tally("message"), Tally("message")
+        fewer, other = Occurrences("message"), Occurrences("message")
         bag.back = 0
         for number, (t_ns, _, message) in enumerate(bag.messages(topic.name), 1):
             before = times[-1:]
@@ -418,7 +418,7 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
         spec, zero, f"{path.name}:{topic.name}",
         session={"imported": path.name, "topic": topic.name},
     )  # fmt: skip
-    return _counted(write_chunks(output, about, whole, account, str(path)), topic)
+    return _count_messages(write_chunks(output, about, whole, account, str(path)), topic)
 
 
 def _array_in(bag: OpenBag, samples: str) -> ArraySpec | None:

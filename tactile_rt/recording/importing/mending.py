@@ -15,7 +15,7 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.files import open_regular, write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.recording.description import SUMMARY, Description
-from tactile_rt.recording.importing.report import Measurer, Report
+from tactile_rt.recording.importing.report import ImportReport, Measurer
 from tactile_rt.recording.layout import SAMPLES, encode_samples
 from tactile_rt.recording.records import MAGIC
 from tactile_rt.recording.writer import McapFile
@@ -113,7 +113,7 @@ class Import:
     seconds: float = 0.0
     rate_hz: float = 0.0
     notes: list[str] = field(default_factory=list)
-    report: Report = field(default_factory=Report)
+    report: ImportReport = field(default_factory=ImportReport)
 
     def line(self) -> str:
         """It in one line."""

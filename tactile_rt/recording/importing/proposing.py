@@ -103,7 +103,7 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
 
 
 def propose_fields(paths: Sequence[str]) -> str:
-    """Propose columns for the numbers of a message: those of its largest array, or its fields.
+    """Propose columns for the largest array of a message, or for its fields.
 
     Args:
         paths: Path of each number, as ``sensors.0.values.3``.

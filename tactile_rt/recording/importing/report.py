@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["Measurer", "Report", "report_lines", "show_time"]
+__all__ = ["ImportReport", "Measurer", "report_lines", "show_time"]
 
 BLOCK = 4096  # samples that are measured together
 SHOWN = 8  # channels in text
 
 
 @dataclass
-class Report:
+class ImportReport:
     """What a file held, and what of it became samples.
 
     Attributes:
@@ -45,13 +45,13 @@ class Report:
 
 
 class Measurer:
-    """Takes the samples as they are written, and fills in a `Report`.
+    """Takes the samples as they are written, and fills in a `ImportReport`.
 
     Args:
         utc_offset_ns: What was taken off the times, ns.
     """
 
-    def __init__(self, report: Report, spec: ArraySpec, utc_offset_ns: int) -> None:
+    def __init__(self, report: ImportReport, spec: ArraySpec, utc_offset_ns: int) -> None:
         self._report, self._spec, self._offset = report, spec, utc_offset_ns
         self._waiting: list[Chunk] = []
         self._n = 0
@@ -109,7 +109,7 @@ def show_time(t_ns: int) -> str:
     )
 
 
-def report_lines(report: Report) -> list[str]:
+def report_lines(report: ImportReport) -> list[str]:
     """Write a report as lines of text: counts, times, and the range of each channel."""
     hz = [
         f"{rate:.6g} Hz {what}"

@@ -17,7 +17,7 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk, SourceStats
-from tactile_rt.drivers.can_lines import Tally
+from tactile_rt.drivers.can_lines import Occurrences
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
 from tactile_rt.drivers.logs import LineLog
@@ -163,7 +163,7 @@ class _Decoded:
     ) -> None:
         self._codec, self._now, self.unfinished = codec, 0, 0
         self.skipped = self._at = 0  # bytes: beside the frames up to the newest sample; of packets
-        self.corrupt = Tally(
+        self.corrupt = Occurrences(
             "frame" if log.wire == "can" else "byte" if log.form == "raw" else "packet"
         )
         self._count: int | None = None  # of the newest sample
@@ -171,7 +171,7 @@ class _Decoded:
         packets = log.packets()
         waiting: list[tuple[Any, int | None, Samples | None]] = []
         for packet, t_ns in packets:
-            waiting.append((packet, t_ns, self._feed(packet, t_ns)))
+            waiting.append((packet, t_ns, self._take(packet, t_ns)))
             if codec.spec is not None or len(waiting) > AHEAD:
                 break
         if codec.spec is None:
@@ -207,12 +207,12 @@ class _Decoded:
             if following is None and isinstance(packet, bytes):
                 yield packet, t_ns, self._fed_slowly(packet, t_ns or 0)
             else:
-                samples = self._feed(packet, t_ns)
+                samples = self._take(packet, t_ns)
                 self.unfinished = 0 if samples is not None else self.unfinished + len(packet)
                 yield packet, t_ns, samples
             packet, t_ns = following, later
 
-    def _feed(self, packet: Any, t_ns: int | None) -> Samples | None:
+    def _take(self, packet: Any, t_ns: int | None) -> Samples | None:
         """Feed a packet, and note what it damages."""
         stats = self._codec.stats
         before = stats.corrupt
@@ -228,7 +228,7 @@ class _Decoded:
         """The last bytes of a log one by one, to see where the last sample ends."""
         found = []
         for k in range(len(packet)):
-            samples = self._feed(packet[k : k + 1], t_ns)
+            samples = self._take(packet[k : k + 1], t_ns)
             self.unfinished += 1
             if samples is not None:
                 found.append(samples)
