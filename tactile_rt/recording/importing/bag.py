@@ -22,11 +22,18 @@ from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.can_lines import Occurrences
+from tactile_rt.drivers.codecs.ascii_mapping import parse_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.mending import Import, clock_of, mend_bag, write_chunks
 from tactile_rt.recording.importing.proposing import propose_fields
-from tactile_rt.recording.importing.table import BESIDE, Table, import_table, shown_names
+from tactile_rt.recording.importing.table import (
+    BESIDE,
+    Table,
+    import_table,
+    mapping_of,
+    shown_names,
+)
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
@@ -224,7 +231,17 @@ def import_bag(
                 f"{path}: {chosen.name} has {chosen.type}: say with --columns what is what, e.g. "
                 f"{paths[-1]}=S.value; its fields are {shown_names(paths)}"
             )
-        made = import_table(_table(path, bag, chosen, paths, channels), output, words, rate_hz)
+        columns_read = parse_columns(mapping_of(words, path.stem).columns, "--columns")
+        wanted = {c.label.strip().lower() for c in columns_read if c.label}
+        steps = [
+            [int(s) if s.isdecimal() else s for s in p.split(".")]
+            if p.lower() in wanted or not wanted
+            else None
+            for p in paths
+        ]
+        table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
+        table.rows = _rows(table, bag, chosen.name, steps, channels)
+        made = import_table(table, output, words, rate_hz)
         made.report.out_of_order = bag.back
         return _count_messages(made, chosen)
 
@@ -307,7 +324,8 @@ def _describe(
     paths = {leaf: order(leaf) for one in found for leaf in islice(_leaves(one, ""), MOST)}
     listed = sorted(paths, key=paths.__getitem__)
     columns = _columns_of(kind, found[0]) if found else ""
-    proposed = "" if columns else propose_fields([p for p in listed if not p.startswith(BESIDE)])
+    few = not columns and len(listed) < MOST  # no picture
+    proposed = "" if not few else propose_fields([p for p in listed if not p.startswith(BESIDE)])
     channels = _channels_of(found[0]) if found and NUMBERS.fullmatch(kind) else 0
     return BagTopic(name, kind, n, columns, proposed), listed, channels
 
@@ -328,46 +346,46 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
         yield at
 
 
-def _table(path: Path, bag: OpenBag, topic: BagTopic, paths: list[str], channels: int) -> Table:
-    steps = [[int(s) if s.isdecimal() else s for s in p.split(".")] for p in paths]
-    table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
-
-    def rows() -> Iterator[Sequence[Any]]:
-        times = table.times_ns
-        assert times is not None
-        fewer, other = Occurrences("message"), Occurrences("message")
-        bag.back = 0
-        for number, (t_ns, _, message) in enumerate(bag.messages(topic.name), 1):
-            before = times[-1:]
-            times[:] = [_stamp(message) or t_ns]
-            bag.back += before > times
-            if message is None:
-                yield ()
-                continue
-            if channels > 1 and _channels_of(message) not in (0, 1, channels):
-                other.add(number)
-                yield ()
-                continue
-            row, missing = _row(message, steps)
-            if missing:
-                fewer.add(number)
-            yield row
-        if other.n:
-            bag.notes.append(f"messages of another number of channels, left out: {other}")
-        if fewer.n:
-            bag.notes.append(f"messages that lack some of the numbers, which are invalid: {fewer}")
-
-    table.rows = rows()
-    return table
+def _rows(
+    table: Table, bag: OpenBag, topic: str, steps: list[list[int | str] | None], channels: int
+) -> Iterator[Sequence[Any]]:
+    """Read the rows of a topic, and count messages that lack numbers or have other channels."""
+    times = table.times_ns
+    assert times is not None
+    fewer, other = Occurrences("message"), Occurrences("message")
+    bag.back = 0
+    for number, (t_ns, _, message) in enumerate(bag.messages(topic), 1):
+        before = times[-1:]
+        times[:] = [_stamp(message) or t_ns]
+        bag.back += before > times
+        if message is None:
+            yield ()
+            continue
+        if channels > 1 and _channels_of(message) not in (0, 1, channels):
+            other.add(number)
+            yield ()
+            continue
+        row, missing = _row(message, steps)
+        if missing:
+            fewer.add(number)
+        yield row
+    if other.n:
+        bag.notes.append(f"messages of another number of channels, left out: {other}")
+    if fewer.n:
+        bag.notes.append(f"messages that lack some of the numbers, which are invalid: {fewer}")
 
 
-def _row(message: Any, steps: list[list[int | str]]) -> tuple[list[Any], int]:
-    """Take the numbers of a message, NaN for one that it lacks, and count those."""
+def _row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], int]:
+    """Take the numbers of a message, NaN for one that it lacks, and count those.
+
+    Args:
+        steps: path of each number; None for one that is not wanted.
+    """
     row, missing = [], 0
     for path in steps:
-        value = message
+        value = np.nan if path is None else message
         try:
-            for step in path:
+            for step in path or ():
                 value = value[step] if isinstance(step, int) else getattr(value, step)
         except IndexError:
             value, missing = np.nan, missing + 1  # a list that is shorter than others
