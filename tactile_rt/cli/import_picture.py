@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 KINDS: Final = (".png", ".svg", ".pdf")
 ROWS, NAMED, NOTES = 12, 8, 4  # channels, elements in the legend, notes that are shown
-BINS: Final = 2000  # of time, of each of which the smallest and the largest value are drawn
-PAUSE: Final = 5  # typical steps
+BINS, PAUSE = 2000, 5  # stretches of time, each drawn by its extremes; typical steps
 
 
 def check_picture(out: Path) -> None:
@@ -38,11 +37,11 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
     spec, chunk = stored.spec, concatenate(list(stored))
     t_s = chunk.t_ns / NS_PER_S
     values = np.where(chunk.valid[..., None], chunk.values, np.nan)
-    bad = ~chunk.valid.all(axis=1)
     steps = np.diff(t_s)
     usual = float(np.median(steps)) if len(steps) else 1.0
     lost = np.flatnonzero((np.diff(chunk.seq) > 1) | (steps > PAUSE * usual))
-    turns = np.flatnonzero(np.diff(bad.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    bad = np.concatenate([[False], ~chunk.valid.all(axis=1), [False]])
+    turns = np.flatnonzero(np.diff(bad)).reshape(-1, 2)  # where a stretch begins and ends
     marks = {
         "invalid": ("tab:red", [(t_s[a], t_s[b - 1] + usual - t_s[a]) for a, b in turns.tolist()]),
         "missing": ("tab:orange", [(t_s[k], t_s[k + 1] - t_s[k]) for k in lost.tolist()]),
@@ -55,9 +54,7 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
     for c, axis in enumerate(axes):
         for e, name in enumerate(spec.elements):
             both = [f.reduceat(values[:, e, c], edges) for f in (np.fmin, np.fmax)]
-            axis.plot(
-                at, np.stack(both, 1).ravel(), lw=0.8, marker="." * (len(t_s) < 3), label=name
-            )
+            axis.plot(at, np.stack(both, 1).ravel(), lw=0.8, label=name)
         for what, (color, spans) in marks.items():
             if spans:
                 whole = {"transform": axis.get_xaxis_transform(), "alpha": 0.3, "label": what}
@@ -67,12 +64,10 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
     labels = dict(zip(*axes[0].get_legend_handles_labels()[::-1], strict=True))
     shown = [n for n in (*spec.elements[:NAMED], "invalid", "missing") if n in labels]
     axes[0].legend([labels[n] for n in shown], shown, loc="upper right", fontsize="small", ncols=5)
-    further = len(spec.channels) - len(rows)
-    head = f"{stored.description.source}: {made.line()}" + f"; {further} channels more" * (
-        further > 0
+    rest = ((len(odd) - NOTES, "notes"), (len(spec.channels) - ROWS, "channels"))
+    notes = [*odd[:NOTES], *(f"and {n} {what} more" for n, what in rest if n > 0)]
+    axes[-1].set_xlabel("\n".join(["time [s]", *notes]), parse_math=False)
+    figure.suptitle(
+        f"{stored.description.source}: {made.line()}", fontsize="medium", parse_math=False
     )
-    figure.suptitle(head, fontsize="medium", parse_math=False)
-    notes = "\n".join([*odd[:NOTES], *[f"and {len(odd) - NOTES} more"] * (len(odd) > NOTES)])
-    axes[-1].set_xlabel(f"time [s]\n{notes}".strip(), parse_math=False)
-    kind = out.suffix[1:].lower()
-    write_whole(out, lambda file: figure.savefig(file, format=kind, dpi=120))
+    write_whole(out, lambda file: figure.savefig(file, format=out.suffix[1:].lower(), dpi=120))

@@ -233,12 +233,7 @@ def import_bag(
             )
         columns_read = parse_columns(mapping_of(words, path.stem).columns, "--columns")
         wanted = {c.label.strip().lower() for c in columns_read if c.label}
-        steps = [
-            [int(s) if s.isdecimal() else s for s in p.split(".")]
-            if p.lower() in wanted or not wanted
-            else None
-            for p in paths
-        ]
+        steps = [_split_path(p) if p.lower() in wanted or not wanted else None for p in paths]
         table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
         table.rows = _rows(table, bag, chosen.name, steps, channels)
         made = import_table(table, output, words, rate_hz)
@@ -315,19 +310,23 @@ def _describe(
         found = list(islice(_whole(bag, name), 1))
     else:
         found = [] if kind == messages.SAMPLES else bag.samples(name, most)
-    names: dict[str, int] = {}  # in the order of the message's fields
-
-    def order(path: str) -> list[int]:
-        steps = path.split(".")
-        return [int(s) if s.isdecimal() else names.setdefault(s, len(names)) for s in steps]
-
-    paths = {leaf: order(leaf) for one in found for leaf in islice(_leaves(one, ""), MOST)}
+    names: dict[str | int, int] = {}  # in the order of the message's fields
+    paths = {
+        leaf: [s if isinstance(s, int) else names.setdefault(s, len(names)) for s in steps]
+        for one in found
+        for leaf in islice(_leaves(one, ""), MOST)
+        for steps in [_split_path(leaf)]
+    }
     listed = sorted(paths, key=paths.__getitem__)
     columns = _columns_of(kind, found[0]) if found else ""
     few = not columns and len(listed) < MOST  # no picture
     proposed = "" if not few else propose_fields([p for p in listed if not p.startswith(BESIDE)])
     channels = _channels_of(found[0]) if found and NUMBERS.fullmatch(kind) else 0
     return BagTopic(name, kind, n, columns, proposed), listed, channels
+
+
+def _split_path(path: str) -> list[int | str]:
+    return [int(s) if s.isdecimal() else s for s in path.split(".")]
 
 
 def _whole(bag: OpenBag, topic: str) -> Iterator[Any]:
@@ -349,7 +348,7 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
 def _rows(
     table: Table, bag: OpenBag, topic: str, steps: list[list[int | str] | None], channels: int
 ) -> Iterator[Sequence[Any]]:
-    """Read the rows of a topic, and count messages that lack numbers or have other channels."""
+    """Read the rows of a topic; note messages that lack numbers or have other channels."""
     times = table.times_ns
     assert times is not None
     fewer, other = Occurrences("message"), Occurrences("message")
