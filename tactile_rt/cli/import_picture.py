@@ -54,7 +54,7 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
     for c, axis in enumerate(axes):
         for e, name in enumerate(spec.elements):
             both = [f.reduceat(values[:, e, c], edges) for f in (np.fmin, np.fmax)]
-            axis.plot(at, np.stack(both, 1).ravel(), lw=0.8, label=name)
+            axis.plot(at, np.stack(both, 1).ravel(), lw=0.8, marker=".", ms=2, label=name)
         for what, (color, spans) in marks.items():
             if spans:
                 whole = {"transform": axis.get_xaxis_transform(), "alpha": 0.3, "label": what}
@@ -67,7 +67,5 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
     rest = ((len(odd) - NOTES, "notes"), (len(spec.channels) - ROWS, "channels"))
     notes = [*odd[:NOTES], *(f"and {n} {what} more" for n, what in rest if n > 0)]
     axes[-1].set_xlabel("\n".join(["time [s]", *notes]), parse_math=False)
-    figure.suptitle(
-        f"{stored.description.source}: {made.line()}", fontsize="medium", parse_math=False
-    )
+    figure.suptitle(f"{stored.description.source}: {made.line()}", parse_math=False)
     write_whole(out, lambda file: figure.savefig(file, format=out.suffix[1:].lower(), dpi=120))

@@ -129,6 +129,17 @@ def test_strict_writes_what_is_good_and_nothing_else(call, refused, bus):
     assert sorted(p.name for p in bus.iterdir()) == before
 
 
+def test_names_of_an_asc_log_are_those_of_the_dbc_file(call, bus):
+    head = "date Tue Mar 5 10:11:12.250 am 2024\nbase hex  timestamps relative\n"
+    line = "   0.010000 1  Force           Rx   d 4 00 64 FF CE\n"
+    (bus / "named.asc").write_text(head + line * 50 + line.replace("Force", "Gear"))
+    code, said, told = call("import", "named.asc", *AS)
+    assert code == 0 and "50 samples in, 50 intact" in said and "0.49 s at 100 Hz" in said
+    assert told == (
+        "named.asc: identifiers are names here (Gear), not read in 1 frames: not in the DBC file\n"
+    )
+
+
 def test_the_report_as_json_has_all_of_it(call, bus):
     import json
 
@@ -169,3 +180,22 @@ def test_a_git_lfs_pointer_is_refused_by_that_name(refused, tmp_path, name):
     if "/" not in name:
         for command in (("replay", path), ("recover", path), ("convert", path, tmp_path / "x.csv")):
             assert said in refused(*command)
+
+
+def test_a_git_lfs_pointer_is_refused_behind_every_other_door(tmp_path):
+    from tactile_rt.alignment.json_file import read_json
+    from tactile_rt.alignment.loading import responses_layers
+    from tactile_rt.alignment.neural import read_published
+    from tactile_rt.alignment.stimuli_input import read_stimuli
+    from tactile_rt.core.errors import TactileError
+    from tactile_rt.recording.labels import check_appendable, read_labels
+
+    path = tmp_path / "a.npz"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    doors = [
+        responses_layers, read_published, read_stimuli, check_appendable,
+        lambda path: read_json(path, dict, ""), lambda path: read_labels(path, []),
+    ]  # fmt: skip
+    for door in doors:
+        with pytest.raises(TactileError, match=r"a\.npz is a Git LFS pointer, not the file itself"):
+            door(path)

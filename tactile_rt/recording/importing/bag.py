@@ -382,7 +382,7 @@ def _row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], 
     """
     row, missing = [], 0
     for path in steps:
-        value = np.nan if path is None else message
+        value: Any = np.nan if path is None else message
         try:
             for step in path or ():
                 value = value[step] if isinstance(step, int) else getattr(value, step)
