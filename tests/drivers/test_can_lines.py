@@ -132,7 +132,7 @@ IS_FRAME = {
 
 
 @pytest.mark.parametrize("suffix", IS_FRAME)
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(edits=EDITS)
 def test_frames_of_a_damaged_log_add_up(tmp_path, suffix, edits):
     path = tmp_path / f"run.{suffix}"

@@ -21,7 +21,7 @@ SLOW = {"deadline": None, "suppress_health_check": list(HealthCheck)}
 FRAME = 37  # bytes of one of bota's
 
 
-@settings(max_examples=8, **SLOW)
+@settings(max_examples=4, **SLOW)
 @given(
     st.dictionaries(
         st.integers(1, 38), st.sampled_from([b"", b"\x00" * 5, b"\xaa" * 9]), max_size=4
@@ -54,7 +54,7 @@ def arrays(folder, sizes, layout=None):
     return folder
 
 
-@settings(max_examples=8, **SLOW)
+@settings(max_examples=4, **SLOW)
 @given(st.lists(st.integers(0, 6), min_size=2, max_size=12).filter(any))
 def test_messages_of_any_size_are_samples_of_the_largest(tmp_path_factory, sizes):
     folder = tmp_path_factory.mktemp("bag")
