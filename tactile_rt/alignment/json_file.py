@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import write_whole
+from tactile_rt.core.files import check_no_pointer, write_whole
 
 __all__ = ["Floats", "Number", "encode", "read_json", "write_json"]
 
@@ -37,6 +37,7 @@ def write_json(value: Any, path: Path) -> None:
 
 def read_json(path: Path, kind: type[T], made_by: str) -> T:
     """Read what `write_json` wrote of a struct whose tag names its kind and version."""
+    check_no_pointer(path)
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_from_plain)
     except OSError as error:

@@ -12,6 +12,7 @@ from tactile_rt.alignment.layers import PARTS, Layers
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoints import describe_checkpoint
 
@@ -143,6 +144,7 @@ def responses_layers(path: Path) -> Layers:
     Raises:
         ConfigError: no such file, an array that is no layer, by name, or two that are one layer.
     """
+    check_no_pointer(path)
     try:
         content = path.read_bytes()
     except OSError as error:

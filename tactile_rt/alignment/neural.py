@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
@@ -157,6 +158,7 @@ def read_published(path: Path) -> dict[str, Floats]:
 
     The stimulus axis has no names in such a file, so only protocol paper-code can use it.
     """
+    check_no_pointer(path)
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())

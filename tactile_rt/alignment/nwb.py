@@ -41,6 +41,7 @@ from tactile_rt.alignment.nwb_parts import (
 from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
@@ -149,6 +150,7 @@ def read_session(
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
     h5py = _h5py()
+    check_no_pointer(path)
     try:
         with h5py.File(path, "r") as file:
             return _session(file, path.stem, window, progress, clock, selection or Selection())

@@ -39,6 +39,7 @@ from tactile_rt.classifier.model_card import (
 from tactile_rt.classifier.onnx_check import MAX_BYTES, BadModel, Contents, graph_sha256, read_onnx
 from tactile_rt.classifier.runtime import FlushDenormals
 from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.core.files import POINTER, is_pointer
 
 __all__ = [
     "METADATA_KEY",
@@ -229,8 +230,8 @@ def _mistaken(data: bytes) -> str:
     """What a file is that somebody took for a model, as far as its first bytes tell."""
     if not data:
         return "it is empty"
-    if data.startswith(b"version https://git-lfs"):
-        return "it is a Git LFS pointer; `git lfs pull` fetches the file"
+    if is_pointer(data):
+        return f"it {POINTER}"
     if data.startswith(b"PK\x03\x04"):
         return "it is a zip archive, as checkpoints are; `tactile-rt export` makes a model of one"
     head = data[:100].decode("latin-1")

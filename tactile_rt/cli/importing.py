@@ -1,7 +1,10 @@
 """`tactile-rt import`: logs, tables and bags of others, as recordings."""
 
+import os
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import parse_qsl
 
 import typer
@@ -12,6 +15,9 @@ from tactile_rt.cli.options import Force, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.recording.importing.mending import Import
 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
@@ -39,6 +45,12 @@ def import_file(
     lines: Annotated[
         int, typer.Option(min=1, max=1000, help="Lines of text per row of a table.")
     ] = 1,
+    plot: Annotated[
+        Path | None, typer.Option(help="Picture of what came in: .png, .svg or .pdf.")
+    ] = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Write nothing if anything is odd; exit code 2.")
+    ] = False,
     force: Force = False,
     json: Json = None,
 ) -> None:
@@ -60,8 +72,44 @@ def import_file(
     check_is_mcap(output)
     check_output(json)
     check_new(output, force)
+    if plot is not None:
+        from tactile_rt.cli.import_picture import check_picture, draw_import
+
+        check_output(plot)
+        check_picture(plot)
     if decimal not in ("", ",", "."):
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
+    with ExitStack() as stack:
+        target = output
+        if strict:  # hidden until it is known to be good
+            hidden = stack.enter_context(TemporaryDirectory(prefix=".", dir=output.parent))
+            target = Path(hidden) / output.name
+        wanted = (decoded_as, columns, topic, rate, bus, form)
+        made = _import(log, target, wanted, (delimiter, decimal, skip, lines))
+        odd = _list_odd(made)
+        for note in made.notes:
+            typer.echo(f"{log}: {note}", err=True)
+        if strict and odd:
+            raise ConfigError(f"{log}: {odd[0]:.100}; nothing is written, as --strict wants it")
+        if plot is not None:
+            draw_import(target, made, odd, plot)
+        if strict:
+            os.replace(target, output)
+    from tactile_rt.recording.importing.report import report_lines
+
+    counted = {k: v for k, v in vars(made).items() if k != "report"} | vars(made.report)
+    if not told_as_json({"file": output, **counted, "odd": odd}, json):
+        typer.echo("\n  ".join([f"{output}: {made.line()}", *report_lines(made.report)]))
+
+
+def _import(
+    log: Path,
+    output: Path,
+    wanted: tuple[str, str, str, float, str, str],
+    form: tuple[str, str, int, int],
+) -> "Import":
+    """Write the recording of a file, whatever it is."""
+    decoded_as, columns, topic, rate, bus, log_form = wanted
     with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
         from tactile_rt.drivers.logs import read_log
         from tactile_rt.recording.importing.bag import import_bag, is_bag
@@ -69,6 +117,7 @@ def import_file(
         from tactile_rt.recording.importing.table import import_table
         from tactile_rt.recording.importing.wire import import_wire
 
+        made: Import
         if is_bag(log):
             if decoded_as:
                 raise ConfigError(f"{log} is a bag: its messages are no bytes of a codec; no --as")
@@ -76,20 +125,31 @@ def import_file(
         elif decoded_as and columns:
             raise ConfigError("give --as, for what a device spoke, or --columns, for a table")
         elif decoded_as:
-            packets = read_log(log, form, bus)
+            packets = read_log(log, log_form, bus)
             made = import_wire(packets, output, codec_fields(decoded_as, "--as"), rate)
         elif columns:
-            table = read_table(log, csv_form(log, delimiter, decimal, skip, lines))
+            table = read_table(log, csv_form(log, *form))
             made = import_table(table, output, columns, rate)
         else:
             raise ConfigError(
                 f"{log}: say what it is: --as codec=NAME or --columns ...; "
                 f"`tactile-rt sniff {log}` tells which"
             )
-    for note in made.notes:
-        typer.echo(f"{log}: {note}", err=True)
-    if not told_as_json({"file": output, **vars(made)}, json):
-        typer.echo(f"{output}: {made.line()}")
+    if rate and not decoded_as:
+        made.report.said_hz = rate
+        if made.report.found_hz == made.report.said_hz:
+            made.report.found_hz = None  # no column is a time
+    return made
+
+
+def _list_odd(made: "Import") -> list[str]:
+    """List what is odd about a file, a line each."""
+    odd = [note for note in made.notes if not note.startswith("left out: ")]
+    if made.corrupt and not any("corrupt" in note for note in odd):
+        odd.append(f"{made.corrupt} corrupt {made.report.unit}")
+    if made.missing:
+        odd.append(f"{made.missing} missing, the first after sample {made.report.first_missing}")
+    return odd
 
 
 def codec_fields(text: str, option: str) -> dict[str, str]:

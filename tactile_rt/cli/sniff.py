@@ -238,6 +238,8 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         fits = sniff_frames(frames, further)
         if not fits:
             _show_identifiers(frames, told)
+            for note in log.notes:
+                told.say(note)
             told.nothing(
                 f"no codec fits {path}",
                 "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'",
@@ -330,6 +332,13 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     if not told.alone:
         print_table(table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
+    proposed = [t for t in topics if t.proposed]
+    if not known and proposed:
+        best = max(proposed, key=lambda t: t.messages)
+        told.say(f"{best.name} has numbers: names and units are for you to say")
+        quoted = f"{shlex.quote(str(path))} --topic {shlex.quote(best.name)}"
+        told.go_on(f"tactile-rt import {quoted} --columns {shlex.quote(best.proposed)}")
+        return
     if not known:
         told.nothing(f"{path}: of no topic is known what is what", "say it with --columns")
     best = max(known, key=lambda t: t.messages)

@@ -9,9 +9,10 @@ anywhere and hold lines that are none: what can be read is, and `notes` say what
 
 import gzip
 import logging
+import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from io import BufferedReader, RawIOBase, TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any, BinaryIO, Final, cast
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
+from tactile_rt.drivers.can_lines import TRC_1_0, CanLines, Occurrences, find_asc_frame, has_names
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import Found, of_candump, of_gvret, of_heard, of_hex, of_slcan
 
@@ -71,6 +73,9 @@ class LineLog:
         piece: Bytes of a packet where the log says nothing of packets.
         notes: What could not be read, a sentence each; complete once all packets were read.
         buses: Number of packets of each bus, by its name; complete once all packets were read.
+        names: Identifiers, and whether they have 29 bits, of the messages whose names are known.
+        total: The number of bytes, lines or frames that the file holds; complete as the notes.
+        frames: How many of them were read as frames, or as lines that a device sent.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:
@@ -79,6 +84,9 @@ class LineLog:
         self.piece = PIECE
         self.notes: list[str] = []
         self.buses: Counter[str] = Counter()
+        self.names: Mapping[str, tuple[int, bool]] = {}
+        self.total = self.frames = 0
+        self.back = Occurrences("packet")  # times that go back
 
     def packets(self) -> Iterator[Timed]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
@@ -86,19 +94,26 @@ class LineLog:
         """
         self.notes.clear()
         self.buses.clear()
-        latest, back = -(1 << 62), 0
+        self.total = self.frames = 0
+        latest, self.back = -(1 << 62), Occurrences("frame" if self.wire == "can" else "packet")
         with open_log_file(self.path) as file:
-            for packet, t_ns in self._read(file):
+            for number, (packet, t_ns) in enumerate(self._read(file), 1):
                 if t_ns is not None:
-                    back += t_ns < latest
-                    latest = t_ns = max(t_ns, latest)
+                    if t_ns < latest:
+                        self.back.add(number)
+                        t_ns = latest
+                    latest = t_ns
                 yield packet, t_ns
-        if back:
-            self.notes.append(f"{back} times go back; these packets have the time before")
+        if self.back.n:
+            self.notes.append(
+                f"{self.back.n} times go back ({self.back.what} {self.back.first} is the first); "
+                "these packets have the time before"
+            )
 
     def _read(self, file: "LogFile") -> Iterator[Timed]:
         if self.form == "raw":
             while piece := file.read(self.piece):
+                self.total += len(piece)
                 yield piece, None
         elif self.form in OF_PYTHON_CAN:
             yield from self._logged(file)
@@ -109,13 +124,16 @@ class LineLog:
 
     def _text(self, file: LogFile) -> Iterator[Timed]:
         parse, errors, buses = LINES[self.form], 0, self.buses
-        others = -(self.form == "gvret")  # whose first line names the columns
+        others, blank, number = Occurrences("line"), 0, 0
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
-        with TextIOWrapper(file, "utf-8", "replace") as lines:
-            for line in lines:
+        with TextIOWrapper(file, "utf-8-sig", "replace") as lines:
+            for number, line in enumerate(lines, 1):
                 found = parse(line.rstrip("\r\n"))
                 if found is None:
-                    others += bool(line.strip())
+                    if not line.strip() or (number == 1 and self.form == "gvret"):
+                        blank += 1  # as good as: the names of columns
+                    else:
+                        others.add(number)
                     continue
                 bus, packet, t_ns = found
                 if packet is None:
@@ -128,26 +146,23 @@ class LineLog:
                 buses[bus] += 1
                 if not self._bus or bus == self._bus:
                     yield packet, t_ns
+        self.total, self.frames = number - blank, number - blank - others.n
         self._tell(others, "line", errors)
 
     def _logged(self, file: LogFile) -> Iterator[Timed]:
         """Read what python-can does: what it passes over in silence, a note says."""
-        from can.io import ASCReader, BLFReader, CSVReader, SqliteReader, TRCReader
-
-        logging.getLogger("can").addHandler(logging.NullHandler())  # it tells us, not the terminal
-        made: Any
-        n, errors, buses = 0, 0, self.buses
-        lines = _Lines(file, "utf-8", "replace")
+        warned = _Warnings()
+        logging.getLogger("can").addHandler(warned)  # it tells us, not the terminal
+        errors, buses, n = 0, self.buses, 0
+        lines: CanLines | None = None
+        if self.form in ("asc", "csv", "trc"):
+            text, named = TextIOWrapper(file, "utf-8-sig", "replace"), False
+            if self.form == "asc":
+                named = has_names(_lines(_head(self.path)))
+            lines = CanLines(text, self.form, self.names, named)
         try:
-            if self.form == "blf":
-                made = BLFReader(file)
-            elif self.form == "db":
-                made = SqliteReader(self.path)
-            elif self.form == "asc":
-                made = ASCReader(lines, relative_timestamp=False)
-            else:
-                made = (TRCReader if self.form == "trc" else CSVReader)(lines)
-            for message in made:
+            made = self._reader(file, lines)
+            for message in self._read_messages(made, lines):
                 n += 1
                 bus = "" if message.channel is None else str(message.channel)
                 if message.is_error_frame:
@@ -161,23 +176,77 @@ class LineLog:
                             message.is_fd, message.is_remote_frame,
                         )
                     ], round(NS_PER_S * message.timestamp)  # fmt: skip
-            told = made.object_count if self.form == "blf" else n
-            if n < told or (self.form == "asc" and "end triggerblock" not in lines.newest.lower()):
-                of = f" of {told}" if n < told else ""
-                self.notes.append(f"it ends before its end: {n} frames{of} were read")
-        except OSError:
-            raise
-        except Exception as error:  # python-can raises anything on a file that is cut or damaged
-            why = " ".join(str(error).split()) or type(error).__name__
-            self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
         finally:
-            lines.close()
-        self._tell(0, "frame", errors)
+            logging.getLogger("can").removeHandler(warned)
+            if lines is not None:
+                lines.close()
+        others = Occurrences("line")
+        self.total, self.frames = n, n
+        if lines is not None:
+            lines.finish()
+            others, self.total = lines.lost, lines.filled
+            self.notes += lines.notes
+            if lines.begun:  # in its last line, most often
+                last = others.n == 1 and others.first == lines.number
+                others = Occurrences("line") if last else others
+                self.notes.append(f"it ends before its end: {n} frames were read")
+        elif self.form == "blf" and made is not None:
+            self.total = max(n, made.object_count)
+            self._check_end(file, made, n)
+        self.notes += warned.notes[:3] if self.form != "trc" else []  # whose lines are counted
+        self._tell(others, "frame", errors)
 
-    def _tell(self, others: int, what: str, errors: int) -> None:
+    def _reader(self, file: LogFile, lines: CanLines | None) -> Any:
+        """Make python-can's reader; None where the file does not even begin as it should."""
+        from can.io import ASCReader, BLFReader, CSVReader, SqliteReader, TRCReader
+
+        if lines is not None:
+            kinds = {"asc": ASCReader, "csv": CSVReader, "trc": TRCReader}
+            return kinds[self.form](lines, relative_timestamp=False)
+        if self.form == "db":
+            return SqliteReader(self.path)
+        try:
+            made: Any = BLFReader(file)
+        except (struct.error, ValueError) as error:
+            self.notes.append(f"it is cut short or damaged after 0 frames ({error!s:.80})")
+            return None
+        made.stop = lambda: None  # `file` is looked at once more
+        return made
+
+    def _read_messages(self, made: Any, lines: CanLines | None) -> Iterator[Any]:
+        """Read messages, and go on after lines that python-can cannot read."""
+        n = 0
+        while True:
+            at = lines.number if lines else 0
+            try:
+                for message in made or ():
+                    n += 1
+                    if lines is None or lines.accept(message):
+                        yield message
+                return
+            except (OSError, GeneratorExit):
+                raise
+            except Exception as error:  # python-can raises anything on what is cut or damaged
+                why = " ".join(str(error).split()) or type(error).__name__
+                if lines is None or lines.number == at:
+                    self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
+                    return
+                if not lines.settle(why):
+                    self.notes.append(f"line {lines.number} of its header is not read ({why:.60})")
+                lines.resume()
+
+    def _check_end(self, file: LogFile, made: Any, n: int) -> None:
+        """Note that a .blf is shorter than its header says, or ends within an object."""
+        short = file.seekable() and file.tell() < made.file_size  # one that is cut is noted
+        if (short or made._tail.strip(b"\0")) and not self.notes:
+            of = f" of {made.object_count}" if n < made.object_count else ""
+            self.notes.append(f"it ends before its end: {n} frames{of} were read")
+
+    def _tell(self, others: Occurrences, what: str, errors: int) -> None:
         buses = self.buses
-        if others:
-            self.notes.append(f"passed over, no {what} of a {self.form} log: {others}")
+        if others.n:
+            a = "an" if self.form == "asc" else "a"
+            self.notes.append(f"passed over, no {what} of {a} {self.form} log: {others}")
         if errors:
             self.notes.append(f"{errors} error frames")
         if self._bus and self._bus not in buses:
@@ -243,14 +312,17 @@ class _Unpacked(RawIOBase):
         super().close()
 
 
-class _Lines(TextIOWrapper):
-    """Lines of text, of which one knows the newest."""
+class _Warnings(logging.Handler):
+    """What python-can passes over with a warning, once each."""
 
-    newest = ""
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.notes: list[str] = []
 
-    def __next__(self) -> str:  # type: ignore[override]  # text, of what gives text
-        self.newest = super().__next__()
-        return self.newest
+    def emit(self, record: logging.LogRecord) -> None:
+        note = " ".join(record.getMessage().split())
+        if note not in self.notes:
+            self.notes.append(note)
 
 
 def _head(path: Path) -> bytes:
@@ -259,7 +331,7 @@ def _head(path: Path) -> bytes:
 
 
 def _lines(head: bytes) -> list[str]:
-    lines = [x for x in head.decode("utf-8", "replace").splitlines() if x.strip()]
+    lines = [x for x in head.decode("utf-8-sig", "replace").splitlines() if x.strip()]
     return lines[:-1] if len(head) == HEAD else lines  # the last one was cut
 
 
@@ -284,14 +356,19 @@ def _form(path: Path) -> str:
     lines = _lines(head)
     if not lines:
         return "raw"
-    if lines[0].startswith(";$FILEVERSION"):
+    entries = [x for x in lines if not x.startswith(";")]
+    if any(x.startswith(";$FILEVERSION") for x in lines) or (
+        entries != lines and sum(map(bool, map(TRC_1_0.fullmatch, entries))) > MOSTLY * len(entries)
+    ):
         return "trc"
     if lines[0].startswith(CSV_HEADER):
         return "csv"
     if lines[0].lower().startswith(SAVVYCAN_HEADER):
         return "gvret"
-    begins = [x.strip().lower() for x in lines[:6]]
-    if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
+    begins = {x.split()[0].lower() for x in lines[:6]}
+    if begins >= {"date", "base"} or sum(map(bool, map(find_asc_frame, lines))) >= MOSTLY * len(
+        lines
+    ):
         return "asc"
     for form in ("candump", "slcan", "terminal"):
         if sum(LINES[form](x) is not None for x in lines) >= MOSTLY * len(lines):

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
-from tactile_rt.core.files import open_regular, replaced
+from tactile_rt.core.files import check_no_pointer, open_regular, replaced
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.ead_config import EADConfig
@@ -58,6 +58,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         ModelError: not there, or no such checkpoint, as far as can be told without its numbers.
     """
+    check_no_pointer(path)
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             names = [name for name in archive.namelist() if name.endswith(PICKLE)]

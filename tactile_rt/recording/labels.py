@@ -21,7 +21,7 @@ from pathlib import Path
 import msgspec
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import open_regular, sync_folder, write_whole
+from tactile_rt.core.files import check_no_pointer, open_regular, sync_folder, write_whole
 from tactile_rt.core.settings import check_columns, convert, nearest, read_csv, refusal
 
 __all__ = [
@@ -86,6 +86,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
         ConfigError: it cannot be read, or a line is wrong; names file, line and column, and what to
             do.
     """
+    check_no_pointer(path)
     table = read_csv(path)
     check_columns(table, COLUMNS, NEEDED)
     if "recording" not in table.columns and len(recordings) > 1:
@@ -172,7 +173,7 @@ def check_appendable(path: Path) -> None:
     Raises:
         ConfigError: it has other columns.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         columns = _cells(file.readline(LONGEST_LINE))
     if columns != COLUMNS:
         raise ConfigError(

@@ -181,7 +181,7 @@ def is_finished(path: Path) -> bool:
     try:
         with open_regular(path) as file:
             return _has_end(file)
-    except OSError:
+    except (OSError, ConfigError):
         return False
 
 

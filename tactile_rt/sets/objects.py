@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
-from tactile_rt.core.files import write_whole
+from tactile_rt.core.files import check_no_pointer, write_whole
 from tactile_rt.sets.manifest import (
     CONTACTS,
     SKIPPED,
@@ -188,6 +188,7 @@ def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
 
 
 def _read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
+    check_no_pointer(path)
     try:
         # Opened here because numpy leaves its own file open when it is damaged.
         with path.open("rb") as file, np.load(file) as arrays:

@@ -64,7 +64,7 @@ def test_a_batch_frozen_into_the_graph_is_refused_unless_it_is_one(tmp_path: Pat
         (b'{\n\t"version": 2}', "it is text"),
         (
             b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
-            "`git lfs pull` fetches",
+            "it is a Git LFS pointer, not the file itself: `git lfs pull`",
         ),
         (b"PK\x03\x04\x00\x00", "it is a zip archive, as checkpoints are; `tactile-rt export`"),
     ],

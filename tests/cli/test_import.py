@@ -20,7 +20,12 @@ def raw(tmp_path, monkeypatch):
 def test_bytes_become_a_recording_of_their_name(call, raw):
     code, said, _ = call("import", "raw.bin", "--as", "codec=bota")
     assert code == 0
-    assert said == "raw.mcap: 40 samples in, 40 intact, 0 corrupt, 0 missing; 0.39 s at 100 Hz\n"
+    assert said.splitlines()[:3] == [
+        "raw.mcap: 40 samples in, 40 intact, 0 corrupt, 0 missing; 0.39 s at 100 Hz",
+        "  1489 bytes: 1480 read, 9 passed over, 0 out of order; 0 samples have an invalid element",
+        "  from 0 s to 0.39 s; 100 Hz by its times; 100 Hz said",
+    ]
+    assert said.splitlines()[3].startswith("  fx ") and said.endswith(" N m\n")
     assert sum(map(len, Recording("raw.mcap"))) == 40
     assert call("run", "--source", "replay:raw.mcap?speed=0", "--model", "none.onnx")[0] == 2
 
@@ -40,7 +45,7 @@ def test_half_a_log_has_a_note(call, tmp_path, monkeypatch):
     (tmp_path / "can.log").write_text(text[:-4])
     code, said, told = call("import", "can.log", "out.mcap", "--as", "codec=aft200")
     assert code == 0 and "39 samples in, 79 intact" in said
-    assert told == "can.log: passed over, no line of a candump log: 1\n"
+    assert told == "can.log: passed over, no line of a candump log: 1 (line 80)\n"
 
 
 def test_a_table_and_a_rate(call, tmp_path, monkeypatch):
@@ -73,3 +78,124 @@ def test_what_cannot_be_is_one_line(refused, raw, options, why):
 def test_a_log_with_nothing_in_it_is_no_matter_of_its_codec(refused, tmp_path):
     (tmp_path / "can.log").touch()
     assert "can.log is empty" in refused("import", tmp_path / "can.log", "--as", "codec=xela")
+
+
+GOOD, ODD = "(0.{k:02}) can0 1A0#00{k:02X}FFCE\n", "(0.{k:02}) can0 1A0#0\n"
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: FT
+BO_ 416 Force: 4 FT
+ SG_ Fx : 7|16@0- (0.01,0) [-327|327] "N" FT
+"""
+MAPPING = """dbc = "f.dbc"
+name = "ft"
+rate_hz = 100.0
+[[channel]]
+name = "fx"
+unit = "N"
+[[element]]
+name = "S"
+grid = [0, 0]
+position_m = [0.0, 0.0, 0.0]
+orientation = [1.0, 0.0, 0.0, 0.0]
+signals = { fx = "Force.Fx" }
+"""
+
+
+@pytest.fixture
+def bus(tmp_path, monkeypatch):
+    """A folder with a good and an odd log of a bus, and what describes its frames."""
+    pytest.importorskip("cantools")
+    monkeypatch.chdir(tmp_path)
+    good = [GOOD.format(k=k) for k in range(90)]
+    (tmp_path / "good.log").write_text("".join(good))
+    good[40:50] = [ODD.format(k=40)]
+    (tmp_path / "odd.log").write_text("".join(good))
+    (tmp_path / "f.dbc").write_text(DBC)
+    (tmp_path / "f.toml").write_text(MAPPING)
+    return tmp_path
+
+
+AS = ("--as", "codec=can-dbc&mapping=f.toml")
+
+
+def test_strict_writes_what_is_good_and_nothing_else(call, refused, bus):
+    code, said, told = call("import", "good.log", *AS, "--strict")
+    assert code == 0 and told == "" and "90 lines: 90 read, 0 passed over, 0 out of order" in said
+    assert "from 0 s to 0.89 s; 100 Hz by its times; 100 Hz said\n  fx 0..0.89 N\n" in said
+    before = sorted(p.name for p in bus.iterdir())
+    assert call("import", "odd.log", *AS, "--strict")[0] == 2
+    assert sorted(p.name for p in bus.iterdir()) == before
+
+
+def test_names_of_an_asc_log_are_those_of_the_dbc_file(call, bus):
+    head = "date Tue Mar 5 10:11:12.250 am 2024\nbase hex  timestamps relative\n"
+    line = "   0.010000 1  Force           Rx   d 4 00 64 FF CE\n"
+    (bus / "named.asc").write_text(head + line * 50 + line.replace("Force", "Gear"))
+    code, said, told = call("import", "named.asc", *AS)
+    assert code == 0 and "50 samples in, 50 intact" in said and "0.49 s at 100 Hz" in said
+    assert told == (
+        "named.asc: identifiers are names here (Gear), not read in 1 frames: not in the DBC file\n"
+    )
+
+
+def test_the_report_as_json_has_all_of_it(call, bus):
+    import json
+
+    code, said, told = call("import", "odd.log", *AS, "--json", "-")
+    report = json.loads(said)
+    assert code == 0 and "1 (line 41)" in told
+    assert (
+        report["odd"] == report["notes"] == ["passed over, no line of a candump log: 1 (line 41)"]
+    )
+    assert [report[k] for k in ("unit", "total", "read", "passed_over")] == ["lines", 81, 80, 1]
+    assert report["ranges"]["S.fx"] == pytest.approx([0, 0.89]) and report["units"] == {"fx": "N"}
+    assert (report["first"], report["last"], report["said_hz"]) == ("0 s", "0.89 s", 100)
+
+
+def test_a_picture_shows_what_came_in(call, refused, bus):
+    pytest.importorskip("matplotlib")
+    code, _, _ = call("import", "odd.log", *AS, "--plot", "in.svg")
+    drawn = (bus / "in.svg").read_text()
+    assert code == 0 and drawn.startswith("<?xml")
+    for word in ("odd.log: 80 samples in", "fx [N]", "time [s]", "missing", "1 (line 41)"):
+        assert f"<!-- {word}" in drawn or word in drawn
+    assert "is no picture" in refused("import", "good.log", *AS, "--plot", "in.txt")
+    assert not (bus / "good.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["a.csv", "a.mcap", "a.log", "a.blf", "a.bag", "a.npz", "bag/b.db3"]
+)
+def test_a_git_lfs_pointer_is_refused_by_that_name(refused, tmp_path, name):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    (tmp_path / "bag" if "/" in name else tmp_path).joinpath("metadata.yaml").write_text("")
+    said = f"{path} is a Git LFS pointer, not the file itself: `git lfs pull`"
+    target = path.parent if "/" in name else path
+    for line in (("import", target, tmp_path / "o.mcap", "--columns", "a=S.x"), ("sniff", target)):
+        assert said in refused(*line)
+    if "/" not in name:
+        for command in (("replay", path), ("recover", path), ("convert", path, tmp_path / "x.csv")):
+            assert said in refused(*command)
+
+
+def test_a_git_lfs_pointer_is_refused_behind_every_other_door(tmp_path):
+    from tactile_rt.alignment.json_file import read_json
+    from tactile_rt.alignment.loading import responses_layers
+    from tactile_rt.alignment.neural import read_published
+    from tactile_rt.alignment.stimuli_input import read_stimuli
+    from tactile_rt.core.errors import TactileError
+    from tactile_rt.recording.labels import check_appendable, read_labels
+
+    path = tmp_path / "a.npz"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    doors = [
+        responses_layers, read_published, read_stimuli, check_appendable,
+        lambda path: read_json(path, dict, ""), lambda path: read_labels(path, []),
+    ]  # fmt: skip
+    for door in doors:
+        with pytest.raises(TactileError, match=r"a\.npz is a Git LFS pointer, not the file itself"):
+            door(path)

@@ -196,7 +196,9 @@ def test_times_never_go_back(tmp_path):
     path.write_text("(2.0) can0 123#AA\n(1.0) can0 123#BB\n(3.0) can0 124#\n")
     log = read_log(path)
     assert [t for _, t in log.packets()] == [2_000_000_000, 2_000_000_000, 3_000_000_000]
-    assert log.notes == ["1 times go back; these packets have the time before"]
+    assert log.notes == [
+        "1 times go back (frame 2 is the first); these packets have the time before"
+    ]
 
 
 def test_what_is_no_file_or_form_is_refused(tmp_path):

@@ -48,6 +48,7 @@ class CanDbc(CanCodec):
         self._map = read_mapping(Path(options.mapping))
         super().__init__(self._map.spec)
         self.tick_ns = self._map.tick_ns
+        self.names = self._map.names  # of messages, as some logs have them for identifiers
         if self._map.counter:
             self.count_bits = self._map.counter[0].length
         if self._map.time:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import convert, read_toml
 from tactile_rt.core.stream import ArraySpec
@@ -109,6 +110,7 @@ class DbcMapping:
             The same holds for `time` and `status`.
         tick_ns: Length of a tick of `time`, ns; None if the device sends no time.
         commands: What the host sends and when: (command, frame, identifier of the answer).
+        names: Identifiers of all messages of the DBC file, and whether they have 29 bits.
     """
 
     spec: ArraySpec
@@ -122,6 +124,7 @@ class DbcMapping:
     tick_ns: float | None
     invalid: int
     commands: tuple[tuple[str, CanFrame, int | None], ...]
+    names: dict[str, tuple[int, bool]]
 
 
 class _Channel(msgspec.Struct, forbid_unknown_fields=True):
@@ -193,6 +196,7 @@ class _Reader:
             raise lacking("codec can-dbc needs", "dbc", error) from None
         self.path, self.file = path, file
         self.dbc = path.parent / file.dbc
+        check_no_pointer(self.dbc)
         try:
             with self.dbc.open("rb") as dbc:
                 content = dbc.read(MOST_BYTES + 1)
@@ -258,6 +262,7 @@ class _Reader:
             file.time.tick_us * 1e3 if file.time else None,
             file.status.invalid if file.status else 0,
             tuple(self._command(i, c) for i, c in enumerate(file.command, 1)),
+            {m.name: (m.frame_id, m.is_extended_frame) for m in self.messages.values()},
         )
 
     def _spec(self) -> ArraySpec:

@@ -17,14 +17,23 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.files import open_regular
+from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
+from tactile_rt.drivers.can_lines import Occurrences
+from tactile_rt.drivers.codecs.ascii_mapping import parse_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.mending import Import, clock_of, mend_bag, write_chunks
-from tactile_rt.recording.importing.table import Table, import_table, shown_names
+from tactile_rt.recording.importing.proposing import propose_fields
+from tactile_rt.recording.importing.table import (
+    BESIDE,
+    Table,
+    import_table,
+    mapping_of,
+    shown_names,
+)
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
@@ -33,6 +42,8 @@ from tactile_rt.recording.ros2_form import ARRAY
 
 __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
 
+SIZES: Final = 64  # of messages of one topic that are looked at, the largest
+LOOKED_AT: Final = 1 << 28  # bytes of a topic, before it is known which one is wanted
 SQLITE: Final = b"SQLite format 3\0"
 ROS1: Final = b"#ROSBAG V2.0\n"
 MOST: Final = 4096  # fields of a message that are columns
@@ -62,12 +73,15 @@ class BagTopic:
     Attributes:
         columns: What each is a sample of, in the words of ``--columns``; empty where only a user
             can tell.
+        proposed: Columns for a user to check where only a user can tell; empty if no message
+            holds a number.
     """
 
     name: str
     type: str
     messages: int
     columns: str
+    proposed: str = ""
 
 
 @dataclass
@@ -76,24 +90,48 @@ class OpenBag:
 
     reader: Any
     notes: list[str] = field(default_factory=list)
+    back: int = 0  # times that go back
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         """Read (time in ns, bytes, message) of a topic; a damaged message is None."""
+        for connection, t_ns, raw in self._read_stored(topic):
+            yield t_ns, bytes(raw), self._decode(connection, raw)
+
+    def samples(self, topic: str, most: float = np.inf) -> list[Any]:
+        """Read one message of each size, the largest first; see `SIZES`.
+
+        Args:
+            most: number of bytes of the topic to look at.
+        """
+        sizes: dict[int, tuple[Any, bytes]] = {}
+        for connection, _, raw in self._read_stored(topic):
+            most -= len(raw)
+            sizes.setdefault(len(raw), (connection, bytes(raw)))
+            if len(sizes) > SIZES:
+                del sizes[min(sizes)]
+            if most <= 0:
+                break
+        found = (self._decode(*sizes[size]) for size in sorted(sizes, reverse=True))
+        return [message for message in found if message is not None]
+
+    def _read_stored(self, topic: str) -> Iterator[tuple[Any, int, bytes]]:
         which = [c for c in self.reader.connections if c.topic == topic]
         stored = self.reader.messages(connections=which)
         while True:
             try:
-                connection, t_ns, raw = next(stored)
+                yield next(stored)
             except StopIteration:
                 return
             except Exception as error:  # so it does where a chunk is damaged
-                self.notes.append(f"it is damaged, and read up to there ({_words(error)})")
+                note = f"it is damaged, and read up to there ({_words(error)})"
+                self.notes += [note] if note not in self.notes else []
                 return
-            try:
-                message = self.reader.deserialize(raw, connection.msgtype)
-            except Exception:  # rosbags raises anything on bytes that are no such message
-                message = None
-            yield t_ns, bytes(raw), message
+
+    def _decode(self, connection: Any, raw: bytes) -> Any:
+        try:
+            return self.reader.deserialize(raw, connection.msgtype)
+        except Exception:  # rosbags raises anything on bytes that are no such message
+            return None
 
 
 @contextmanager
@@ -108,6 +146,8 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         raise lacking("bags need", "import", error) from None
+    for file in path.iterdir() if path.is_dir() else ():
+        check_no_pointer(file)
     with ExitStack() as stack:
         notes: list[str] = []
         store = get_typestore(Stores.LATEST)
@@ -151,10 +191,8 @@ def bag_topics(path: Path) -> list[BagTopic]:
         for name, about in sorted(bag.reader.topics.items()):
             if not about.msgcount:
                 continue
-            kind, columns = about.msgtype or "", ""
-            for message in islice(_whole(bag, name), 1):
-                columns = _columns_of(kind, message)
-            found.append(BagTopic(name, kind, about.msgcount, columns))
+            kind = about.msgtype or ""
+            found.append(_describe(bag, name, kind, about.msgcount, LOOKED_AT)[0])
     return found
 
 
@@ -184,16 +222,33 @@ def import_bag(
     with open_bag(path) as bag:
         if chosen.type == messages.SAMPLES and not columns:
             return _own(path, bag, chosen, output)
-        paths = _paths(bag, chosen)
-        if not paths:
+        chosen, paths, channels = _describe(bag, chosen.name, chosen.type, chosen.messages)
+        if all(path.startswith(BESIDE) for path in paths) and not columns:
             raise RecordingError(f"{path}: no message of {chosen.name} is whole and holds a number")
         words = columns or chosen.columns
         if not words:
             raise ConfigError(
                 f"{path}: {chosen.name} has {chosen.type}: say with --columns what is what, e.g. "
-                f"{paths[-1] if paths else 'data'}=S.value; its fields are {shown_names(paths)}"
+                f"{paths[-1]}=S.value; its fields are {shown_names(paths)}"
             )
-        return import_table(_table(path, bag, chosen, paths), output, words, rate_hz)
+        columns_read = parse_columns(mapping_of(words, path.stem).columns, "--columns")
+        wanted = {c.label.strip().lower() for c in columns_read if c.label}
+        steps = [_split_path(p) if p.lower() in wanted or not wanted else None for p in paths]
+        table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
+        table.rows = _rows(table, bag, chosen.name, steps, channels)
+        made = import_table(table, output, words, rate_hz)
+        made.report.out_of_order = bag.back
+        return _count_messages(made, chosen)
+
+
+def _count_messages(made: Import, topic: BagTopic) -> Import:
+    """Count the messages that the bag's index tells, also those that were not read."""
+    report, unread = made.report, topic.messages - made.intact - made.corrupt
+    report.unit, report.total = "messages", max(topic.messages, made.intact + made.corrupt)
+    report.passed_over = report.total - report.read
+    if unread > 0:
+        made.notes.append(f"{unread} of {topic.messages} messages were not read")
+    return made
 
 
 def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> BagTopic:
@@ -232,10 +287,7 @@ def _columns_of(kind: str, message: Any) -> str:
         return KNOWN[kind].format(_frame_of(message))
     if not NUMBERS.fullmatch(kind) or not len(message.data):
         return ""
-    sizes = [d.size for d in message.layout.dim] or [len(message.data)]
-    if int(np.prod(sizes)) != len(message.data):
-        sizes = [len(message.data)]
-    channels = sizes[-1] if len(sizes) > 1 else 1
+    channels = _channels_of(message)
     names = ["value"] if channels == 1 else [f"c{k}" for k in range(channels)]
     n = len(message.data) // channels
     return compress_columns(
@@ -243,10 +295,38 @@ def _columns_of(kind: str, message: Any) -> str:
     )
 
 
-def _paths(bag: OpenBag, topic: BagTopic) -> list[str]:
-    """The paths of the numbers in a message, by the first one."""
-    return [leaf for message in islice(_whole(bag, topic.name), 1)
-            for leaf in islice(_leaves(message, ""), MOST)]  # fmt: skip
+def _channels_of(message: Any) -> int:
+    """Return the number of channels of an array by its layout; 0 if empty."""
+    sizes, n = [d.size for d in message.layout.dim], len(message.data)
+    fits = len(sizes) > 1 and int(np.prod(sizes)) == n
+    return min(n, sizes[-1] if fits else 1)
+
+
+def _describe(
+    bag: OpenBag, name: str, kind: str, n: int, most: float = np.inf
+) -> tuple[BagTopic, list[str], int]:
+    """Describe a topic, with the paths of its numbers and the channels of arrays."""
+    if kind in KNOWN:  # of one size
+        found = list(islice(_whole(bag, name), 1))
+    else:
+        found = [] if kind == messages.SAMPLES else bag.samples(name, most)
+    names: dict[str | int, int] = {}  # in the order of the message's fields
+    paths = {
+        leaf: [s if isinstance(s, int) else names.setdefault(s, len(names)) for s in steps]
+        for one in found
+        for leaf in islice(_leaves(one, ""), MOST)
+        for steps in [_split_path(leaf)]
+    }
+    listed = sorted(paths, key=paths.__getitem__)
+    columns = _columns_of(kind, found[0]) if found else ""
+    few = not columns and len(listed) < MOST  # no picture
+    proposed = "" if not few else propose_fields([p for p in listed if not p.startswith(BESIDE)])
+    channels = _channels_of(found[0]) if found and NUMBERS.fullmatch(kind) else 0
+    return BagTopic(name, kind, n, columns, proposed), listed, channels
+
+
+def _split_path(path: str) -> list[int | str]:
+    return [int(s) if s.isdecimal() else s for s in path.split(".")]
 
 
 def _whole(bag: OpenBag, topic: str) -> Iterator[Any]:
@@ -265,32 +345,51 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
         yield at
 
 
-def _table(path: Path, bag: OpenBag, topic: BagTopic, paths: list[str]) -> Table:
-    steps = [[int(s) if s.isdecimal() else s for s in p.split(".")] for p in paths]
-    table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
+def _rows(
+    table: Table, bag: OpenBag, topic: str, steps: list[list[int | str] | None], channels: int
+) -> Iterator[Sequence[Any]]:
+    """Read the rows of a topic; note messages that lack numbers or have other channels."""
+    times = table.times_ns
+    assert times is not None
+    fewer, other = Occurrences("message"), Occurrences("message")
+    bag.back = 0
+    for number, (t_ns, _, message) in enumerate(bag.messages(topic), 1):
+        before = times[-1:]
+        times[:] = [_stamp(message) or t_ns]
+        bag.back += before > times
+        if message is None:
+            yield ()
+            continue
+        if channels > 1 and _channels_of(message) not in (0, 1, channels):
+            other.add(number)
+            yield ()
+            continue
+        row, missing = _row(message, steps)
+        if missing:
+            fewer.add(number)
+        yield row
+    if other.n:
+        bag.notes.append(f"messages of another number of channels, left out: {other}")
+    if fewer.n:
+        bag.notes.append(f"messages that lack some of the numbers, which are invalid: {fewer}")
 
-    def rows() -> Iterator[Sequence[Any]]:
-        times = table.times_ns
-        assert times is not None
-        for t_ns, _, message in bag.messages(topic.name):
-            times[:] = [_stamp(message) or t_ns]
-            yield () if message is None else _row(message, steps)
 
-    table.rows = rows()
-    return table
+def _row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], int]:
+    """Take the numbers of a message, NaN for one that it lacks, and count those.
 
-
-def _row(message: Any, steps: list[list[int | str]]) -> list[Any]:
-    row = []
+    Args:
+        steps: path of each number; None for one that is not wanted.
+    """
+    row, missing = [], 0
     for path in steps:
-        value = message
+        value: Any = np.nan if path is None else message
         try:
-            for step in path:
+            for step in path or ():
                 value = value[step] if isinstance(step, int) else getattr(value, step)
         except IndexError:
-            value = np.nan  # a list that is shorter than the first one
+            value, missing = np.nan, missing + 1  # a list that is shorter than others
         row.append(value)
-    return row
+    return row, missing
 
 
 def _stamp(message: Any) -> int:
@@ -336,7 +435,7 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
         spec, zero, f"{path.name}:{topic.name}",
         session={"imported": path.name, "topic": topic.name},
     )  # fmt: skip
-    return write_chunks(output, about, whole, account, str(path))
+    return _count_messages(write_chunks(output, about, whole, account, str(path)), topic)
 
 
 def _array_in(bag: OpenBag, samples: str) -> ArraySpec | None:

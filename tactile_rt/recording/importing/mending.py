@@ -15,6 +15,7 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.files import open_regular, write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.recording.description import SUMMARY, Description
+from tactile_rt.recording.importing.report import ImportReport, Measurer
 from tactile_rt.recording.layout import SAMPLES, encode_samples
 from tactile_rt.recording.records import MAGIC
 from tactile_rt.recording.writer import McapFile
@@ -112,6 +113,7 @@ class Import:
     seconds: float = 0.0
     rate_hz: float = 0.0
     notes: list[str] = field(default_factory=list)
+    report: ImportReport = field(default_factory=ImportReport)
 
     def line(self) -> str:
         """It in one line."""
@@ -141,6 +143,15 @@ def write_chunks(
     if not chunk.valid.any():
         raise RecordingError(f"{what}: no number of a measurement in {len(chunk)} lines")
     n, rate = len(chunk), about.spec.rate_hz
+    span_s = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
+    report = account.report
+    report.total, report.read, report.passed_over = (
+        account.intact + account.corrupt, account.intact, account.corrupt,
+    )  # fmt: skip
+    report.found_hz = int(chunk.seq[-1] - chunk.seq[0]) / span_s if span_s else None
+    measurer = Measurer(report, about.spec, about.utc_offset_ns)
+    measurer.add(chunk)
+    measurer.finish()
     size = max(1, round(CHUNK_S * rate), n // FEWEST)
 
     def fill(file: BinaryIO) -> None:
@@ -155,5 +166,4 @@ def write_chunks(
         made.finish()
 
     write_whole(output, fill)
-    seconds = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
-    return replace(account, samples=n, seconds=seconds, rate_hz=rate)
+    return replace(account, samples=n, seconds=span_s, rate_hz=rate)

@@ -16,7 +16,13 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 from tactile_rt.recording.importing.table import read_samples
 
-__all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_columns"]
+__all__ = [
+    "ProposedColumns",
+    "line_columns",
+    "propose_columns",
+    "propose_fields",
+    "propose_line_columns",
+]
 
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
@@ -135,3 +141,26 @@ def _try_import(path: Path, form: CsvForm, proposed: ProposedColumns) -> Propose
     if len(read.values) > read.corrupt and np.isfinite(read.values).any():
         return proposed
     return replace(proposed, columns="", said=f"{path}: most lines are no rows: {read.complaint}")
+
+
+def propose_fields(paths: Sequence[str]) -> str:
+    """Propose columns for the largest array of a message, or for its fields.
+
+    Args:
+        paths: Path of each number, as ``sensors.0.values.3``.
+    """
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for path in paths:
+        steps = path.split(".")
+        array = [s for s in steps if not s.isdecimal()] if any(map(str.isdecimal, steps)) else []
+        groups.setdefault(tuple(array), []).append(path)
+    words = []
+    for path in max(groups.values(), key=len, default=[]):
+        places = [s for s in path.split(".") if s.isdecimal()]
+        if not places:
+            words.append(f"{path}=S.{path.replace('.', '_')}")
+        elif len(places) == 1:
+            words.append(f"{path}=T{places[0]}.value")
+        else:
+            words.append(f"{path}=T{'_'.join(places[:-1])}.c{places[-1]}")
+    return compress_columns(words)

@@ -17,12 +17,14 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk, SourceStats
+from tactile_rt.drivers.can_lines import Occurrences
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
 from tactile_rt.drivers.logs import LineLog
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.description import SUMMARY, Description
 from tactile_rt.recording.importing.mending import Import, clock_of
+from tactile_rt.recording.importing.report import Measurer
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
 
@@ -47,6 +49,7 @@ def import_wire(
         ConfigError: no such codec or option, or a device that describes itself did not.
     """
     codec, about = _prepared(log, fields, rate_hz)
+    log.names = getattr(codec, "names", {})
     if log.form == "raw":
         log.piece = _bytes_of_a_sample(log, make_codec(log.wire, about.codec, _own(fields)))
     account, stats = Import(), SourceStats()
@@ -55,6 +58,7 @@ def import_wire(
         decoded = _Decoded(log, codec, about, stats)
         made = McapFile(file, decoded.about)
         made.add(WIRE, encode_packet(None, about.wire), 0)
+        measurer = Measurer(account.report, decoded.about.spec, decoded.about.utc_offset_ns)
         first = last = packets = 0
         for packet, t_ns, chunk in decoded:
             made.add(WIRE, encode_packet(packet, about.wire), t_ns)
@@ -66,6 +70,7 @@ def import_wire(
             first = first if account.samples else int(chunk.t_ns[0])
             last = int(chunk.t_ns[-1])
             account.samples += len(chunk)
+            measurer.add(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
         if log.wire == "serial" and decoded.unfinished:
@@ -74,6 +79,8 @@ def import_wire(
             account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
+        measurer.finish()
+        _count(log, codec, decoded, account)
         account.seconds = (last - first) / NS_PER_S
         account.rate_hz = decoded.about.spec.rate_hz
 
@@ -88,13 +95,28 @@ def import_wire(
     if account.samples >= FEW and not getattr(codec, "claims_rate", True):
         if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
             return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
+    account.report.said_hz = account.rate_hz
+    if account.report.found_hz is not None:
+        account.report.found_hz = came_hz
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
         account.notes.append(
             f"they came at {came_hz:.4g} Hz, not at {account.rate_hz:g} Hz as is claimed: --rate "
             "says what the device was set to"
         )
-        account.rate_hz = came_hz
     return account
+
+
+def _count(log: LineLog, codec: Codec[Any], decoded: "_Decoded", account: Import) -> None:
+    """Count what the file held, and how much of it was read."""
+    report, raw = account.report, log.form == "raw"
+    report.unit = {"raw": "bytes", "blf": "objects", "db": "frames"}.get(log.form, "lines")
+    report.total = log.total
+    report.read = log.total - decoded.skipped - decoded.unfinished if raw else log.frames
+    report.passed_over = report.total - report.read
+    report.out_of_order = log.back.n
+    report.found_hz = 1.0 if decoded.timed else None
+    if decoded.corrupt.n:
+        account.notes.append(f"corrupt frames: {decoded.corrupt}")
 
 
 def _prepared(
@@ -146,6 +168,10 @@ class _Decoded:
         self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
     ) -> None:
         self._codec, self._now, self._rest = codec, 0, 0
+        self.skipped = self._at = 0  # bytes: beside the frames up to the newest sample; of packets
+        self.corrupt = Occurrences(
+            "frame" if log.wire == "can" else "byte" if log.form == "raw" else "packet"
+        )
         self._count: int | None = None  # of the newest sample
         codec.commands(Command.START)  # some note what they have asked for
         packets = log.packets()
@@ -153,7 +179,7 @@ class _Decoded:
             packets = _lead(packets, getattr(codec, "line_end", b""))
         waiting: list[tuple[Any, int | None, Samples | None]] = []
         for packet, t_ns in packets:
-            waiting.append((packet, t_ns, codec.feed(packet, t_ns or 0)))
+            waiting.append((packet, t_ns, self._take(packet, t_ns)))
             if codec.spec is not None or len(waiting) > AHEAD:
                 break
         if codec.spec is None:
@@ -165,11 +191,12 @@ class _Decoded:
                 )
             raise ConfigError(f"{log.path}: {why}")
         self._packets = chain(waiting, self._fed(packets))
-        self._stamped = bool(waiting) and waiting[0][1] is not None
+        self.timed = self._stamped = bool(waiting) and waiting[0][1] is not None
         self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
         self._stamper = Stamper(codec, codec.spec, stats)
         own_clock = not self._stamped and codec.tick_ns is not None
         if own_clock and codec.tick_ns is not None:
+            self.timed = True
             self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         self._period_ns = NS_PER_S / codec.spec.rate_hz
         self._passed = 0.0  # periods, where the log has no times
@@ -193,16 +220,28 @@ class _Decoded:
             if following is None and isinstance(packet, bytes):
                 yield packet, t_ns, self._fed_slowly(packet, t_ns or 0)
             else:
-                samples = self._codec.feed(packet, t_ns or 0)
+                samples = self._take(packet, t_ns)
                 self._rest = 0 if samples is not None else self._rest + len(packet)
                 yield packet, t_ns, samples
             packet, t_ns = following, later
+
+    def _take(self, packet: Any, t_ns: int | None) -> Samples | None:
+        """Feed a packet, and note what it damages."""
+        stats = self._codec.stats
+        before = stats.corrupt
+        samples = self._codec.feed(packet, t_ns or 0)
+        for _ in range(stats.corrupt - before):
+            self.corrupt.add(self._at + 1)
+        self._at += len(packet) if isinstance(packet, bytes) else 1
+        if samples is not None:
+            self.skipped = stats.skipped
+        return samples
 
     def _fed_slowly(self, packet: bytes, t_ns: int) -> Samples | None:
         """The last bytes of a log one by one, to see where the last sample ends."""
         found = []
         for k in range(len(packet)):
-            samples = self._codec.feed(packet[k : k + 1], t_ns)
+            samples = self._take(packet[k : k + 1], t_ns)
             self._rest += 1
             if samples is not None:
                 found.append(samples)

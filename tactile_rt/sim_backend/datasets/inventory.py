@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.core.errors import RecordingError, name_some
-from tactile_rt.core.files import write_whole
+from tactile_rt.core.files import check_no_pointer, write_whole
 from tactile_rt.sets.manifest import (
     MANIFEST,
     SKIPPED,
@@ -54,6 +54,7 @@ def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
     misses = unstable = 0
     for name in there:
         path = object_path(folder, name)
+        check_no_pointer(path)
         try:
             with path.open("rb") as file, np.load(file) as arrays:
                 known = set(arrays.files)
