@@ -103,6 +103,7 @@ def import_wire(
             f"they came at {came_hz:.4g} Hz, not at {account.rate_hz:g} Hz as is claimed: --rate "
             "says what the device was set to"
         )
+        account.rate_hz = came_hz
     return account
 
 
