@@ -171,14 +171,12 @@ def usable_units(
         notes: Receives what is left out, and why.
     """
     far = max(FAR_S, end - begin)
-    faults: dict[str, list[int]] = {}
-    oddities = ("far outside the trials: left out", "stored twice: counted once", "before 0 s")
-    odd: dict[str, list[int]] = {what: [] for what in oddities}
-    kept, seen = [], dict[bytes, int]()
+    kept, seen, faults = [], dict[bytes, int](), dict[str, list[int]]()
+    strange, doubled = list[int](), list[int]()
     for k, given in enumerate(units):
         times = np.sort(given)
         away = (times < begin - far) | (times > end + far)
-        twice = np.diff(times, prepend=-np.inf) == 0
+        odd, again = away | (times < 0), np.diff(times, prepend=-np.inf) == 0
         first = seen.setdefault(times.tobytes(), k)
         fault = ""
         if not times.size:
@@ -191,21 +189,18 @@ def usable_units(
             fault = "their spikes lie outside the trials (another clock, or ms for s?)"
         elif first < k and len(times) > 2:
             fault = f"the spikes of unit {first} again"
+        elif again.mean() > SAME_SHARE:
+            doubled += [k] * int(again.sum())
+            times = times[~again]
         if fault:
             faults.setdefault(fault, []).append(k)
         else:
-            twice &= twice.mean() > SAME_SHARE
-            for rows, spikes in zip(odd.values(), (away, twice, times < 0), strict=True):
-                rows += [k] * int(spikes.sum())
-            times = times[~(away | twice)]
+            strange += [k] * int(odd.sum())
         kept.append(times)
-    notes += [
-        f"{len(rows)} spikes (unit {name_rows(rows)}) {what}" for what, rows in odd.items() if rows
-    ]
-    notes += [
-        f"{len(rows)} of {len(units)} units left out ({name_rows(rows)}): {fault}"
-        for fault, rows in faults.items()
-    ]
+    told = {"counted once, stored twice": doubled, "far from the trials, or before 0 s": strange}
+    notes += [f"{len(r)} spikes {what} (unit {name_rows(r)})" for what, r in told.items() if r]
+    for fault, rows in faults.items():
+        notes.append(f"{len(rows)} of {len(units)} units left out ({name_rows(rows)}): {fault}")
     return kept, ~np.isin(np.arange(len(units)), [k for rows in faults.values() for k in rows])
 
 
