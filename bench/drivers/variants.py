@@ -53,6 +53,8 @@ def call_command(*arguments: str) -> tuple[int, str, str]:
         code = left.code if isinstance(left.code, int) else 0
     finally:
         sys.argv = argv
+    if code > 128:  # a signal, which the command takes for itself
+        raise KeyboardInterrupt
     out.seek(0)
     return code, out.read(), err.getvalue()
 
