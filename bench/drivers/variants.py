@@ -19,6 +19,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,9 +42,13 @@ class Judgement(NamedTuple):
 
 def call_command(*arguments: str) -> tuple[int, str, str]:
     """Call `tactile-rt` in this process; return its exit code, stdout and stderr."""
+    import typer.main
+
     from tactile_rt.cli import main, progress
 
     progress.LINE_S = threading.TIMEOUT_MAX
+    if not hasattr(typer.main.get_command, "cache_info"):  # made once, not for each of hundreds
+        typer.main.get_command = cache(typer.main.get_command)
     out, err, argv, code = io.TextIOWrapper(io.BytesIO()), io.StringIO(), sys.argv, 0
     sys.argv = ["tactile-rt", *arguments]
     try:
