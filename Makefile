@@ -59,6 +59,7 @@ bench: $(VENV)/.dev
 
 fuzz: $(VENV)/.dev
 	$(BIN)/python -m bench.drivers.fuzzing
+	$(BIN)/python -m bench.drivers.variants
 
 captures: $(VENV)/.dev
 	$(BIN)/python -m bench.drivers.captures

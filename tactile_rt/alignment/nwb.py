@@ -30,6 +30,8 @@ from tactile_rt.alignment.nwb_parts import (
     contact_times,
     flags,
     inhibitory_units,
+    mark_overlaps,
+    name_rows,
     numbers,
     spike_times,
     starting_time,
@@ -37,6 +39,7 @@ from tactile_rt.alignment.nwb_parts import (
     text,
     trial_columns,
     unit_column,
+    usable_units,
 )
 from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
@@ -56,7 +59,7 @@ BIN_S = 0.045
 COURSE_BINS = 22  # as many as the steps of a model that is compared
 WINDOWS = ("contact", "start")  # where a trial's window begins; it ends with the choice
 LONGEST_TRIAL_S, LONGEST_SESSION_S = 600.0, 1e6
-NAMED = 5  # trials that a note names
+SILENT_S = 60.0  # without a spike of any unit: not recorded
 
 
 class Reading(NamedTuple):
@@ -190,8 +193,8 @@ def _session(
         nonlocal kept
         rows = np.flatnonzero(bad & kept)
         if rows.size:
-            few = ", ".join(map(str, rows[:NAMED])) + (", ..." if rows.size > NAMED else "")
-            notes.append(f"{rows.size} of {kept.sum()} correct trials left out ({few}): {why}")
+            few, whole = name_rows(rows.tolist()), kept.sum()
+            notes.append(f"{rows.size} of {whole} correct trials left out ({few}): {why}")
         kept = kept & ~bad
 
     drop(ignored == -1, "ignore_trial is neither true nor false")
@@ -200,6 +203,9 @@ def _session(
         lasts = stop - start
         good = (lasts > 0) & (lasts < LONGEST_TRIAL_S) & (np.abs(start) < LONGEST_SESSION_S)
     drop(~good, f"choice_time is not after start_time, by {LONGEST_TRIAL_S:g} s at most")
+    twice = np.zeros_like(kept)
+    twice[kept] = mark_overlaps(start[kept], stop[kept])
+    drop(twice, "start_time goes back, or trials overlap")
     units = spike_times(file, notes)
     origin = starting_time(file)
     if clock == "recording" and origin is None:
@@ -208,26 +214,35 @@ def _session(
             "analysis counts spike times from"
         )
     shift = origin or 0.0 if clock == "recording" else 0.0
-    response = None
+    contacts = None
     try:
         contacts = contact_times(file, notes)
     except ConfigError:
         if window == "contact":
             raise
-    else:
-        response = contact_response(name, units, contacts, shift, origin or 0.0)
-        if window == "contact":
-            start = _first_contacts(contacts, start, stop)
-            drop(~np.isfinite(start), "no contact before the choice")
+    if contacts is not None and window == "contact":
+        start = _first_contacts(contacts, start, stop)
+        drop(~np.isfinite(start), "no contact before the choice")
+    _check_left(kept, notes)
+    units, usable = usable_units(units, trials["start_time"][kept].min(), stop[kept].max(), notes)
+    heard = [times for times, good in zip(units, usable, strict=True) if good]
+    if not heard:
+        raise ConfigError(name_some(["no unit can be used", *notes[::-1]], 2, "; "))
+    near = [start - SILENT_S, stop + SILENT_S]
+    before = np.searchsorted(np.sort(np.concatenate(heard)), near)
+    drop(before[0] == before[1], f"no unit has a spike within {SILENT_S:g} s")
+    _check_left(kept, notes)
     rows = np.flatnonzero(kept)
-    if not rows.size:
-        left = f"no trial is left in {TRIALS}: correct, not ignored, convex or concave"
-        raise ConfigError(name_some([left, *notes], 2, "; "))
+    response = None
+    if contacts is not None:
+        response = contact_response(name, heard, contacts, shift, origin or 0.0)
     depth = unit_column(file, "depth", len(units), notes)
     inhibitory = inhibitory_units(file, len(units), notes)
-    chosen = selection.units(depth, inhibitory, len(units))
+    chosen = selection.units(depth, inhibitory, len(units)) & usable
     spikes = [times - shift for times, wanted in zip(units, chosen, strict=True) if wanted]
     rates, course = _rates(spikes, start[rows], stop[rows], progress)
+    if rates.size and not rates.any():
+        raise ConfigError(f"none of {len(spikes)} units has a spike in one of {len(rows)} trials")
     session = NeuralSession(
         animal=animal_name(file, name),
         name=name,
@@ -239,6 +254,12 @@ def _session(
         begin=numbers(trials["start_time"], "start_time")[rows],
     )
     return Reading(session, [f"session {name}: {note}" for note in notes], task, response)
+
+
+def _check_left(kept: NDArray[np.bool_], notes: list[str]) -> None:
+    if not kept.any():
+        left = f"no trial is left in {TRIALS}: correct, not ignored, convex or concave"
+        raise ConfigError(name_some([left, *notes], 2, "; "))
 
 
 def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:

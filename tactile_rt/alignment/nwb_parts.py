@@ -4,6 +4,7 @@ What spoils a session raises a `ConfigError` that names the place in the file; t
 who reads it. What spoils a trial, a contact or a spike alone is left out, and a note says so.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,8 @@ __all__ = [
     "flags",
     "inhibitory_units",
     "last_time",
+    "mark_overlaps",
+    "name_rows",
     "numbers",
     "spike_times",
     "starting_time",
@@ -38,6 +41,7 @@ __all__ = [
     "text",
     "trial_columns",
     "unit_column",
+    "usable_units",
 ]
 
 Floats = NDArray[np.float64]
@@ -50,6 +54,10 @@ WHISKER = "processed_position_whisker_"
 SUBJECT = "general/subject/subject_id"
 EXPERIMENT = "general/experiment_description"  # says which task it was
 LARGEST = 1 << 30  # bytes of a column; the longest ones, of spike times, have some millions
+NAMED = 5  # trials or units that a note names
+BACK_S = 0.01  # of spike times that sorters leave out of order; further back is another clock
+FAR_S = 3600.0  # before and after the trials, or as long as they last together
+FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; fewer are single mistakes, or chance
 
 
 def stored(file: Any, name: str) -> NDArray[Any]:
@@ -130,7 +138,7 @@ def last_time(clock: Any) -> float | None:
 
 
 def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
-    """Spike times of every unit as stored, s, sorted; what was left out is said in `notes`."""
+    """Read the finite spike times of every unit, s, in the order stored; `notes` name others."""
     for name in ("units/spike_times", "units/spike_times_index"):
         if name not in file:
             raise ConfigError(f"has no {name}: is this a session with spikes?")
@@ -144,8 +152,81 @@ def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
         )
     finite = np.isfinite(times)
     if not finite.all():
-        notes.append(f"{(~finite).sum()} of {len(times)} spikes left out: their times are no times")
-    return [np.sort(times[a:b][finite[a:b]]) for a, b in pairwise(edges)]
+        spoilt = [k for k, (a, b) in enumerate(pairwise(edges)) if not finite[a:b].all()]
+        notes.append(
+            f"{(~finite).sum()} of {len(times)} spikes left out: their times are no times "
+            f"(unit {name_rows(spoilt)})"
+        )
+    return [times[a:b][finite[a:b]] for a, b in pairwise(edges)]
+
+
+def usable_units(
+    units: list[Floats], begin: float, end: float, notes: list[str]
+) -> tuple[list[Floats], NDArray[np.bool_]]:
+    """Sort the spike times of units, and mark units that can be averaged.
+
+    Args:
+        units: Times in s, in the order stored.
+        begin, end: When the first trial begins and the last one ends, in s.
+        notes: Receives what is left out, and why.
+    """
+    far = max(FAR_S, end - begin)
+    kept, seen, faults = [], dict[bytes, int](), dict[str, list[int]]()
+    strange, doubled = list[int](), list[int]()
+    for k, given in enumerate(units):
+        times = np.sort(given)
+        away = (times < begin - far) | (times > end + far)
+        odd, again = away | (times < 0), np.diff(times, prepend=-np.inf) == 0
+        first = seen.setdefault(times.tobytes(), k)
+        fault = ""
+        if not times.size:
+            fault = "no spikes"
+        elif (np.maximum.accumulate(given) - given).max() > BACK_S:
+            fault = "their spike times go back, as of a clock that began anew"
+        elif times[-1] < begin:
+            fault = f"their spikes end before the first trial begins, at {begin:.3f} s"
+        elif times[0] > end or away.mean() > FAR_SHARE:
+            fault = "their spikes lie outside the trials (another clock, or ms for s?)"
+        elif first < k and len(times) > 2:
+            fault = f"the spikes of unit {first} again"
+        elif again.mean() > SAME_SHARE:
+            doubled += [k] * int(again.sum())
+            times = times[~again]
+        if fault:
+            faults.setdefault(fault, []).append(k)
+        else:
+            strange += [k] * int(odd.sum())
+        kept.append(times)
+    told = {"counted once, stored twice": doubled, "far from the trials, or before 0 s": strange}
+    notes += [f"{len(r)} spikes {what} (unit {name_rows(r)})" for what, r in told.items() if r]
+    for fault, rows in faults.items():
+        notes.append(f"{len(rows)} of {len(units)} units left out ({name_rows(rows)}): {fault}")
+    return kept, ~np.isin(np.arange(len(units)), [k for rows in faults.values() for k in rows])
+
+
+def mark_overlaps(start: Floats, stop: Floats) -> NDArray[np.bool_]:
+    """Mark trials of another clock, stored twice, or running into the next one."""
+    bad = np.zeros(len(start), dtype=np.bool_)
+    for again in range(2):
+        order = np.lexsort((stop, start, bad))[: int((~bad).sum())]
+        one, two = order[:-1], order[1:]
+        same = start[one] == start[two]
+        bad[two[same & ((stop[one] == stop[two]) | bool(again))]] = True
+        runs = stop[one] > start[two]
+        if again:
+            bad[one[runs]] = True
+        elif runs[~bad[two]].any():
+            back = np.maximum.accumulate(start) > start
+            if back.sum() > NAMED:  # not single mistakes
+                back[int(np.argmax(back)) :] = True
+            bad |= back
+    return bad
+
+
+def name_rows(rows: Sequence[int]) -> str:
+    """Name some rows of a table in a note, each once."""
+    rows = sorted(set(rows))
+    return ", ".join(map(str, rows[:NAMED])) + (", ..." if len(rows) > NAMED else "")
 
 
 def unit_column(file: "h5py.File", name: str, units: int, notes: list[str]) -> Floats | None:
