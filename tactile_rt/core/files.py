@@ -8,22 +8,55 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
-__all__ = ["open_regular", "replaced", "sync_folder", "whole_folder", "write_whole"]
+from tactile_rt.core.errors import ConfigError
+
+__all__ = [
+    "POINTER",
+    "check_no_pointer",
+    "is_pointer",
+    "open_regular",
+    "replaced",
+    "sync_folder",
+    "whole_folder",
+    "write_whole",
+]
+
+
+POINTER: Final = "is a Git LFS pointer, not the file itself: `git lfs pull`"
+_LFS: Final = b"version https://git-lfs.github.com/spec/"
+
+
+def is_pointer(begins: bytes) -> bool:
+    """Return whether a file that begins so only names the content that Git LFS stores elsewhere."""
+    return begins.startswith(_LFS)
+
+
+def check_no_pointer(path: Path) -> None:
+    """Refuse a Git LFS pointer; what cannot be read is left to the reader.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    with suppress(OSError):
+        open_regular(path).close()
 
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a file to read. A pipe, socket or device is refused, and never waited for.
 
     Raises:
+        ConfigError: it is a Git LFS pointer.
         OSError: it is no file, or cannot be read.
     """
     _check_regular(path, os.stat(path))  # opening a device may do something to it
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
         _check_regular(path, os.fstat(file.fileno()))  # nor what has come in its place since
-    except OSError:
+        if is_pointer(os.pread(file.fileno(), len(_LFS), 0)):
+            raise ConfigError(f"{path} {POINTER}")
+    except (OSError, ConfigError):
         file.close()
         raise
     return file
