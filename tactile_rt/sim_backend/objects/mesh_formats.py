@@ -39,7 +39,7 @@ class Found:
         meshes: Whole, or empty where the library is to read them.
         told: How many triangles the library must find; negative: not known.
         up: The axis that points up.
-        same: The library's meshes are taken, if they are as many triangles of the same area.
+        same: The library's meshes are taken, if they are as many triangles.
         again: The reader to ask where the library finds another number.
     """
 
@@ -58,8 +58,14 @@ def _plain(content: bytes) -> bytes:
     return text if b"\n" in text else text.replace(b"\r", b"\n")
 
 
-def _mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> trimesh.Trimesh:
-    """Make a mesh of polygons; faces of two corners have no area and are left out."""
+def _mesh(
+    vertices: Array, corners: Array, sizes: Array, base: int = 0, same: bool = False
+) -> Found:
+    """Make a mesh of polygons; faces of two corners have no area and are left out.
+
+    Args:
+        same: the library's is to be taken, unless it must have cut a polygon wrongly.
+    """
     outside = corners[(corners < 0) | (corners >= len(vertices))]
     if len(outside):
         raise ValueError(
@@ -67,10 +73,11 @@ def _mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> trime
         )
     kept = sizes > 2
     corners, sizes = corners[np.repeat(kept, sizes)].astype(np.int64), sizes[kept]
-    faces = cut_polygons(vertices, corners, sizes)
+    faces, ears = cut_polygons(vertices, corners, sizes)
     if not base:  # in the order of the library
         faces = group_by_corners(faces, sizes)
-    return trimesh.Trimesh(vertices, faces, process=False)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return Found([mesh], same=same and not ears.any())
 
 
 def _numbers(rows: Sequence[bytes], kind: type) -> Array:
@@ -88,7 +95,7 @@ def _read_obj(content: bytes) -> Found:
         if joined.count(b" ") + 1 == 3 * len(faces):
             return Found(told=len(faces), again=_parse_obj)
         with suppress(ValueError):
-            return Found([_make_obj(re.findall(rb"\nv (.*)", content), faces)], same=True)
+            return _make_obj(re.findall(rb"\nv (.*)", content), faces)
     return _parse_obj(content)
 
 
@@ -99,12 +106,12 @@ def _parse_obj(content: bytes) -> Found:
     kinds = np.array([kind == b"v" for kind, _ in row.findall(text)], bool)
     faces = [values for kind, values in row.findall(text) if kind == b"f"]
     places = [values for kind, values in row.findall(text) if kind == b"v"]
-    return Found([_make_obj(places, faces, np.cumsum(kinds)[~kinds])])
+    return _make_obj(places, faces, np.cumsum(kinds)[~kinds])
 
 
 def _make_obj(
     places: list[bytes], faces: list[bytes], before: NDArray[np.int64] | None = None
-) -> trimesh.Trimesh:
+) -> Found:
     """Make a mesh of rows of vertices and faces, with the number of vertices before each face."""
     sizes = np.array([len(face.split()) for face in faces], np.int64)
     if len(sizes) and sizes.min() < 3:
@@ -116,7 +123,7 @@ def _make_obj(
     if before is not None:  # relative numbers count back from there
         back = corners + np.repeat(before, sizes) + 1
         corners = np.where(corners < 0, np.maximum(back, 0), corners)
-    return _mesh(vertices.reshape(-1, 3), corners - 1, sizes, 1)
+    return _mesh(vertices.reshape(-1, 3), corners - 1, sizes, 1, before is None)
 
 
 def _read_off(content: bytes) -> Found:
@@ -137,7 +144,7 @@ def _read_off(content: bytes) -> Found:
     corners = np.array(list(map(int, chain.from_iterable(polygons))), np.int64)
     if len(corners) != sizes.sum():
         raise ValueError("cut short: a face has fewer corners than it tells")
-    return Found([_mesh(vertices, corners, sizes)])
+    return _mesh(vertices, corners, sizes)
 
 
 def _read_ply(content: bytes) -> Found:
@@ -170,8 +177,7 @@ def _read_ply(content: bytes) -> Found:
     sizes, corners = lists[names[0]] if names else (np.zeros(0, int), np.zeros(0, int))
     if "tristrips" in elements:
         raise ValueError("it holds strips of triangles, `tristrips`; save it as faces")
-    mesh = _mesh(vertices, corners, sizes)
-    return Found([mesh], same=bool(TEXTURED & {*points, *lists}))
+    return _mesh(vertices, corners, sizes, same=bool(TEXTURED & {*points, *lists}))
 
 
 def _read_rows(
@@ -282,7 +288,7 @@ def _place(geometry: Any, matrix: Array) -> Iterator[trimesh.Trimesh]:
             )
         if sizes is not None:
             index = index[np.repeat(sizes > 2, sizes)]
-            index = cut_polygons(primitive.vertex, index, sizes[sizes > 2].astype(np.int64))
+            index, _ = cut_polygons(primitive.vertex, index, sizes[sizes > 2].astype(np.int64))
         if index.size and index.min() < 0:
             raise ValueError(f"a face names vertex {index.min()}")
         corners = primitive.vertex[index].reshape(-1, 3)
