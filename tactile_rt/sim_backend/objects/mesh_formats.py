@@ -87,15 +87,15 @@ def _numbers(rows: Sequence[bytes], kind: type) -> Array:
 def _read_obj(content: bytes) -> Found:
     if b"surf" in content and re.search(rb"^\s*surf[ \t]", content, re.MULTILINE):
         raise ValueError("it holds free-form surfaces, `surf`; export it as polygons")
-    content = b"\n" + content if content.startswith(b"v ") else content
-    faces = re.findall(rb"\nf (.*)", content)
+    text = b"\n" + content if content.startswith(b"v ") else content
+    faces = re.findall(rb"\nf (.*)", text)
     joined = b" ".join(faces)
-    odd = b"\\" in content or any(sign in joined for sign in (b"-", b"#", b"\t", b" 0"))
+    odd = b"\\" in text or any(sign in joined for sign in (b"-", b"#", b"\t", b" 0"))
     if faces and not odd:
         if joined.count(b" ") + 1 == 3 * len(faces):
             return Found(told=len(faces), again=_parse_obj)
         with suppress(ValueError):
-            return _make_obj(re.findall(rb"\nv (.*)", content), faces)
+            return _make_obj(re.findall(rb"\nv (.*)", text), faces)
     return _parse_obj(content)
 
 
@@ -249,7 +249,8 @@ def _read_dae(content: bytes) -> Found:
     tag, geometries = file.tag, list(file.xmlnode.getroot().iter(file.tag("geometry")))
     curves = {f"#{g.get('id')}" for g in geometries if g.find(tag("mesh")) is None}
     if file.scene is None or len(geometries) > len(file.geometries) + len(curves):
-        raise ValueError(f"a mesh or its scene: {file.errors[-1] if file.errors else 'no scene'}")
+        why = re.sub(r"{.*?}", "", str(file.errors[0])) if file.errors else "there is none"
+        raise ValueError(f"a mesh or its scene: {why}")
     parts = {tag(k) for k in ("node", "instance_node", "instance_geometry", "instance_controller")}
     meshes: list[trimesh.Trimesh] = []
 
@@ -263,7 +264,7 @@ def _read_dae(content: bytes) -> Found:
             told = [e for e in element if e.tag in parts and e.get("url") not in curves]
             known = (collada.scene.GeometryNode, collada.scene.ControllerNode, collada.scene.Node)
             if len(told) > sum(isinstance(child, known) for child in node.children):
-                raise ValueError(f"a part of its scene: {file.errors[-1]}")
+                raise ValueError(f"a part of its scene: {file.errors[0]}")
             for child in node.children:
                 visit(child, np.dot(matrix, node.matrix))
 
