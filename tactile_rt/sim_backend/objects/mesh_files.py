@@ -380,7 +380,7 @@ def _check_number(path: Path, faces: int) -> None:
         )
 
 
-class _Beside(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
+class _Beside(trimesh.resolvers.FilePathResolver):
     """Files that a .gltf names, as URLs write them."""
 
     def get(self, name: str) -> Any:

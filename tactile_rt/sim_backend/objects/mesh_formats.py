@@ -172,9 +172,9 @@ def _read_ply(content: bytes) -> Found:
     if missing := [axis for axis in "xyz" if axis not in points]:
         raise ValueError(f"its vertices have no {missing[0]}")
     vertices = np.column_stack([found["vertex"][k][1].astype(points[k][0]) for k in "xyz"])
-    lists = {key: rows for key, rows in found.get("face", {}).items() if rows[0] is not None}
+    lists = [key for key, kinds in elements.get("face", (0, {}))[1].items() if len(kinds) > 1]
     names = [key for key in ("vertex_index", "vertex_indices", *lists) if key in lists]
-    sizes, corners = lists[names[0]] if names else (np.zeros(0, int), np.zeros(0, int))
+    sizes, corners = found["face"][names[0]] if names else (np.zeros(0, int), np.zeros(0, int))
     if "tristrips" in elements:
         raise ValueError("it holds strips of triangles, `tristrips`; save it as faces")
     return _mesh(vertices, corners, sizes, same=bool(TEXTURED & {*points, *lists}))
@@ -182,44 +182,37 @@ def _read_ply(content: bytes) -> Found:
 
 def _read_rows(
     element: str, data: bytes, at: int, count: int, kinds: dict[str, list[str]]
-) -> tuple[dict[str, tuple[Array | None, Array]], int]:
+) -> tuple[dict[str, tuple[Array, Array]], int]:
     """Read the rows of an element: of each property the sizes of its lists, and all its values."""
+    none, fields = np.zeros(0, int), list[Any]()
     if not count or not kinds:
-        return {key: (np.zeros(0, int), np.zeros(0)) for key in kinds}, at
-    fields: list[Any] = []
+        return dict.fromkeys(kinds, (none, none)), at
     with suppress(ValueError):  # most have lists of one size
-        for key, (*size, kind) in kinds.items():
-            here = at + np.dtype(fields).itemsize
-            many = [int(np.frombuffer(data, s, 1, here)[0]) for s in size]
-            fields += [*((f"{key} ", s) for s in size), (key, kind, *((n,) for n in many))]
+        for key, kind in kinds.items():
+            if len(kind) > 1:
+                size = np.frombuffer(data, kind[0], 1, at + np.dtype(fields).itemsize)[0]
+                fields += [(f"{key} ", kind[0]), (key, kind[1], (int(size),))]
+            else:
+                fields.append((key, kind[0]))
         rows = np.frombuffer(data, fields, count, at)
-        if all(
-            (rows[key + " "] == rows[key + " "][0]).all() for key in kinds if len(kinds[key]) > 1
-        ):
-            return {
-                key: (rows[key + " "].astype(int) if size else None, rows[key].ravel())
-                for key, (*size, _) in kinds.items()
-            }, at + rows.nbytes
+        sizes = {k: rows[f"{k} "].astype(int) for k, kind in kinds.items() if len(kind) > 1}
+        if all((n == n[0]).all() for n in sizes.values()):
+            return {k: (sizes.get(k, none), rows[k].ravel()) for k in kinds}, at + rows.nbytes
     values: dict[str, list[Array]] = {key: [] for key in kinds}
     for row in range(count):
-        for key, (*size, kind) in kinds.items():
-            try:
+        try:
+            for key, kind in kinds.items():
                 many = 1
-                for s in size:
-                    many, at = int(np.frombuffer(data, s, 1, at)[0]), at + np.dtype(s).itemsize
-                values[key].append(np.frombuffer(data, kind, many, at)[: max(many, 0)])
+                if len(kind) > 1:
+                    many = max(int(np.frombuffer(data, kind[0], 1, at)[0]), 0)
+                    at += np.dtype(kind[0]).itemsize
+                values[key].append(np.frombuffer(data, kind[-1], many, at) if many else none)
                 at += values[key][-1].nbytes
-            except ValueError:
-                raise ValueError(
-                    f"cut short: its header tells {count} rows of {element!r}, {row} are there"
-                ) from None
-    return {
-        key: (
-            np.array([len(v) for v in values[key]]) if size else None,
-            np.concatenate(values[key]),
-        )
-        for key, (*size, _) in kinds.items()
-    }, at
+        except ValueError:
+            raise ValueError(
+                f"cut short: its header tells {count} rows of {element!r}, {row} are there"
+            ) from None
+    return {k: (np.array([len(v) for v in vs]), np.concatenate(vs)) for k, vs in values.items()}, at
 
 
 def _read_stl(content: bytes) -> Found:
