@@ -61,12 +61,16 @@ def _check_archive(name: str, content: bytes) -> int:
                     f"{name}: {len(content)} bytes that unpack to {size >> 20} MiB are no mesh; "
                     "export it again"
                 )
-            models = [archive.read(m) for m in members if m.filename.endswith(".model")]
+            named = {m.filename: archive.read(m) for m in members if m.filename.endswith(".model")}
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OSError):
         return -1  # the mesh library says what is wrong with it
+    models = list(named.values())
     _check_nodes(name, _xml_nodes(name, models, "object", "component", "objectid"))
     if any(b"beamlattice>" in model for model in models):
         raise ConfigError(f"{name}: it holds a beam lattice; export it as a mesh of triangles")
+    parts = [m for n, m in named.items() if "3d/3dmodel.model" not in n.lower()]
+    if any(part.count(b"<mesh>") > 1 for part in parts):  # the library takes all for each
+        raise ConfigError(f"{name}: several parts share a file within it; export it as one mesh")
     return -1
 
 

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -282,3 +283,37 @@ def test_a_pointer_is_called_one(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 9\n")
     refuse(path, "is a Git LFS pointer")
+
+
+@pytest.mark.parametrize(("shared", "lattice"), [(False, False), (True, False), (False, True)])
+def test_parts_of_a_3mf_in_a_file_of_their_own(tmp_path, shared, lattice):
+    vertices = "".join(f'<vertex x="{x}" y="{y}" z="{z}"/>' for x, y, z in BOX)
+    faces = [t for a, b, c, d in QUADS for t in ((a, b, c), (c, d, a))]
+    faces = "".join(f'<triangle v1="{a}" v2="{b}" v3="{c}"/>' for a, b, c in faces)
+    mesh = f"<mesh><vertices>{vertices}</vertices><triangles>{faces}</triangles>"
+    mesh += f"{'<b:beamlattice></b:beamlattice>' * lattice}</mesh>"
+    space = "http://schemas.microsoft.com/3dmanufacturing"
+    head = f'<model xmlns="{space}/core/2015/02" xmlns:p="{space}/production/2015/06" xmlns:b="b">'
+    thing = "".join(f'<object id="{i}" type="model">{mesh}</object>' for i in range(1, 2 + shared))
+    used = '<object id="9"><components><component p:path="/3D/a.model" objectid="1"/></components>'
+    with zipfile.ZipFile(tmp_path / "a.3mf", "w") as file:
+        file.writestr("3D/a.model", f"{head}<resources>{thing}</resources></model>")
+        root = f'<resources>{used}</object></resources><build><item objectid="9"/></build></model>'
+        file.writestr("3D/3dmodel.model", head + root)
+    if shared or lattice:
+        refuse(tmp_path / "a.3mf", "several parts share" if shared else "beam lattice")
+    else:
+        assert read_parts([tmp_path / "a.3mf"]).extents == pytest.approx([1, 2, 3])
+
+
+def test_a_check_goes_on_past_what_cannot_be_read_and_draws_the_others(tmp_path, call):
+    pytest.importorskip("matplotlib")
+    folder = tmp_path / "things" / "kind"
+    folder.mkdir(parents=True)
+    write(folder, ".ply", BOX, [*QUADS, (0, 1, 9)])
+    write(folder, ".off", *prism(YOU)).rename(folder / "you.off")
+    out = tmp_path / "sheet.png"
+    code, _, err = call("objects", "check", tmp_path / "things", "--plot", out)
+    assert code == 1 and "names vertex 9" in err
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert "is a .png" in call("objects", "check", tmp_path / "things", "--plot", "sheet.pdf")[2]
