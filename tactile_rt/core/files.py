@@ -29,7 +29,7 @@ _LFS: Final = b"version https://git-lfs.github.com/spec/"
 
 
 def is_pointer(begins: bytes) -> bool:
-    """Return whether a file that begins so only names the content that Git LFS stores elsewhere."""
+    """Return whether a Git LFS pointer, which names content stored elsewhere, begins so."""
     return begins.startswith(_LFS)
 
 

@@ -284,7 +284,7 @@ def mesh_content(path: Path) -> bytes:
 
 
 def _read_checked(path: Path) -> tuple[bytes, int]:
-    """Read a file, and how many triangles it tells of; refuse one that unpacks to too much."""
+    """Read a file and the number of triangles it tells; refuse archive bombs."""
     check_no_pointer(path)
     content, check = path.read_bytes(), FORMATS[path.suffix.lower()]
     return content, check(str(path), content) if check else -1
@@ -331,7 +331,7 @@ def _part(path: Path, up: str) -> trimesh.Trimesh:
 
 
 def _read_meshes(path: Path) -> Found:
-    """Read the bodies of a file, every one in its place, and hold their number against it."""
+    """Read the bodies of a file in their places; refuse it if some are missing."""
     content, told = _read_checked(path)
     suffix = path.suffix.lower()
     axis = "y" if suffix in Y_UP else "z"

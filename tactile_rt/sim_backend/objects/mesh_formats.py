@@ -61,7 +61,7 @@ def _plain(content: bytes) -> bytes:
 def _mesh(
     vertices: Array, corners: Array, sizes: Array, base: int = 0, same: bool = False
 ) -> Found:
-    """Make a mesh of polygons; faces of two corners have no area and are left out.
+    """Make a mesh of polygons, without those of two corners.
 
     Args:
         same: the library's is to be taken, unless it must have cut a polygon wrongly.
@@ -112,7 +112,11 @@ def _parse_obj(content: bytes) -> Found:
 def _make_obj(
     places: list[bytes], faces: list[bytes], before: NDArray[np.int64] | None = None
 ) -> Found:
-    """Make a mesh of rows of vertices and faces, with the number of vertices before each face."""
+    """Make a mesh of rows of vertices and of faces.
+
+    Args:
+        before: how many vertices stand before each face, if their numbers may be relative.
+    """
     sizes = np.array([len(face.split()) for face in faces], np.int64)
     if len(sizes) and sizes.min() < 3:
         raise ValueError(f"face {sizes.argmin() + 1} has {sizes.min()} corners; is it cut short?")
@@ -183,7 +187,7 @@ def _read_ply(content: bytes) -> Found:
 def _read_rows(
     element: str, data: bytes, at: int, count: int, kinds: dict[str, list[str]]
 ) -> tuple[dict[str, tuple[Array, Array]], int]:
-    """Read the rows of an element: of each property the sizes of its lists, and all its values."""
+    """Read an element: sizes of lists and all values of each property."""
     none, fields = np.zeros(0, int), list[Any]()
     if not count or not kinds:
         return dict.fromkeys(kinds, (none, none)), at

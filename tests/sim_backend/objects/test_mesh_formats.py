@@ -306,14 +306,14 @@ def test_parts_of_a_3mf_in_a_file_of_their_own(tmp_path, shared, lattice):
         assert read_parts([tmp_path / "a.3mf"]).extents == pytest.approx([1, 2, 3])
 
 
-def test_a_check_goes_on_past_what_cannot_be_read_and_draws_the_others(tmp_path, call):
-    pytest.importorskip("matplotlib")
+@pytest.mark.parametrize("plot", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_check_goes_on_past_what_cannot_be_read_and_draws_the_others(tmp_path, call, plot):
     folder = tmp_path / "things" / "kind"
     folder.mkdir(parents=True)
     write(folder, ".ply", BOX, [*QUADS, (0, 1, 9)])
-    write(folder, ".off", *prism(YOU)).rename(folder / "you.off")
+    write(folder, ".off", *prism(ARROW)).rename(folder / "arrow.off")
     out = tmp_path / "sheet.png"
-    code, _, err = call("objects", "check", tmp_path / "things", "--plot", out)
+    code, _, err = call("objects", "check", folder.parent, *(["--plot", out] if plot else []))
     assert code == 1 and "names vertex 9" in err
-    assert out.read_bytes().startswith(b"\x89PNG")
-    assert "is a .png" in call("objects", "check", tmp_path / "things", "--plot", "sheet.pdf")[2]
+    assert out.exists() == plot and (not plot or out.read_bytes().startswith(b"\x89PNG"))
+    assert "is a .png" in call("objects", "check", folder.parent, "--plot", "sheet.pdf")[2]
