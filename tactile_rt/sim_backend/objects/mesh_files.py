@@ -8,9 +8,11 @@ these the sizes are looked up before a library builds them.
 
 import base64
 import json
+import logging
 import re
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -62,7 +64,8 @@ def _check_archive(name: str, content: bytes) -> int:
                     "export it again"
                 )
             named = {m.filename: archive.read(m) for m in members if m.filename.endswith(".model")}
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OSError):
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError,
+            ValueError, OSError):  # fmt: skip
         return -1  # the mesh library says what is wrong with it
     models = list(named.values())
     _check_nodes(name, _xml_nodes(name, models, "object", "component", "objectid"))
@@ -252,6 +255,7 @@ FORMATS: Final[dict[str, Callable[[str, bytes], int] | None]] = {
     ".3mf": _check_archive,
 }
 MESH_SUFFIXES = tuple(FORMATS)
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what matters of a file is told here
 
 
 def check_mesh_file(path: Path) -> None:
@@ -348,12 +352,15 @@ def _read_meshes(path: Path) -> Found:
                 found = found.again(content) if found.again else found
         number = sum(len(mesh.faces) for mesh in found.meshes)
         _check_number(path, number)
-        for mesh in found.meshes:
-            if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(
-                mesh.vertices
-            ):
-                outside = mesh.faces.max() if mesh.faces.min() >= 0 else mesh.faces.min()
-                raise ValueError(f"a face names vertex {outside}, of {len(mesh.vertices)}")
+        for vertices, faces in (
+            (np.asarray(m.vertices), m.faces) for m in found.meshes if len(m.faces)
+        ):
+            if vertices.shape[1:] != (3,):
+                raise ValueError("a vertex has fewer than 3 coordinates; is it cut short?")
+            if outside := [i for i in (faces.min(), faces.max()) if not 0 <= i < len(vertices)]:
+                raise ValueError(f"a face names vertex {outside[0]}, of {len(vertices)}")
+            if DRACO in content and not np.ptp(vertices, axis=0).any():
+                raise ValueError("what Draco compressed cannot be unpacked")
     except ConfigError:
         raise
     except Exception as error:  # the parsers raise whatever their format trips over
