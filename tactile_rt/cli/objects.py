@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from tactile_rt.cli.app import add_group, needing
+from tactile_rt.cli.app import add_group, check_output, needing
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_table, told_as_json
@@ -56,6 +56,9 @@ def get(
 @objects.command(epilog="tactile-rt objects check objects")
 def check(
     folder: Annotated[Path, typer.Argument(help="Folder: CATEGORY/OBJECT.stl, or ShapeNetCore.")],
+    plot: Annotated[
+        Path | None, typer.Option(help="Picture (.png) to write of all objects, to see them.")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Load every object of a folder and report which can be used.
@@ -64,6 +67,9 @@ def check(
     """
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}")
+    check_output(plot)
+    if plot and plot.suffix.lower() != ".png":
+        raise ConfigError(f"{plot}: the picture is a .png")
     with needing("sim"):
         from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
         from tactile_rt.sim_backend.objects.object_sets import open_objects
@@ -71,6 +77,13 @@ def check(
     console = Console(stderr=True)
     with progress_bar(console, "loading", total=len(opened.names), counted=True) as update:
         report = opened.check(lambda name: update(advance=1))
+    if plot:
+        with needing("view"):
+            from tactile_rt.sim_backend.views.contact_sheet import write_contact_sheet
+        usable = report.surface_error
+        write_contact_sheet(
+            plot, {n: opened.load(n) if n in usable else None for n in opened.names}
+        )
     found = []
     for kind in dict.fromkeys(opened.categories.values()):
         names = [name for name in opened.names if opened.categories[name] == kind]

@@ -8,10 +8,14 @@ these the sizes are looked up before a library builds them.
 
 import base64
 import json
+import logging
+import re
 import struct
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from io import BytesIO
 from pathlib import Path
@@ -22,6 +26,8 @@ import numpy as np
 import trimesh
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import check_no_pointer
+from tactile_rt.sim_backend.objects.mesh_formats import READERS, Found
 
 __all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
 
@@ -32,15 +38,22 @@ MOST_NODES: Final = 10_000  # of a scene, with every time that one is used
 MOST_OBJECTS: Final = 100_000  # of glTF's JSON
 MOST_POINTS: Final = 6_000_000  # of a mesh that Draco compressed
 
+# Extensions of glTF that may be required: they do not change where a triangle is, or are read.
+HARMLESS: Final = re.compile(
+    "[A-Z]+_(draco_mesh_compression|mesh_quantization|materials|texture|lights|xmp|animation)"
+)
 GLB_JSON: Final = struct.Struct("<4sIIII")  # head of the file and of its first chunk
 DRACO: Final = b"DRACO"
-Y_UP = (".glb", ".gltf")  # by their standard; COLLADA files say it, and the reader turns them
 MAX_FACES = 2_000_000  # a minute
 POINT = 1e-9  # of all extents: smaller is none
-_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+Y_UP = (".glb", ".gltf")  # by their standard; COLLADA files say it, the others are z-up
+TO_Z_UP: Final = {  # from the axis that points up
+    "x": np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]]),
+    "y": np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
+}
 
 
-def _check_archive(name: str, content: bytes) -> None:
+def _check_archive(name: str, content: bytes) -> int:
     try:
         with zipfile.ZipFile(BytesIO(content)) as archive:
             members = archive.infolist()
@@ -50,10 +63,18 @@ def _check_archive(name: str, content: bytes) -> None:
                     f"{name}: {len(content)} bytes that unpack to {size >> 20} MiB are no mesh; "
                     "export it again"
                 )
-            models = [archive.read(m) for m in members if m.filename.endswith(".model")]
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, ValueError, OSError):
-        return  # the mesh library says what is wrong with it
+            named = {m.filename: archive.read(m) for m in members if m.filename.endswith(".model")}
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError,
+            ValueError, OSError):  # fmt: skip
+        return -1  # the mesh library says what is wrong with it
+    models = list(named.values())
     _check_nodes(name, _xml_nodes(name, models, "object", "component", "objectid"))
+    if any(b"beamlattice>" in model for model in models):
+        raise ConfigError(f"{name}: it holds a beam lattice; export it as a mesh of triangles")
+    parts = [m for n, m in named.items() if "3d/3dmodel.model" not in n.lower()]
+    if any(part.count(b"<mesh>") > 1 for part in parts):  # the library takes all for each
+        raise ConfigError(f"{name}: several parts share a file within it; export it as one mesh")
+    return -1
 
 
 def _xml_nodes(
@@ -105,14 +126,18 @@ def _check_nodes(name: str, used: Mapping[str, Sequence[str]]) -> None:
         raise ConfigError(f"{name}: a node of its scene holds itself; export it again") from None
 
 
-def _check_collada(name: str, content: bytes) -> None:
+def _check_collada(name: str, content: bytes) -> int:
     _check_nodes(name, _xml_nodes(name, [content], "node", "instance_node", "url"))
+    return -1
 
 
-def _check_gltf(name: str, content: bytes) -> None:
+def _check_gltf(name: str, content: bytes) -> int:
+    """Refuse what is not supported; return how many triangles the scene tells of."""
     text, binary = content, b""
     if content[:4] == b"glTF" and len(content) >= GLB_JSON.size:
-        *_, length, _ = GLB_JSON.unpack_from(content)
+        _, _, whole, length, _ = GLB_JSON.unpack_from(content)
+        if whole > len(content):
+            raise ConfigError(f"{name}: cut short, {len(content)} of {whole} bytes; copy it again")
         text = content[GLB_JSON.size : GLB_JSON.size + length]
         binary = content[GLB_JSON.size + length + 8 :]
     if text.count(b"{") > MOST_OBJECTS:
@@ -125,10 +150,13 @@ def _check_gltf(name: str, content: bytes) -> None:
         }
         primitives = [p for mesh in scene.get("meshes", ()) for p in mesh.get("primitives", ())]
         draco = [d for p in primitives if (d := _draco_of(scene, p, binary))]
+        unsupported = _find_unsupported(scene, primitives, Path(name))
     except RecursionError:
         raise ConfigError(f"{name}: its JSON is nested too deep; export it again") from None
     except (ValueError, KeyError, TypeError, AttributeError, IndexError):
-        return  # the mesh library says what is wrong with it
+        return -1  # the mesh library says what is wrong with it
+    if unsupported:
+        raise ConfigError(f"{name}: {unsupported}")
     if len(nodes) > MOST_NODES:
         raise ConfigError(f"{name}: a scene of more than {MOST_NODES} nodes; join them")
     _check_nodes(name, nodes)
@@ -137,6 +165,52 @@ def _check_gltf(name: str, content: bytes) -> None:
             raise ConfigError(
                 f"{name}: Draco's data tells of more than {MOST_POINTS} points; export it again"
             )
+    with suppress(ValueError, KeyError, TypeError, AttributeError, IndexError):
+        return _count_drawn(scene)
+    return -1
+
+
+def _find_unsupported(scene: Any, primitives: Sequence[Any], path: Path) -> str:
+    """Say what of a glTF the mesh library would leave out or misread; empty: nothing."""
+    for required in scene.get("extensionsRequired", ()):
+        if not HARMLESS.match(required):
+            how = "`gltfpack -noq -i IN -o OUT` writes it without" if "meshopt" in required else ""
+            return f"it needs {required}, which is not supported; {how or 'export it without'}"
+    if any("EXT_mesh_gpu_instancing" in n.get("extensions", ()) for n in scene.get("nodes", ())):
+        return "its nodes have copies by EXT_mesh_gpu_instancing; export it without"
+    for buffer in scene.get("buffers", ()):
+        beside = path.parent / unquote(uri := buffer.get("uri", ""))
+        if uri and not uri.startswith("data:"):
+            if not beside.is_file():
+                return f"{uri}, which it names, is not beside it; copy both, or export a .glb"
+            check_no_pointer(beside)
+            if beside.stat().st_size < buffer["byteLength"]:
+                return f"{uri}, which it names, is cut short; copy it again"
+    for primitive in (p for p in primitives if p.get("mode", 4) > 3):
+        if primitive.get("mode", 4) > 5:
+            return "it holds fans of triangles (mode 6); export plain triangles"
+        used = [
+            primitive["attributes"]["POSITION"],
+            *([primitive.get("indices")] * ("indices" in primitive)),
+        ]
+        places, *_ = read = [scene["accessors"][i] for i in used]
+        if any("sparse" in accessor for accessor in read):
+            return "its vertices are a sparse accessor; export it without"
+        if places.get("normalized"):
+            return "its vertices are normalized integers; `gltf-transform dequantize IN OUT`"
+    return ""
+
+
+def _count_drawn(scene: Any) -> int:
+    """Count the triangles of all nodes of the scene that is shown."""
+    drawn, todo = 0, list(scene["scenes"][scene.get("scene", 0)].get("nodes", ()))
+    while todo:
+        node = scene["nodes"][todo.pop()]
+        todo += node.get("children", ())
+        for p in scene["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            number = scene["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"]
+            drawn += {4: number // 3, 5: number - 2}.get(p.get("mode", 4), 0)
+    return drawn
 
 
 def _draco_of(scene: Any, primitive: Any, binary: bytes) -> bytes:
@@ -170,7 +244,7 @@ def _draco_sizes(data: bytes) -> tuple[int, ...]:
 
 
 # Every format that can be read, with the check of what it says of itself.
-FORMATS: Final[dict[str, Callable[[str, bytes], None] | None]] = {
+FORMATS: Final[dict[str, Callable[[str, bytes], int] | None]] = {
     ".obj": None,
     ".stl": None,
     ".ply": None,
@@ -181,6 +255,7 @@ FORMATS: Final[dict[str, Callable[[str, bytes], None] | None]] = {
     ".3mf": _check_archive,
 }
 MESH_SUFFIXES = tuple(FORMATS)
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what matters of a file is told here
 
 
 def check_mesh_file(path: Path) -> None:
@@ -203,7 +278,7 @@ def mesh_content(path: Path) -> bytes:
     Raises:
         ConfigError: it unpacks to more than it can be expected to hold.
     """
-    content = _read_checked(path)
+    content, _ = _read_checked(path)
     if path.suffix.lower() == ".gltf":
         with suppress(ValueError, KeyError, TypeError, AttributeError, OSError):
             for buffer in json.loads(content)["buffers"]:
@@ -212,12 +287,11 @@ def mesh_content(path: Path) -> bytes:
     return content
 
 
-def _read_checked(path: Path) -> bytes:
-    """Read a file; refuse one that unpacks to more than it may."""
+def _read_checked(path: Path) -> tuple[bytes, int]:
+    """Read a file and the number of triangles it tells; refuse archive bombs."""
+    check_no_pointer(path)
     content, check = path.read_bytes(), FORMATS[path.suffix.lower()]
-    if check is not None:
-        check(str(path), content)
-    return content
+    return content, check(str(path), content) if check else -1
 
 
 def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
@@ -245,36 +319,48 @@ def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
 
 def _part(path: Path, up: str) -> trimesh.Trimesh:
     check_mesh_file(path)
-    suffix = path.suffix.lower()
-    _read_checked(path)
-    meshes = _parsed(path, suffix)
-    if not any(len(m.faces) for m in meshes):
-        raise ConfigError(f"{path}: holds no triangles; export a surface mesh, not points or lines")
+    found = _read_meshes(path)
     # joined by hand: what colours and textures the bodies have is dropped
-    joined = trimesh.util.append_faces([m.vertices for m in meshes], [m.faces for m in meshes])
+    joined = trimesh.util.append_faces(
+        [m.vertices for m in found.meshes], [m.faces for m in found.meshes]
+    )
     mesh = trimesh.Trimesh(*joined, process=False)
     mesh.remove_unreferenced_vertices()
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
         raise ConfigError(f"{path}: {bad} vertices are not finite numbers; export it again")
-    if up == "y" or (not up and suffix in Y_UP):
-        mesh.vertices = mesh.vertices @ _Y_UP_TO_Z_UP.T
+    if (up or found.up) in TO_Z_UP:
+        mesh.vertices = mesh.vertices @ TO_Z_UP[up or found.up].T
     return mesh
 
 
-def _parsed(path: Path, suffix: str) -> list[trimesh.Trimesh]:
+def _read_meshes(path: Path) -> Found:
+    """Read the bodies of a file in their places; refuse it if some are missing."""
+    content, told = _read_checked(path)
+    suffix = path.suffix.lower()
+    axis = "y" if suffix in Y_UP else "z"
     try:
-        # materials would be dropped, and pictures that are missing be complained of
-        kinds = (".obj", ".ply")
-        materials: dict[str, Any] = {"skip_materials": True} if suffix in kinds else {}
-        scene = trimesh.load_scene(path, process=False, **materials)
-        names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
-        faces = sum(len(getattr(scene.geometry[name], "faces", ())) for name in names)
-        if faces > MAX_FACES:  # told before a mesh that is used a thousand times is copied
-            raise ConfigError(
-                f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
-            )
-        return [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]
+        found = READERS[suffix](content) if suffix in READERS else Found(told=told, up=axis)
+        if found.same or not found.meshes:
+            try:
+                found = _choose(found, _load_meshes(path, content))
+            except ConfigError:
+                raise
+            except Exception:
+                if not found.again and not found.meshes:
+                    raise
+                found = found.again(content) if found.again else found
+        number = sum(len(mesh.faces) for mesh in found.meshes)
+        _check_number(path, number)
+        for vertices, faces in (
+            (np.asarray(m.vertices), m.faces) for m in found.meshes if len(m.faces)
+        ):
+            if vertices.shape[1:] != (3,):
+                raise ValueError("a vertex has fewer than 3 coordinates; is it cut short?")
+            if outside := [i for i in (faces.min(), faces.max()) if not 0 <= i < len(vertices)]:
+                raise ValueError(f"a face names vertex {outside[0]}, of {len(vertices)}")
+            if not np.ptp(vertices, axis=0).any() and DRACO in content:
+                raise ValueError("what Draco compressed cannot be unpacked")
     except ConfigError:
         raise
     except Exception as error:  # the parsers raise whatever their format trips over
@@ -284,3 +370,43 @@ def _parsed(path: Path, suffix: str) -> list[trimesh.Trimesh]:
         raise ConfigError(
             f"{path}: cannot be read as {suffix} ({reason[:120]}); export it again"
         ) from error
+    if not number:
+        raise ConfigError(f"{path}: holds no triangles; export a surface mesh, not points or lines")
+    return found
+
+
+def _choose(found: Found, theirs: list[trimesh.Trimesh]) -> Found:
+    """Take what the library read, if it is as many triangles as the file tells."""
+    told = sum(len(mesh.faces) for mesh in found.meshes) if found.meshes else found.told
+    number = sum(len(mesh.faces) for mesh in theirs)
+    if told not in (-1, number):
+        raise ValueError(f"it tells {told} triangles, {number} of them can be read")
+    return replace(found, meshes=theirs)
+
+
+def _check_number(path: Path, faces: int) -> None:
+    if faces > MAX_FACES:
+        raise ConfigError(
+            f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
+        )
+
+
+class _Beside(trimesh.resolvers.FilePathResolver):
+    """Files that a .gltf names, as URLs write them."""
+
+    def get(self, name: str) -> Any:
+        return super().get(unquote(name))
+
+
+def _load_meshes(path: Path, content: bytes) -> list[trimesh.Trimesh]:
+    """Let the library read the bodies of a file."""
+    kind = path.suffix.lower()[1:]
+    # materials would be dropped, and pictures that are missing be complained of
+    materials: dict[str, Any] = {} if kind in ("stl", "3mf") else {"skip_materials": True}
+    scene = trimesh.load_scene(
+        BytesIO(content), file_type=kind, process=False, resolver=_Beside(str(path)), **materials
+    )
+    names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
+    # told before a mesh that is used a thousand times is copied
+    _check_number(path, sum(len(getattr(scene.geometry[name], "faces", ())) for name in names))
+    return [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]

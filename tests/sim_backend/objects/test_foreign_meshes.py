@@ -119,7 +119,7 @@ def test_strips_of_triangles_are_all_drawn(tmp_path):
 @pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".off", ".glb", ".3mf", ".dae"])
 def test_what_trimesh_writes_has_its_size_and_side(tmp_path, suffix):
     mesh = corner()
-    if suffix == ".glb":
+    if suffix in (".glb", ".dae"):
         mesh.vertices = y_up(mesh.vertices)
     path = tmp_path / f"a{suffix}"
     mesh.export(path)

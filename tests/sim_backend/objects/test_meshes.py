@@ -23,9 +23,9 @@ Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0,
 
 
 def save(mesh: trimesh.Trimesh, path: Path) -> Path:
-    """Write the z-up mesh as its format would have it: glTF is y-up."""
+    """Write the z-up mesh as its format would have it: glTF is y-up, and trimesh's COLLADA."""
     mesh = mesh.copy()
-    if path.suffix in (".glb", ".gltf"):
+    if path.suffix in (".glb", ".gltf", ".dae"):
         mesh.apply_transform(Z_UP_TO_Y_UP)
     if path.suffix == ".gltf":
         for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh)).items():
