@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, starting
+from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, needing, starting
 from tactile_rt.cli.options import Force, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -73,10 +73,11 @@ def import_file(
     check_output(json)
     check_new(output, force)
     if plot is not None:
-        from tactile_rt.cli.import_picture import check_picture, draw_import
+        from tactile_rt.recording.importing.picture import check_picture, draw_import
 
         check_output(plot)
-        check_picture(plot)
+        with needing("view"):
+            check_picture(plot)
     if decimal not in ("", ",", "."):
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
     with ExitStack() as stack:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from tactile_rt.cli.app import needing
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, concatenate
@@ -23,8 +22,7 @@ def check_picture(out: Path) -> None:
     """Refuse a picture that cannot be drawn, before anything is read."""
     if out.suffix.lower() not in KINDS:
         raise ConfigError(f"{out} is no picture: give --plot a {', '.join(KINDS)}")
-    with needing("view"):
-        import matplotlib  # noqa: F401
+    import matplotlib  # noqa: F401
 
 
 def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> None:
