@@ -359,7 +359,7 @@ def _read_meshes(path: Path) -> Found:
                 raise ValueError("a vertex has fewer than 3 coordinates; is it cut short?")
             if outside := [i for i in (faces.min(), faces.max()) if not 0 <= i < len(vertices)]:
                 raise ValueError(f"a face names vertex {outside[0]}, of {len(vertices)}")
-            if not np.ptp(vertices, axis=0).any() and DRACO in content:
+            if suffix in Y_UP and not np.ptp(vertices, axis=0).any() and DRACO in content:
                 raise ValueError("what Draco compressed cannot be unpacked")
     except ConfigError:
         raise

@@ -28,6 +28,7 @@ PLY_TYPES: Final = {
     "int64": "i8", "uint64": "u8", "float": "f4", "float16": "f2", "float32": "f4",
     "float64": "f8", "double": "f8",
 }  # fmt: skip
+ENDS: Final = 1 << 14  # bytes of an OBJ file at which it says that it holds surfaces
 TEXTURED: Final = {"texcoord", "texture_u", "texture_v", "u", "v", "s", "t"}
 
 
@@ -85,7 +86,7 @@ def _numbers(rows: Sequence[bytes], kind: type) -> Array:
 
 
 def _read_obj(content: bytes) -> Found:
-    if b"surf" in content and re.search(rb"^\s*surf[ \t]", content, re.MULTILINE):
+    if re.search(rb"^[ \t]*surf[ \t]", content[:ENDS] + b"\n" + content[-ENDS:], re.MULTILINE):
         raise ValueError("it holds free-form surfaces, `surf`; export it as polygons")
     text = b"\n" + content if content.startswith(b"v ") else content
     faces = re.findall(rb"\nf (.*)", text)
