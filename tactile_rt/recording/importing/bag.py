@@ -21,9 +21,9 @@ from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
-from tactile_rt.drivers.can_lines import Occurrences
 from tactile_rt.drivers.codecs.ascii_mapping import parse_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.drivers.logs import Occurrences
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.mending import Import, clock_of, mend_bag, write_chunks
 from tactile_rt.recording.importing.proposing import propose_fields

@@ -17,10 +17,9 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk, SourceStats
-from tactile_rt.drivers.can_lines import Occurrences
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
-from tactile_rt.drivers.logs import LineLog
+from tactile_rt.drivers.logs import LineLog, Occurrences
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.description import SUMMARY, Description
 from tactile_rt.recording.importing.mending import Import, clock_of
