@@ -17,7 +17,7 @@ from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.recording.importing.mending import Import
+    from tactile_rt.recording.importing.report import Import
 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
@@ -73,7 +73,7 @@ def import_file(
     check_output(json)
     check_new(output, force)
     if plot is not None:
-        from tactile_rt.recording.importing.picture import check_picture, draw_import
+        from tactile_rt.recording.importing.report import check_picture, draw_import
 
         check_output(plot)
         with needing("view"):
@@ -98,9 +98,8 @@ def import_file(
             os.replace(target, output)
     from tactile_rt.recording.importing.report import report_lines
 
-    counted = {k: v for k, v in vars(made).items() if k != "report"} | vars(made.report)
-    if not told_as_json({"file": output, **counted, "odd": odd}, json):
-        typer.echo("\n  ".join([f"{output}: {made.line()}", *report_lines(made.report)]))
+    if not told_as_json({"file": output, **vars(made), "odd": odd}, json):
+        typer.echo(f"{output}: " + "\n  ".join(report_lines(made)))
 
 
 def _import(
@@ -137,9 +136,9 @@ def _import(
                 f"`tactile-rt sniff {log}` tells which"
             )
     if rate and not decoded_as:
-        made.report.said_hz = rate
-        if made.report.found_hz == made.report.said_hz:
-            made.report.found_hz = None  # no column is a time
+        made.said_hz = rate
+        if made.found_hz == rate:
+            made.found_hz = None  # no column is a time
     return made
 
 
@@ -147,9 +146,9 @@ def _list_odd(made: "Import") -> list[str]:
     """List what is odd about a file, a line each."""
     odd = [note for note in made.notes if not note.startswith("left out: ")]
     if made.corrupt and not any("corrupt" in note for note in odd):
-        odd.append(f"{made.corrupt} corrupt {made.report.unit}")
+        odd.append(f"{made.corrupt} corrupt {made.unit}")
     if made.missing:
-        odd.append(f"{made.missing} missing, the first after sample {made.report.first_missing}")
+        odd.append(f"{made.missing} missing, the first after sample {made.first_missing}")
     return odd
 
 

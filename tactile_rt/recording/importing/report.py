@@ -1,24 +1,43 @@
-"""What came of an import: counts that add up, times, rates, ranges, and what is odd."""
+"""What came of an import, as a recording, in text and as a picture."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
+from tactile_rt.recording.description import SUMMARY, Description
+from tactile_rt.recording.layout import SAMPLES, encode_samples
+from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.writer import McapFile
 
-__all__ = ["ImportReport", "Measurer", "report_lines", "show_time"]
+__all__ = [
+    "Import", "Measurer", "check_picture", "clock_of", "draw_import", "report_lines",
+    "write_chunks",
+]  # fmt: skip
 
-BLOCK = 4096  # samples that are measured together
-SHOWN = 8  # channels in text
+BLOCK: Final = 4096  # samples that are measured together
+CHUNK_S: Final = 0.01  # of a chunk, as live sources have it
+FEWEST: Final = 100_000  # chunks beyond which they are longer
+UTC_FROM_NS: Final = 10**17  # a time that is larger counts from 1970
+SHOWN: Final = 8  # channels in text
+PICTURES: Final = (".png", ".svg", ".pdf")
+ROWS, NAMED, NOTES = 12, 8, 4  # channels, elements in the legend, notes that are drawn
+BINS, PAUSE = 2000, 5  # stretches of time, each drawn by its extremes; typical steps
 
 
 @dataclass
-class ImportReport:
+class Import:
     """What a file held, and what of it became samples.
 
     Attributes:
+        missing: The number of samples that never came, by the device's counter.
         unit: What `total`, `read` and `passed_over` count: bytes, lines, frames, messages or rows.
         out_of_order: How many times go back; None where nobody counted.
         found_hz: Rate by the times of the file; None where it has none.
@@ -29,6 +48,13 @@ class ImportReport:
         ranges: Smallest and largest valid value of each column, SI, by ELEMENT.CHANNEL.
     """
 
+    samples: int = 0
+    intact: int = 0
+    corrupt: int = 0
+    missing: int = 0
+    seconds: float = 0.0
+    rate_hz: float = 0.0
+    notes: list[str] = field(default_factory=list)
     unit: str = "rows"
     total: int = 0
     read: int = 0
@@ -45,13 +71,13 @@ class ImportReport:
 
 
 class Measurer:
-    """Takes the samples as they are written, and fills in a `ImportReport`.
+    """Takes the samples as they are written, and fills in an `Import`.
 
     Args:
         utc_offset_ns: What was taken off the times, ns.
     """
 
-    def __init__(self, report: ImportReport, spec: ArraySpec, utc_offset_ns: int) -> None:
+    def __init__(self, report: Import, spec: ArraySpec, utc_offset_ns: int) -> None:
         self._report, self._spec, self._offset = report, spec, utc_offset_ns
         self._waiting: list[Chunk] = []
         self._n = 0
@@ -102,14 +128,14 @@ class Measurer:
 
 def show_time(t_ns: int) -> str:
     """Write a time as UTC where it counts from 1970, else in seconds."""
-    if t_ns < 10**17:
+    if t_ns < UTC_FROM_NS:
         return f"{round(t_ns / NS_PER_S, 6):.12g} s"
     return datetime.fromtimestamp(t_ns // NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S") + (
         f".{t_ns % NS_PER_S // 1000:06d} UTC"
     )
 
 
-def report_lines(report: ImportReport) -> list[str]:
+def report_lines(report: Import) -> list[str]:
     """Write a report as lines of text: counts, times, and the range of each channel."""
     hz = [
         f"{rate:.6g} Hz {what}"
@@ -118,6 +144,8 @@ def report_lines(report: ImportReport) -> list[str]:
     ]
     order = "" if report.out_of_order is None else f", {report.out_of_order} out of order"
     lines = [
+        f"{report.samples} samples in, {report.intact} intact, {report.corrupt} corrupt, "
+        f"{report.missing} missing; {report.seconds:.6g} s at {report.rate_hz:.6g} Hz",
         f"{report.total} {report.unit}: {report.read} read, {report.passed_over} passed over{order}"
         f"; {report.invalid} samples have an invalid element",
         f"from {report.first} to {report.last}{''.join(f'; {x}' for x in hz)}",
@@ -133,3 +161,97 @@ def report_lines(report: ImportReport) -> list[str]:
     if len(of) > SHOWN:
         lines.append(f"and {len(of) - SHOWN} channels more")
     return lines
+
+
+def clock_of(first_ns: int) -> int:
+    """Return what to take off a file's times, ns: all if they count from 1970."""
+    return first_ns if first_ns >= UTC_FROM_NS else 0
+
+
+def write_chunks(
+    output: Path, about: Description, chunk: Chunk, account: Import, what: str
+) -> Import:
+    """Write a recording of these samples, cut as a live source would.
+
+    Args:
+        output: the file to write; it is there whole or not at all.
+        account: what became of the file; samples, seconds and rate are filled in.
+
+    Raises:
+        RecordingError: no sample is valid.
+    """
+    if not chunk.valid.any():
+        raise RecordingError(f"{what}: no number of a measurement in {len(chunk)} lines")
+    n, rate = len(chunk), about.spec.rate_hz
+    span_s = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
+    account.samples, account.seconds, account.rate_hz = n, span_s, rate
+    account.total, account.read = account.intact + account.corrupt, account.intact
+    account.passed_over = account.corrupt
+    account.found_hz = int(chunk.seq[-1] - chunk.seq[0]) / span_s if span_s else None
+    measurer = Measurer(account, about.spec, about.utc_offset_ns)
+    measurer.add(chunk)
+    measurer.finish()
+    size = max(1, round(CHUNK_S * rate), n // FEWEST)
+
+    def fill(file: BinaryIO) -> None:
+        made = McapFile(file, about)
+        for at in range(0, n, size):
+            piece = slice(at, at + size)
+            part = Chunk(
+                chunk.seq[piece], chunk.t_ns[piece], chunk.values[piece], chunk.valid[piece]
+            )
+            made.add(SAMPLES, encode_samples(part), int(part.t_ns[-1]))
+        made.note(SUMMARY, {"samples": str(n), "packets": "0"})
+        made.finish()
+
+    write_whole(output, fill)
+    return account
+
+
+def check_picture(out: Path) -> None:
+    """Refuse a picture that cannot be drawn, before anything is read."""
+    if out.suffix.lower() not in PICTURES:
+        raise ConfigError(f"{out} is no picture: give --plot a {', '.join(PICTURES)}")
+    import matplotlib  # noqa: F401
+
+
+def draw_import(path: Path, made: Import, odd: Sequence[str], out: Path) -> None:
+    """Draw the samples of a recording that was imported."""
+    from matplotlib.figure import Figure
+
+    stored = Recording(path)
+    spec, chunk = stored.spec, concatenate(list(stored))
+    t_s = chunk.t_ns / NS_PER_S
+    values = np.where(chunk.valid[..., None], chunk.values, np.nan)
+    steps = np.diff(t_s)
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    lost = np.flatnonzero((np.diff(chunk.seq) > 1) | (steps > PAUSE * usual))
+    bad = np.concatenate([[False], ~chunk.valid.all(axis=1), [False]])
+    turns = np.flatnonzero(np.diff(bad)).reshape(-1, 2)  # where a stretch begins and ends
+    marks = {
+        "invalid": ("tab:red", [(t_s[a], t_s[b - 1] + usual - t_s[a]) for a, b in turns.tolist()]),
+        "missing": ("tab:orange", [(t_s[k], t_s[k + 1] - t_s[k]) for k in lost.tolist()]),
+    }
+    rows = spec.channels[:ROWS]
+    figure = Figure((10, 1.4 + 1.5 * len(rows)), layout="constrained")
+    axes: Any = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    edges = np.unique(np.linspace(0, len(t_s) - 1, min(BINS, len(t_s))).astype(int))
+    at = np.repeat(t_s[edges], 2)
+    for c, axis in enumerate(axes):
+        for e, name in enumerate(spec.elements):
+            both = [f.reduceat(values[:, e, c], edges) for f in (np.fmin, np.fmax)]
+            axis.plot(at, np.stack(both, 1).ravel(), lw=0.8, marker=".", ms=2, label=name)
+        for what, (color, spans) in marks.items():
+            if spans:
+                whole = {"transform": axis.get_xaxis_transform(), "alpha": 0.3, "label": what}
+                axis.broken_barh(spans, (0, 1), color=color, **whole)
+        axis.set_ylabel(f"{spec.channels[c]} [{spec.units[c]}]")
+        axis.grid(alpha=0.3)
+    labels = dict(zip(*axes[0].get_legend_handles_labels()[::-1], strict=True))
+    shown = [n for n in (*spec.elements[:NAMED], "invalid", "missing") if n in labels]
+    axes[0].legend([labels[n] for n in shown], shown, loc="upper right", fontsize="small", ncols=5)
+    rest = ((len(odd) - NOTES, "notes"), (len(spec.channels) - ROWS, "channels"))
+    notes = [*odd[:NOTES], *(f"and {n} {what} more" for n, what in rest if n > 0)]
+    axes[-1].set_xlabel("\n".join(["time [s]", *notes]), parse_math=False)
+    figure.suptitle(f"{stored.description.source}: {report_lines(made)[0]}", parse_math=False)
+    write_whole(out, lambda file: figure.savefig(file, format=out.suffix[1:].lower(), dpi=120))
