@@ -68,7 +68,7 @@ LINES: Final[dict[str, Callable[[str], Found]]] = {
     "candump": of_candump, "slcan": of_slcan,
     "terminal": of_heard, "hex": of_hex, "gvret": of_gvret, "csv": read_csv_line,
 }  # fmt: skip
-Timed = tuple[Any, int | None]  # a packet, and when it came, ns
+Read = tuple[str, Any, int | None]  # bus, packet, empty for an error frame, and time, ns
 
 
 class Occurrences:
@@ -112,7 +112,7 @@ class LineLog:
         self.total = self.frames = 0
         self.back = Occurrences("packet")  # times that go back
 
-    def packets(self) -> Iterator[Timed]:
+    def packets(self) -> Iterator[tuple[Any, int | None]]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
         not say. Times never go back.
         """
@@ -120,46 +120,45 @@ class LineLog:
         self.buses.clear()
         self.total = self.frames = 0
         latest, self.back = -(1 << 62), Occurrences("frame" if self.wire == "can" else "packet")
+        number = errors = 0
+        read = self._raw if self.form == "raw" else self._text
         with open_log_file(self.path) as file:
-            for number, (packet, t_ns) in enumerate(self._read(file), 1):
+            for bus, packet, t_ns in (self._binary if self.form in BINARY else read)(file):
+                self.frames += 1
+                if not packet:
+                    errors += 1
+                    continue
+                self.buses[bus] += 1
+                if self._bus and bus != self._bus:
+                    continue
+                number += 1
                 if t_ns is not None:
                     if t_ns < latest:
                         self.back.add(number)
-                        t_ns = latest
-                    latest = t_ns
+                    t_ns = latest = max(t_ns, latest)
                 yield packet, t_ns
+            if getattr(file.raw, "broken", False):
+                self.notes.append("it is cut short or damaged: what unpacks of it was read")
+        self.notes += [f"{errors} error frames"] if errors else []
+        if self._bus and self._bus not in self.buses:
+            known = ", ".join(sorted(self.buses)) or "none"
+            self.notes.append(f"no frames are of bus {self._bus}; there are those of {known}")
+        elif len(self.buses) > 1:
+            named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(self.buses.items()))
+            taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
+            self.notes.append(f"frames of several buses: {named}; {taken}")
         if self.back.n:
             self.notes.append(
                 f"{self.back.n} times go back ({self.back.what} {self.back.first} is the first); "
                 "these packets have the time before"
             )
 
-    def _read(self, file: BufferedReader) -> Iterator[Timed]:
-        if self.form == "raw":
-            while piece := file.read(self.piece):
-                self.total += len(piece)
-                yield piece, None
-        else:
-            errors = 0
-            for bus, packet, t_ns in (
-                self._binary(file) if self.form in BINARY else self._text(file)
-            ):
-                self.frames += 1
-                if not packet:
-                    errors += 1
-                    continue
-                self.buses[bus] += 1
-                if not self._bus or bus == self._bus:
-                    yield packet, t_ns
-            if self.form in BINARY:
-                self.total = max(self.total, self.frames)
-            if errors:
-                self.notes.append(f"{errors} error frames")
-            self._tell_buses()
-        if getattr(file.raw, "broken", False):
-            self.notes.append("it is cut short or damaged: what unpacks of it was read")
+    def _raw(self, file: BufferedReader) -> Iterator[Read]:
+        while piece := file.read(self.piece):
+            self.total += len(piece)
+            yield "", piece, None
 
-    def _text(self, file: BufferedReader) -> Iterator[tuple[str, Any, int | None]]:
+    def _text(self, file: BufferedReader) -> Iterator[Read]:
         """Read lines of text, and note those that are none of its form."""
         asc, trc = AscLines(self.names), TrcLines()
         parse = {"asc": asc.read, "trc": trc.read, **LINES}[self.form]
@@ -204,7 +203,7 @@ class LineLog:
             what = "frame" if self.form in ("asc", "csv", "trc") else "line"
             self.notes.append(f"passed over, no {what} of {a} {self.form} log: {odd}")
 
-    def _binary(self, file: BufferedReader) -> Iterator[tuple[str, Any, int | None]]:
+    def _binary(self, file: BufferedReader) -> Iterator[Read]:
         """Read messages by python-can, up to where the file is damaged."""
         from can.io import BLFReader, SqliteReader
 
@@ -234,22 +233,13 @@ class LineLog:
             self.notes.append(f"it is cut short or damaged after {self.frames} frames ({why:.80})")
         finally:
             warned.removeFilter(self._note_warning)
+            self.total = max(self.total, self.frames)
 
     def _note_warning(self, record: logging.LogRecord) -> bool:
         """Note what python-can passes over with a warning, and not on the terminal."""
         note = " ".join(record.getMessage().split())
         self.notes += [note] if note not in self.notes else []
         return False
-
-    def _tell_buses(self) -> None:
-        buses = self.buses
-        if self._bus and self._bus not in buses:
-            known = ", ".join(sorted(buses)) or "none"
-            self.notes.append(f"no frames are of bus {self._bus}; there are those of {known}")
-        elif len(buses) > 1:
-            named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(buses.items()))
-            taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
-            self.notes.append(f"frames of several buses: {named}; {taken}")
 
 
 def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:

@@ -3,26 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import write_whole
-from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
+from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.recording.description import SUMMARY, Description
 from tactile_rt.recording.layout import SAMPLES, encode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
 
 __all__ = [
-    "Import", "Measurer", "check_picture", "clock_of", "draw_import", "report_lines",
+    "Import", "check_picture", "clock_of", "draw_import", "measure_samples", "report_lines",
     "write_chunks",
 ]  # fmt: skip
 
-BLOCK: Final = 4096  # samples that are measured together
+BLOCK: Final = 4096  # chunks that are measured together
 CHUNK_S: Final = 0.01  # of a chunk, as live sources have it
 FEWEST: Final = 100_000  # chunks beyond which they are longer
 UTC_FROM_NS: Final = 10**17  # a time that is larger counts from 1970
@@ -70,60 +70,30 @@ class Import:
     ranges: dict[str, tuple[float, float] | None] = field(default_factory=dict)
 
 
-class Measurer:
-    """Takes the samples as they are written, and fills in an `Import`.
-
-    Args:
-        utc_offset_ns: What was taken off the times, ns.
-    """
-
-    def __init__(self, report: Import, spec: ArraySpec, utc_offset_ns: int) -> None:
-        self._report, self._spec, self._offset = report, spec, utc_offset_ns
-        self._waiting: list[Chunk] = []
-        self._n = 0
-        self._low: NDArray[np.float32] = np.full(spec.shape, np.nan, np.float32)
-        self._high = self._low
-        self._seq: int | None = None
-        self._times = [0, 0]
-
-    def add(self, chunk: Chunk) -> None:
-        """Take samples."""
-        self._waiting.append(chunk)
-        if len(self._waiting) >= BLOCK:
-            self._measure()
-
-    def finish(self) -> None:
-        """Fill in times and ranges."""
-        self._measure()
-        report, spec = self._report, self._spec
-        report.first, report.last = (show_time(t + self._offset) for t in self._times)
-        names = [f"{e}.{c}" for e in spec.elements for c in spec.channels]
-        pairs = zip(self._low.ravel().tolist(), self._high.ravel().tolist(), strict=True)
-        report.units = dict(zip(spec.channels, spec.units, strict=True))
-        report.ranges = {
-            name: None if low != low else (low, high)
-            for name, (low, high) in zip(names, pairs, strict=True)
-        }
-
-    def _measure(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return
-        seq = np.concatenate([c.seq for c in waiting])
-        valid = np.concatenate([c.valid for c in waiting])
-        values = np.where(valid[..., None], np.concatenate([c.values for c in waiting]), np.nan)
-        if self._seq is None:
-            self._times[0] = int(waiting[0].t_ns[0])
-        self._times[1] = int(waiting[-1].t_ns[-1])
-        gaps = np.flatnonzero(
-            np.diff(seq, prepend=seq[0] - 1 if self._seq is None else self._seq) > 1
-        )
-        if len(gaps) and self._report.first_missing is None:
-            self._report.first_missing = self._n + int(gaps[0])
-        self._seq, self._n = int(seq[-1]), self._n + len(seq)
-        self._report.invalid += int((~valid.all(axis=1)).sum())
-        self._low = np.fmin(self._low, np.fmin.reduce(values))
-        self._high = np.fmax(self._high, np.fmax.reduce(values))
+def measure_samples(account: Import, path: Path) -> None:
+    """Fill in the times, gaps and ranges of a recording that was imported."""
+    stored = Recording(path)
+    spec, offset, chunks = stored.spec, stored.description.utc_offset_ns, iter(stored)
+    low = high = np.full(spec.shape, np.nan, np.float32)
+    n, seq, times = 0, None, []
+    while parts := list(islice(chunks, BLOCK)):
+        chunk = concatenate(parts)
+        values = np.where(chunk.valid[..., None], chunk.values, np.nan)
+        low, high = np.fmin(low, np.fmin.reduce(values)), np.fmax(high, np.fmax.reduce(values))
+        account.invalid += int((~chunk.valid.all(axis=1)).sum())
+        before = chunk.seq[0] - 1 if seq is None else seq
+        gaps = np.flatnonzero(np.diff(chunk.seq, prepend=before) > 1)
+        if len(gaps) and account.first_missing is None:
+            account.first_missing = n + int(gaps[0])
+        times = [times[0] if n else chunk.t_ns[0], chunk.t_ns[-1]]
+        n, seq = n + len(chunk), chunk.seq[-1]
+    account.first, account.last = (show_time(int(t) + offset) for t in times)
+    account.units = dict(zip(spec.channels, spec.units, strict=True))
+    names = [f"{e}.{c}" for e in spec.elements for c in spec.channels]
+    pairs = zip(low.ravel().tolist(), high.ravel().tolist(), strict=True)
+    account.ranges = {
+        name: None if np.isnan(pair[0]) else pair for name, pair in zip(names, pairs, strict=True)
+    }
 
 
 def show_time(t_ns: int) -> str:
@@ -188,9 +158,6 @@ def write_chunks(
     account.total, account.read = account.intact + account.corrupt, account.intact
     account.passed_over = account.corrupt
     account.found_hz = int(chunk.seq[-1] - chunk.seq[0]) / span_s if span_s else None
-    measurer = Measurer(account, about.spec, about.utc_offset_ns)
-    measurer.add(chunk)
-    measurer.finish()
     size = max(1, round(CHUNK_S * rate), n // FEWEST)
 
     def fill(file: BinaryIO) -> None:
@@ -205,6 +172,7 @@ def write_chunks(
         made.finish()
 
     write_whole(output, fill)
+    measure_samples(account, output)
     return account
 
 

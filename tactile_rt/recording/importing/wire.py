@@ -21,7 +21,7 @@ from tactile_rt.drivers.codec import CODECS, Codec, Command, Samples, codec_clas
 from tactile_rt.drivers.logs import CAN_FORMS, LineLog, Occurrences
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.description import SUMMARY, Description
-from tactile_rt.recording.importing.report import Import, Measurer, clock_of
+from tactile_rt.recording.importing.report import Import, clock_of, measure_samples
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
 
@@ -56,7 +56,6 @@ def import_wire(
         decoded = _Decoded(log, codec, about, stats)
         made = McapFile(file, decoded.about)
         made.add(WIRE, encode_packet(None, about.wire), 0)
-        measurer = Measurer(account, decoded.about.spec, decoded.about.utc_offset_ns)
         first = last = packets = 0
         for packet, t_ns, chunk in decoded:
             made.add(WIRE, encode_packet(packet, about.wire), t_ns)
@@ -68,7 +67,6 @@ def import_wire(
             first = first if account.samples else int(chunk.t_ns[0])
             last = int(chunk.t_ns[-1])
             account.samples += len(chunk)
-            measurer.add(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
         if log.wire == "serial" and decoded.unfinished:
@@ -77,7 +75,6 @@ def import_wire(
             account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
-        measurer.finish()
         _count(log, codec, decoded, account)
         account.seconds = (last - first) / NS_PER_S
         account.rate_hz = decoded.about.spec.rate_hz
@@ -93,6 +90,7 @@ def import_wire(
     if account.samples >= FEW and not getattr(codec, "claims_rate", True):
         if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
             return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
+    measure_samples(account, output)
     account.said_hz = account.rate_hz
     if account.found_hz is not None:
         account.found_hz = came_hz
