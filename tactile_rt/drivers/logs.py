@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping
 from io import BufferedReader, RawIOBase, TextIOWrapper
 from itertools import pairwise
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, BinaryIO, Final, cast
 
 from tactile_rt.core.errors import ConfigError, name_some
@@ -318,13 +317,8 @@ def _parse(parse: Callable[[str], Found], line: str) -> tuple[Found, str]:
         return None, str(error)
 
 
-def _are_mostly(
-    parse: Callable[[str], Found], lines: list[str], named: Mapping[str, int] = MappingProxyType({})
-) -> bool:
-    """Return whether most lines are frames of a form, some of them `named`."""
-    found = [_parse(parse, line)[0] for line in lines]
-    n = sum(one is not None and one[1] is not None for one in found) + sum(named.values())
-    return n > 0 and n >= MOSTLY * len(lines)
+def _count_frames(parse: Callable[[str], Found], lines: list[str]) -> int:
+    return sum(x is not None and x[1] is not None for x in (_parse(parse, y)[0] for y in lines))
 
 
 def _times_are_apart(path: Path) -> bool:
@@ -346,9 +340,11 @@ def _form(path: Path) -> str:
     lines = _lines(head)
     if not lines:
         return "raw"
+    most = max(1, MOSTLY * len(lines))
     entries = [x for x in lines if not x.startswith(";")]
     if any(x.startswith(";$FILEVERSION") for x in lines) or (
-        entries != lines and _are_mostly(TrcLines().read, entries)
+        entries != lines
+        and _count_frames(TrcLines().read, entries) >= max(1, MOSTLY * len(entries))
     ):
         return "trc"
     if lines[0].startswith(CSV_HEADER):
@@ -357,13 +353,14 @@ def _form(path: Path) -> str:
         return "gvret"
     asc = AscLines({})
     begins = {x.split()[0].lower() for x in lines[:6]}
-    if begins >= {"date", "base"} or _are_mostly(asc.read, lines, asc.unknown):
+    if begins >= {"date", "base"} or _count_frames(asc.read, lines) + asc.unknown.total() >= most:
         return "asc"
     for form in ("candump", "slcan", "terminal"):
-        if _are_mostly(LINES[form], lines):
+        if _count_frames(LINES[form], lines) >= most:
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
-    data = b"".join(found[1] for x in lines if (found := _parse(of_hex, x)[0]) is not None)
+    hexes = [x for x in (_parse(of_hex, line)[0] for line in lines) if x is not None]
+    data = b"".join(x[1] for x in hexes)
     letters = sum(b & 15 > 9 or b > 0x9F for b in data)
-    right = _are_mostly(of_hex, lines)
-    return "hex" if right and len(data) >= 16 and letters > len(data) / 16 else "raw"
+    right = len(hexes) >= most and len(data) >= 16 and letters > len(data) / 16
+    return "hex" if right else "raw"
