@@ -75,19 +75,19 @@ def measure_samples(account: Import, path: Path) -> None:
     stored = Recording(path)
     spec, offset, chunks = stored.spec, stored.description.utc_offset_ns, iter(stored)
     low = high = np.full(spec.shape, np.nan, np.float32)
-    n, seq, times = 0, None, []
+    n, seq, times = 0, 0, [0, 0]
     while parts := list(islice(chunks, BLOCK)):
         chunk = concatenate(parts)
         values = np.where(chunk.valid[..., None], chunk.values, np.nan)
         low, high = np.fmin(low, np.fmin.reduce(values)), np.fmax(high, np.fmax.reduce(values))
         account.invalid += int((~chunk.valid.all(axis=1)).sum())
-        before = chunk.seq[0] - 1 if seq is None else seq
-        gaps = np.flatnonzero(np.diff(chunk.seq, prepend=before) > 1)
+        seq = seq if n else int(chunk.seq[0]) - 1
+        gaps = np.flatnonzero(np.diff(chunk.seq, prepend=seq) > 1)
         if len(gaps) and account.first_missing is None:
             account.first_missing = n + int(gaps[0])
-        times = [times[0] if n else chunk.t_ns[0], chunk.t_ns[-1]]
-        n, seq = n + len(chunk), chunk.seq[-1]
-    account.first, account.last = (show_time(int(t) + offset) for t in times)
+        times = [times[0] if n else int(chunk.t_ns[0]), int(chunk.t_ns[-1])]
+        n, seq = n + len(chunk), int(chunk.seq[-1])
+    account.first, account.last = (show_time(t + offset) for t in times)
     account.units = dict(zip(spec.channels, spec.units, strict=True))
     names = [f"{e}.{c}" for e in spec.elements for c in spec.channels]
     pairs = zip(low.ravel().tolist(), high.ravel().tolist(), strict=True)

@@ -16,8 +16,9 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk, SourceStats
+from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
-from tactile_rt.drivers.codec import CODECS, Codec, Command, Samples, codec_class
+from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
 from tactile_rt.drivers.logs import CAN_FORMS, LineLog, Occurrences
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.description import SUMMARY, Description
