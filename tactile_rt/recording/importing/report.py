@@ -71,7 +71,7 @@ class Import:
 
 
 def measure_samples(account: Import, path: Path) -> None:
-    """Fill in the times, gaps and ranges of a recording that was imported."""
+    """Fill in the number, times, gaps and ranges of the samples of a recording."""
     stored = Recording(path)
     spec, offset, chunks = stored.spec, stored.description.utc_offset_ns, iter(stored)
     low = high = np.full(spec.shape, np.nan, np.float32)
@@ -87,6 +87,8 @@ def measure_samples(account: Import, path: Path) -> None:
             account.first_missing = n + int(gaps[0])
         times = [times[0] if n else int(chunk.t_ns[0]), int(chunk.t_ns[-1])]
         n, seq = n + len(chunk), int(chunk.seq[-1])
+    account.samples, account.seconds = n, (times[1] - times[0]) / NS_PER_S
+    account.rate_hz = spec.rate_hz
     account.first, account.last = (show_time(t + offset) for t in times)
     account.units = dict(zip(spec.channels, spec.units, strict=True))
     names = [f"{e}.{c}" for e in spec.elements for c in spec.channels]
@@ -154,7 +156,6 @@ def write_chunks(
         raise RecordingError(f"{what}: no number of a measurement in {len(chunk)} lines")
     n, rate = len(chunk), about.spec.rate_hz
     span_s = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
-    account.samples, account.seconds, account.rate_hz = n, span_s, rate
     account.total, account.read = account.intact + account.corrupt, account.intact
     account.passed_over = account.corrupt
     account.found_hz = int(chunk.seq[-1] - chunk.seq[0]) / span_s if span_s else None

@@ -57,7 +57,7 @@ def import_wire(
         decoded = _Decoded(log, codec, about, stats)
         made = McapFile(file, decoded.about)
         made.add(WIRE, encode_packet(None, about.wire), 0)
-        first = last = packets = 0
+        packets = 0
         for packet, t_ns, chunk in decoded:
             made.add(WIRE, encode_packet(packet, about.wire), t_ns)
             packets += 1
@@ -65,8 +65,6 @@ def import_wire(
                 continue
             own = decoded.about.clock == "device"
             made.add(SAMPLES, encode_samples(chunk), t_ns if own else int(chunk.t_ns[-1]))
-            first = first if account.samples else int(chunk.t_ns[0])
-            last = int(chunk.t_ns[-1])
             account.samples += len(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
@@ -77,10 +75,9 @@ def import_wire(
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
         _count(log, codec, decoded, account)
-        account.seconds = (last - first) / NS_PER_S
-        account.rate_hz = decoded.about.spec.rate_hz
 
     write_whole(output, fill)
+    measure_samples(account, output)
     account.intact, account.corrupt = codec.stats.intact, codec.stats.corrupt
     account.missing, account.notes = stats.missing, [*log.notes, *account.notes]
     if codec.stats.incomplete:
@@ -91,7 +88,6 @@ def import_wire(
     if account.samples >= FEW and not getattr(codec, "claims_rate", True):
         if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
             return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
-    measure_samples(account, output)
     account.said_hz = account.rate_hz
     if account.found_hz is not None:
         account.found_hz = came_hz
