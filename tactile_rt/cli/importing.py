@@ -1,10 +1,11 @@
 """`tactile-rt import`: logs, tables and bags of others, as recordings."""
 
 import os
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final
 from urllib.parse import parse_qsl
 
 import typer
@@ -17,7 +18,11 @@ from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.recording.importing.mending import Import
+    from tactile_rt.recording.importing.report import Import
+
+PICTURES: Final = (".png", ".svg", ".pdf")
+ROWS, NAMED, NOTES = 12, 8, 4  # channels, elements in the legend, notes that are drawn
+BINS, PAUSE = 2000, 5  # stretches of time, each drawn by its extremes; typical steps
 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
@@ -73,8 +78,6 @@ def import_file(
     check_output(json)
     check_new(output, force)
     if plot is not None:
-        from tactile_rt.recording.importing.picture import check_picture, draw_import
-
         check_output(plot)
         with needing("view"):
             check_picture(plot)
@@ -98,9 +101,8 @@ def import_file(
             os.replace(target, output)
     from tactile_rt.recording.importing.report import report_lines
 
-    counted = {k: v for k, v in vars(made).items() if k != "report"} | vars(made.report)
-    if not told_as_json({"file": output, **counted, "odd": odd}, json):
-        typer.echo("\n  ".join([f"{output}: {made.line()}", *report_lines(made.report)]))
+    if not told_as_json({"file": output, **vars(made), "odd": odd}, json):
+        typer.echo(f"{output}: " + "\n  ".join(report_lines(made)))
 
 
 def _import(
@@ -137,9 +139,9 @@ def _import(
                 f"`tactile-rt sniff {log}` tells which"
             )
     if rate and not decoded_as:
-        made.report.said_hz = rate
-        if made.report.found_hz == made.report.said_hz:
-            made.report.found_hz = None  # no column is a time
+        made.said_hz = rate
+        if made.found_hz == rate:
+            made.found_hz = None  # no column is a time
     return made
 
 
@@ -147,9 +149,9 @@ def _list_odd(made: "Import") -> list[str]:
     """List what is odd about a file, a line each."""
     odd = [note for note in made.notes if not note.startswith("left out: ")]
     if made.corrupt and not any("corrupt" in note for note in odd):
-        odd.append(f"{made.corrupt} corrupt {made.report.unit}")
+        odd.append(f"{made.corrupt} corrupt {made.unit}")
     if made.missing:
-        odd.append(f"{made.missing} missing, the first after sample {made.report.first_missing}")
+        odd.append(f"{made.missing} missing, the first after sample {made.first_missing}")
     return odd
 
 
@@ -164,3 +166,58 @@ def codec_fields(text: str, option: str) -> dict[str, str]:
     if len(fields) < len(pairs) or not fields.get("codec"):
         raise ConfigError(f"{option} is codec=NAME&OPTION=VALUE..., each once, not {text!r}")
     return fields
+
+
+def check_picture(out: Path) -> None:
+    """Refuse a picture that cannot be drawn, before anything is read."""
+    if out.suffix.lower() not in PICTURES:
+        raise ConfigError(f"{out} is no picture: give --plot a {', '.join(PICTURES)}")
+    import matplotlib  # noqa: F401
+
+
+def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> None:
+    """Draw the samples of a recording that was imported."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
+    from tactile_rt.core.files import write_whole
+    from tactile_rt.core.stream import NS_PER_S, concatenate
+    from tactile_rt.recording.importing.report import report_lines
+    from tactile_rt.recording.reader import Recording
+
+    stored = Recording(path)
+    spec, chunk = stored.spec, concatenate(list(stored))
+    t_s = chunk.t_ns / NS_PER_S
+    values = np.where(chunk.valid[..., None], chunk.values, np.nan)
+    steps = np.diff(t_s)
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    lost = np.flatnonzero((np.diff(chunk.seq) > 1) | (steps > PAUSE * usual))
+    bad = np.concatenate([[False], ~chunk.valid.all(axis=1), [False]])
+    turns = np.flatnonzero(np.diff(bad)).reshape(-1, 2)  # where a stretch begins and ends
+    marks = {
+        "invalid": ("tab:red", [(t_s[a], t_s[b - 1] + usual - t_s[a]) for a, b in turns.tolist()]),
+        "missing": ("tab:orange", [(t_s[k], t_s[k + 1] - t_s[k]) for k in lost.tolist()]),
+    }
+    rows = spec.channels[:ROWS]
+    figure = Figure((10, 1.4 + 1.5 * len(rows)), layout="constrained")
+    axes: Any = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    edges = np.unique(np.linspace(0, len(t_s) - 1, min(BINS, len(t_s))).astype(int))
+    at = np.repeat(t_s[edges], 2)
+    for c, axis in enumerate(axes):
+        for e, name in enumerate(spec.elements):
+            both = [f.reduceat(values[:, e, c], edges) for f in (np.fmin, np.fmax)]
+            axis.plot(at, np.stack(both, 1).ravel(), lw=0.8, marker=".", ms=2, label=name)
+        for what, (color, spans) in marks.items():
+            if spans:
+                whole = {"transform": axis.get_xaxis_transform(), "alpha": 0.3, "label": what}
+                axis.broken_barh(spans, (0, 1), color=color, **whole)
+        axis.set_ylabel(f"{spec.channels[c]} [{spec.units[c]}]")
+        axis.grid(alpha=0.3)
+    labels = dict(zip(*axes[0].get_legend_handles_labels()[::-1], strict=True))
+    shown = [n for n in (*spec.elements[:NAMED], "invalid", "missing") if n in labels]
+    axes[0].legend([labels[n] for n in shown], shown, loc="upper right", fontsize="small", ncols=5)
+    rest = ((len(odd) - NOTES, "notes"), (len(spec.channels) - ROWS, "channels"))
+    notes = [*odd[:NOTES], *(f"and {n} {what} more" for n, what in rest if n > 0)]
+    axes[-1].set_xlabel("\n".join(["time [s]", *notes]), parse_math=False)
+    figure.suptitle(f"{stored.description.source}: {report_lines(made)[0]}", parse_math=False)
+    write_whole(out, lambda file: figure.savefig(file, format=out.suffix[1:].lower(), dpi=120))

@@ -1,7 +1,13 @@
-"""One line of a log of text: what candump, SavvyCAN, slcan adapters, terminals and dumps in
-hexadecimal print."""
+"""One line of a log of text: what candump, SavvyCAN, slcan adapters, tools of Vector and PEAK,
+python-can, terminals and dumps in hexadecimal write.
 
+What is no such line is None; a ValueError says why one is none that nearly is.
+"""
+
+import base64
 import re
+from collections import Counter
+from collections.abc import Mapping
 from typing import Any, Final
 
 from tactile_rt.core.stream import NS_PER_S
@@ -9,7 +15,10 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 
-__all__ = ["Found", "of_candump", "of_gvret", "of_heard", "of_hex", "of_slcan"]
+__all__ = [
+    "TRC_COLUMNS", "AscLines", "Found", "TrcLines", "of_candump", "of_gvret", "of_heard", "of_hex",
+    "of_slcan", "read_csv_line",
+]  # fmt: skip
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
@@ -35,9 +44,19 @@ _HEX: Final = re.compile(
     r"\s*(?:\[?(?P<t>\d+\.\d+)\]?(?:\s*s)?[\s,:;]+)?"
     r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
 )
-_ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
+_ERROR, _STANDARD, _EXTENDED = 1 << 29, 0x7FF, 0x1FFFFFFF
+_FD_BYTES: Final = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by the code of the length
+# Columns of each version of .trc: the letters of its line ;$COLUMNS.
+TRC_COLUMNS: Final = {
+    "1.0": "NOILD", "1.1": "NOdILD", "1.2": "NOBdILD", "1.3": "NOBdIRLD", "2.0": "NOTIdlD",
+    "2.1": "NOTBIdRLD",
+}  # fmt: skip
+_TRC_STATUS: Final = {"Warng", "Error", "ST", "EC", "ER", "EV"}  # of the bus: no frame
+_TRC_FD: Final = {"FD", "FB", "FE", "BI"}
 
-Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns
+# Bus, packet, when in ns. The packet is empty for an error frame, None for a line beside frames.
+Found = tuple[str, Any, int | None] | None
+BESIDE: Final = ("", None, None)
 
 
 def of_candump(line: str) -> Found:
@@ -46,37 +65,175 @@ def of_candump(line: str) -> Found:
     if found is None:
         return None
     if found["error"]:
-        return found["bus"], None, None
+        return found["bus"], [], None
     t_ns = _time(found["t"]) if found["t"] else None
     number = int(found["id"], 16)
     extended = len(found["id"]) == 8
     if extended and number & _ERROR:
-        return found["bus"], None, None
-    fd = found["fd"] is not None
+        return found["bus"], [], None
     remote = found["rtr"] is not None or (found["spaced"] or "").strip() == "remote request"
     text = "" if remote else found["hex"] or found["spaced"] or ""
     data = bytes.fromhex(text.replace(".", ""))
-    if len(data) > 64 or (found["n"] and not remote and int(found["n"]) != len(data)):
-        return None
-    fd = fd or len(data) > 8
-    return found["bus"], [CanFrame(number & _EXTENDED, data, extended, fd, remote)], t_ns
+    n, fd = int(found["n"] or len(data)), found["fd"] is not None
+    return _frame(found["bus"], t_ns, number & _EXTENDED, extended, data, n, fd, remote)
 
 
 def of_gvret(line: str) -> Found:
     """A line of what SavvyCAN saves (GVRET)."""
+    if line.lower().startswith("time stamp,"):
+        return BESIDE
     found = _GVRET.fullmatch(line)
     if found is None:
         return None
-    data, number = bytes.fromhex(found["hex"].replace(",", "")), int(found["id"], 16)
+    data, t_ns = bytes.fromhex(found["hex"].replace(",", "")), 1000 * int(found["us"])
     extended = found["extended"] == "true"
-    if (
-        len(data) != int(found["n"])
-        or len(data) > 64
-        or number > (_EXTENDED if extended else 0x7FF)
-    ):
+    return _frame(found["bus"], t_ns, int(found["id"], 16), extended, data, int(found["n"]))
+
+
+def read_csv_line(line: str) -> Found:
+    """Read a line of a table that python-can writes as text."""
+    if line.startswith("timestamp,"):
+        return BESIDE
+    t, number, extended, remote, error, n, text = line.split(",")
+    if error == "1":
+        return "", [], None
+    t_ns, data = round(float(t) * NS_PER_S), base64.b64decode(text)
+    return _frame("", t_ns, int(number, 16), extended == "1", data, int(n), remote=remote == "1")
+
+
+class AscLines:
+    """Lines of an .asc log, whose times may be differences, and whose identifiers names.
+
+    Args:
+        names: Identifiers, and whether they have 29 bits, of the messages whose names are known.
+
+    Attributes:
+        unknown: The number of frames of each name that is not known.
+        begun: Whether a trigger block has begun that has not ended.
+        odd_date: A date that is not read.
+    """
+
+    def __init__(self, names: Mapping[str, tuple[int, bool]]) -> None:
+        self.unknown: Counter[str] = Counter()
+        self.begun, self.odd_date = False, ""
+        self._names, self._base, self._differ = names, 16, False
+        self._began_ns = self._now_ns = 0
+
+    def read(self, line: str) -> Found:
+        """Read a line."""
+        words = line.split()
+        first = words[0].lower()
+        if re.fullmatch(r"\d+[.,]\d+", first):
+            since = round(float(first.replace(",", ".")) * NS_PER_S)
+            self._now_ns = since + self._now_ns * self._differ
+            return self._event(words[1:])
+        if first in ("date", "begin"):
+            if first == "begin":
+                self.begun, self._now_ns = True, 0
+            self._date(words[2 if first == "begin" else 1 :])
+        elif first == "base":
+            self._base = 10 if words[1:2] == ["dec"] else 16
+            self._differ = "relative" in line.lower()
+        elif first == "end":
+            self.begun = False
+        elif first not in ("internal", "no", "previous", "next") and not first.startswith("//"):
+            return None
+        return BESIDE
+
+    def _date(self, words: list[str]) -> None:
+        from can.io import ASCReader
+
+        try:
+            began_s = ASCReader._datetime_to_timestamp(" ".join(words[1:]))
+            self._began_ns = 1000 * round(1e6 * began_s)
+        except ValueError:
+            self.odd_date = self.odd_date or " ".join(words)
+
+    def _event(self, words: list[str]) -> Found:
+        """Read what follows the time of a line."""
+        fd = words[:1] == ["CANFD"]
+        bus, text, way, *rest = [*words[fd:], "", "", ""]
+        if fd:
+            text, way = way, text
+        if not bus.isdecimal():
+            return BESIDE if bus else None
+        if text.lower() == "errorframe":
+            return f"{int(bus) - 1}", [], None
+        if way == "TxRq" or ":" in (text[-1:], way[-1:]):  # statistics and the like
+            return BESIDE
+        if way not in ("Rx", "Tx"):
+            return None
+        if fd:  # a name may come first, then two flags and the code of the length
+            rest = ["d", *rest[3 + (not rest[0].isdigit()) :], "", ""]
+        identifier = self._identifier(text)
+        if identifier is None:
+            return BESIDE
+        remote, n = rest[0].lower() == "r", 0
+        if not remote:
+            n = int(rest[1]) if fd else min(8, int(rest[1], self._base))
+        told = rest[2 : 2 + n]
+        data = _unpack(" ".join(told)) if self._base == 16 else bytes(map(int, told))
+        t_ns = self._began_ns + self._now_ns
+        return _frame(f"{int(bus) - 1}", t_ns, *identifier, data, n, fd, remote)
+
+    def _identifier(self, text: str) -> tuple[int, bool] | None:
+        """Find an identifier, and whether it has 29 bits, by its number or name."""
+        digits = text.rstrip("xX")
+        extended = digits != text
+        try:
+            number = int(digits, self._base)
+        except ValueError:
+            number = -1
+        if text in self._names and not 0 <= number <= (_EXTENDED if extended else _STANDARD):
+            return self._names[text]
+        if number >= 0:
+            return number, extended
+        self.unknown[text] += 1
         return None
-    frame = CanFrame(number, data, extended, len(data) > 8)
-    return found["bus"], [frame], _time(found["us"], NS_PER_S // 1_000_000)
+
+
+class TrcLines:
+    """Lines of a .trc log, whose header says its version and columns.
+
+    Attributes:
+        version: Version of the format.
+    """
+
+    def __init__(self) -> None:
+        self.version = "1.0"
+        self._columns, self._began_ns = TRC_COLUMNS["1.0"], 0
+
+    def read(self, line: str) -> Found:
+        """Read a line; all of a version that is not known are beside frames."""
+        if line.startswith(";"):
+            key, _, value = line.strip().partition("=")
+            if key == ";$FILEVERSION":
+                self.version, self._columns = value, TRC_COLUMNS.get(value, "")
+            elif key == ";$COLUMNS" and self._columns:
+                self._columns = value.replace(",", "")
+            elif key == ";$STARTTIME":  # days from 30 December 1899
+                self._began_ns = round((float(value) - 25_569) * 86_400 * NS_PER_S)
+            return BESIDE
+        names = self._columns
+        cells = dict(zip(names, line.split(maxsplit=len(names) - 1), strict=False))
+        status = cells.get("T") or cells.get("d")
+        if not names or status in _TRC_STATUS or cells.get("I") == "FFFFFFFF":
+            return BESIDE
+        old = self.version < "2"
+        if len(cells) < len(names) - 1 or (old and not cells["N"].endswith(")")):
+            return None
+        if status not in ((None, "Rx", "Tx") if old else (*_TRC_FD, "DT", "RR")):
+            return None
+        text, fd = cells.get("D", ""), status in _TRC_FD
+        remote = status == "RR" or text.startswith("RTR")
+        n = int(cells["l"]) if "l" in cells else int(cells["L"])
+        if "L" in cells:
+            n = _FD_BYTES[n] if fd else min(8, n)
+        return _frame(
+            cells.get("B", "1"), self._began_ns + round(1e6 * float(cells["O"])),
+            int(cells["I"], 16), len(cells["I"]) > 4, _unpack("" if remote else text), n,
+            fd, remote,
+        )  # fmt: skip
 
 
 def of_slcan(line: str) -> Found:
@@ -103,10 +260,32 @@ def of_hex(line: str) -> Found:
     if found is None:
         return None
     t_ns = _time(found["t"]) if "t" in found.re.groupindex and found["t"] else None
-    try:
-        return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
-    except ValueError:
-        return None
+    return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
+
+
+def _unpack(text: str) -> bytes:
+    """Read bytes of two hexadecimal digits each."""
+    if not re.fullmatch(r"(?:\s*[0-9A-Fa-f]{2})*\s*", text):
+        raise ValueError("its bytes are damaged")
+    return bytes.fromhex(text)
+
+
+def _frame(
+    bus: str,
+    t_ns: int | None,
+    number: int,
+    extended: bool,
+    data: bytes,
+    n: int,
+    fd: bool = False,
+    remote: bool = False,
+) -> Found:
+    """Make a frame, which has n bytes if it is right."""
+    if number > (_EXTENDED if extended else _STANDARD):
+        raise ValueError("no such identifier")
+    if n > _FD_BYTES[-1] or (len(data) != n and not remote):
+        raise ValueError(f"{len(data)} of {n} bytes")
+    return bus, [CanFrame(number, data, extended, fd or n > 8, remote)], t_ns
 
 
 def _time(text: str, unit_ns: int = NS_PER_S) -> int | None:

@@ -9,7 +9,6 @@ anywhere and hold lines that are none: what can be read is, and `notes` say what
 
 import gzip
 import logging
-import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -18,18 +17,28 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
-from tactile_rt.drivers.can_lines import TRC_1_0, CanLines, Occurrences, find_asc_frame, has_names
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.log_lines import Found, of_candump, of_gvret, of_heard, of_hex, of_slcan
+from tactile_rt.drivers.log_lines import (
+    TRC_COLUMNS,
+    AscLines,
+    Found,
+    TrcLines,
+    of_candump,
+    of_gvret,
+    of_heard,
+    of_hex,
+    of_slcan,
+    read_csv_line,
+)  # fmt: skip
 
-__all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
+__all__ = ["CAN_FORMS", "FORMS", "LineLog", "Occurrences", "open_log_file", "read_log"]
 
 SERIAL_FORMS: Final = ("raw", "hex", "terminal")
-OF_PYTHON_CAN: Final = ("asc", "blf", "trc", "csv", "db")
-CAN_FORMS: Final = ("candump", "slcan", "gvret", *OF_PYTHON_CAN)
+CAN_FORMS: Final = ("candump", "slcan", "gvret", "asc", "blf", "trc", "csv", "db")
+BINARY: Final = ("blf", "db")
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
@@ -56,11 +65,25 @@ FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
 LINES: Final[dict[str, Callable[[str], Found]]] = {
     "candump": of_candump, "slcan": of_slcan,
-    "terminal": of_heard, "hex": of_hex, "gvret": of_gvret,
+    "terminal": of_heard, "hex": of_hex, "gvret": of_gvret, "csv": read_csv_line,
 }  # fmt: skip
-Timed = tuple[Any, int | None]  # a packet, and when it came, ns
+Read = tuple[str, Any, int | None]  # bus, packet, empty for an error frame, and time, ns
 
-LogFile = BufferedReader
+
+class Occurrences:
+    """How many there are of something, and which is the first."""
+
+    def __init__(self, what: str) -> None:
+        self.what, self.n, self.first, self.why = what, 0, 0, ""
+
+    def add(self, number: int, why: str = "") -> None:
+        """Count the one of this number."""
+        if not self.n:
+            self.first, self.why = number, why
+        self.n += 1
+
+    def __str__(self) -> str:
+        return f"{self.n} ({self.what} {self.first}{f': {self.why:.60}' * bool(self.why)})"
 
 
 class LineLog:
@@ -88,7 +111,7 @@ class LineLog:
         self.total = self.frames = 0
         self.back = Occurrences("packet")  # times that go back
 
-    def packets(self) -> Iterator[Timed]:
+    def packets(self) -> Iterator[tuple[Any, int | None]]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
         not say. Times never go back.
         """
@@ -96,166 +119,126 @@ class LineLog:
         self.buses.clear()
         self.total = self.frames = 0
         latest, self.back = -(1 << 62), Occurrences("frame" if self.wire == "can" else "packet")
+        number = errors = 0
+        read = self._raw if self.form == "raw" else self._text
         with open_log_file(self.path) as file:
-            for number, (packet, t_ns) in enumerate(self._read(file), 1):
+            for bus, packet, t_ns in (self._binary if self.form in BINARY else read)(file):
+                self.frames += 1
+                if not packet:
+                    errors += 1
+                    continue
+                self.buses[bus] += 1
+                if self._bus and bus != self._bus:
+                    continue
+                number += 1
                 if t_ns is not None:
                     if t_ns < latest:
                         self.back.add(number)
-                        t_ns = latest
-                    latest = t_ns
+                    t_ns = latest = max(t_ns, latest)
                 yield packet, t_ns
+            if getattr(file.raw, "broken", False):
+                self.notes.append("it is cut short or damaged: what unpacks of it was read")
+        self.notes += [f"{errors} error frames"] if errors else []
+        if self._bus and self._bus not in self.buses:
+            known = ", ".join(sorted(self.buses)) or "none"
+            self.notes.append(f"no frames are of bus {self._bus}; there are those of {known}")
+        elif len(self.buses) > 1:
+            named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(self.buses.items()))
+            taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
+            self.notes.append(f"frames of several buses: {named}; {taken}")
         if self.back.n:
             self.notes.append(
                 f"{self.back.n} times go back ({self.back.what} {self.back.first} is the first); "
                 "these packets have the time before"
             )
 
-    def _read(self, file: "LogFile") -> Iterator[Timed]:
-        if self.form == "raw":
-            while piece := file.read(self.piece):
-                self.total += len(piece)
-                yield piece, None
-        elif self.form in OF_PYTHON_CAN:
-            yield from self._logged(file)
-        else:
-            yield from self._text(file)
-        if getattr(file.raw, "broken", False):
-            self.notes.append("it is cut short or damaged: what unpacks of it was read")
+    def _raw(self, file: BufferedReader) -> Iterator[Read]:
+        while piece := file.read(self.piece):
+            self.total += len(piece)
+            yield "", piece, None
 
-    def _text(self, file: LogFile) -> Iterator[Timed]:
-        parse, errors, buses = LINES[self.form], 0, self.buses
-        others, blank, number = Occurrences("line"), 0, 0
-        apart, now = self.form == "candump" and _times_are_apart(self.path), 0
-        with TextIOWrapper(file, "utf-8-sig", "replace") as lines:
+    def _text(self, file: BufferedReader) -> Iterator[Read]:
+        """Read lines of text, and note those that are none of its form."""
+        asc, trc = AscLines(self.names), TrcLines()
+        parse = {"asc": asc.read, "trc": trc.read, **LINES}[self.form]
+        odd, number, now = Occurrences("line"), 0, 0
+        apart = self.form == "candump" and _times_are_apart(self.path)
+        with TextIOWrapper(file, _encoding(_head(self.path)), "replace") as lines:
             for number, line in enumerate(lines, 1):
-                found = parse(line.rstrip("\r\n"))
+                if not line.strip():
+                    continue
+                self.total += 1
+                found, why = _parse(parse, line.rstrip("\r\n"))
                 if found is None:
-                    if not line.strip() or (number == 1 and self.form == "gvret"):
-                        blank += 1  # as good as: the names of columns
-                    else:
-                        others.add(number)
+                    odd.add(number, why)
                     continue
                 bus, packet, t_ns = found
                 if packet is None:
-                    errors += 1
                     continue
                 if self.form == "terminal" and t_ns is not None:  # on after midnight
                     now = t_ns = t_ns + DAY_NS * max(0, -((t_ns - now + DAY_NS // 4) // DAY_NS))
                 if apart:
                     t_ns = now = now + (t_ns or 0)
-                buses[bus] += 1
-                if not self._bus or bus == self._bus:
-                    yield packet, t_ns
-        self.total, self.frames = number - blank, number - blank - others.n
-        self._tell(others, "line", errors)
-
-    def _logged(self, file: LogFile) -> Iterator[Timed]:
-        """Read what python-can does: what it passes over in silence, a note says."""
-        warned = _Warnings()
-        logging.getLogger("can").addHandler(warned)  # it tells us, not the terminal
-        errors, buses, n = 0, self.buses, 0
-        lines: CanLines | None = None
-        if self.form in ("asc", "csv", "trc"):
-            text, named = TextIOWrapper(file, "utf-8-sig", "replace"), False
-            if self.form == "asc":
-                named = has_names(_lines(_head(self.path)))
-            lines = CanLines(text, self.form, self.names, named)
-        try:
-            made = self._reader(file, lines)
-            for message in self._read_messages(made, lines):
-                n += 1
-                bus = "" if message.channel is None else str(message.channel)
-                if message.is_error_frame:
-                    errors += 1
-                    continue
-                buses[bus] += 1
-                if not self._bus or bus == self._bus:
-                    yield [
-                        CanFrame(
-                            message.arbitration_id, bytes(message.data), message.is_extended_id,
-                            message.is_fd, message.is_remote_frame,
-                        )
-                    ], round(NS_PER_S * message.timestamp)  # fmt: skip
-        finally:
-            logging.getLogger("can").removeHandler(warned)
-            if lines is not None:
-                lines.close()
-        others = Occurrences("line")
-        self.total, self.frames = n, n
-        if lines is not None:
-            lines.finish()
-            others, self.total = lines.lost, lines.filled
-            self.notes += lines.notes
-            if lines.begun:  # in its last line, most often
-                last = others.n == 1 and others.first == lines.number
-                others = Occurrences("line") if last else others
-                self.notes.append(f"it ends before its end: {n} frames were read")
-        elif self.form == "blf" and made is not None:
-            self.total = max(n, made.object_count)
-            self._check_end(file, made, n)
-        self.notes += warned.notes[:3] if self.form != "trc" else []  # whose lines are counted
-        self._tell(others, "frame", errors)
-
-    def _reader(self, file: LogFile, lines: CanLines | None) -> Any:
-        """Make python-can's reader; None where the file does not even begin as it should."""
-        from can.io import ASCReader, BLFReader, CSVReader, SqliteReader, TRCReader
-
-        if lines is not None:
-            kinds = {"asc": ASCReader, "csv": CSVReader, "trc": TRCReader}
-            return kinds[self.form](lines, relative_timestamp=False)
-        if self.form == "db":
-            return SqliteReader(self.path)
-        try:
-            made: Any = BLFReader(file)
-        except (struct.error, ValueError) as error:
-            self.notes.append(f"it is cut short or damaged after 0 frames ({error!s:.80})")
-            return None
-        made.stop = lambda: None  # `file` is looked at once more
-        return made
-
-    def _read_messages(self, made: Any, lines: CanLines | None) -> Iterator[Any]:
-        """Read messages, and go on after lines that python-can cannot read."""
-        n = 0
-        while True:
-            at = lines.number if lines else 0
-            try:
-                for message in made or ():
-                    n += 1
-                    if lines is None or lines.accept(message):
-                        yield message
-                return
-            except (OSError, GeneratorExit):
-                raise
-            except Exception as error:  # python-can raises anything on what is cut or damaged
-                why = " ".join(str(error).split()) or type(error).__name__
-                if lines is None or lines.number == at:
-                    self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
-                    return
-                if not lines.settle(why):
-                    self.notes.append(f"line {lines.number} of its header is not read ({why:.60})")
-                lines.resume()
-
-    def _check_end(self, file: LogFile, made: Any, n: int) -> None:
-        """Note that a .blf is shorter than its header says, or ends within an object."""
-        short = file.seekable() and file.tell() < made.file_size  # one that is cut is noted
-        if (short or made._tail.strip(b"\0")) and not self.notes:
-            of = f" of {made.object_count}" if n < made.object_count else ""
-            self.notes.append(f"it ends before its end: {n} frames{of} were read")
-
-    def _tell(self, others: Occurrences, what: str, errors: int) -> None:
-        buses = self.buses
-        if others.n:
+                yield bus, packet, t_ns
+        if asc.odd_date:
+            self.notes.append(f"its date, {asc.odd_date:.40}, is not read: times count from 0")
+        if asc.unknown:
+            why = (
+                "not in the DBC file" if self.names else "codec=can-dbc knows those of its DBC file"
+            )
+            self.notes.append(
+                f"identifiers are names here ({name_some(list(asc.unknown))}), not read in "
+                f"{asc.unknown.total()} frames: {why}"
+            )
+        if trc.version not in TRC_COLUMNS:
+            self.notes.append(
+                f"version {trc.version[:20]!r} of a .trc is not read: there are "
+                f"{', '.join(TRC_COLUMNS)}"
+            )
+        if asc.begun:  # in its last line, most often
+            self.notes.append(f"it ends before its end: {self.frames} frames were read")
+        if odd.n and not (asc.begun and odd.n == 1 and odd.first == number):
             a = "an" if self.form == "asc" else "a"
-            self.notes.append(f"passed over, no {what} of {a} {self.form} log: {others}")
-        if errors:
-            self.notes.append(f"{errors} error frames")
-        if self._bus and self._bus not in buses:
-            known = ", ".join(sorted(buses)) or "none"
-            self.notes.append(f"no frames are of bus {self._bus}; there are those of {known}")
-        elif len(buses) > 1:
-            named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(buses.items()))
-            taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
-            self.notes.append(f"frames of several buses: {named}; {taken}")
+            what = "frame" if self.form in ("asc", "csv", "trc") else "line"
+            self.notes.append(f"passed over, no {what} of {a} {self.form} log: {odd}")
+
+    def _binary(self, file: BufferedReader) -> Iterator[Read]:
+        """Read messages by python-can, up to where the file is damaged."""
+        from can.io import BLFReader, SqliteReader
+
+        warned = logging.getLogger("can.io.blf")
+        warned.addFilter(self._note_warning)
+        try:
+            made: Any = SqliteReader(self.path) if self.form == "db" else BLFReader(file)
+            made.stop = lambda: None  # `file` is looked at once more
+            for message in made:
+                bus = "" if message.channel is None else str(message.channel)
+                frame = CanFrame(
+                    message.arbitration_id, bytes(message.data), message.is_extended_id,
+                    message.is_fd, message.is_remote_frame,
+                )  # fmt: skip
+                packet = [] if message.is_error_frame else [frame]
+                yield bus, packet, round(NS_PER_S * message.timestamp)
+            if self.form == "blf":
+                self.total = made.object_count
+                n, short = self.frames, file.seekable() and file.tell() < made.file_size
+                if (short or made._tail.strip(b"\0")) and not self.notes:
+                    of = f" of {made.object_count}" if n < made.object_count else ""
+                    self.notes.append(f"it ends before its end: {n} frames{of} were read")
+        except OSError:
+            raise
+        except Exception as error:  # python-can raises anything on what is cut or damaged
+            why = " ".join(str(error).split()) or type(error).__name__
+            self.notes.append(f"it is cut short or damaged after {self.frames} frames ({why:.80})")
+        finally:
+            warned.removeFilter(self._note_warning)
+            self.total = max(self.total, self.frames)
+
+    def _note_warning(self, record: logging.LogRecord) -> bool:
+        """Note what python-can passes over with a warning, and not on the terminal."""
+        note = " ".join(record.getMessage().split())
+        self.notes += [note] if note not in self.notes else []
+        return False
 
 
 def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
@@ -312,32 +295,35 @@ class _Unpacked(RawIOBase):
         super().close()
 
 
-class _Warnings(logging.Handler):
-    """What python-can passes over with a warning, once each."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.notes: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        note = " ".join(record.getMessage().split())
-        if note not in self.notes:
-            self.notes.append(note)
-
-
 def _head(path: Path) -> bytes:
     with open_log_file(path) as file:
         return file.read(HEAD)
 
 
+def _encoding(head: bytes) -> str:
+    return "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+
+
 def _lines(head: bytes) -> list[str]:
-    lines = [x for x in head.decode("utf-8-sig", "replace").splitlines() if x.strip()]
+    lines = [x for x in head.decode(_encoding(head), "replace").splitlines() if x.strip()]
     return lines[:-1] if len(head) == HEAD else lines  # the last one was cut
+
+
+def _parse(parse: Callable[[str], Found], line: str) -> tuple[Found, str]:
+    """Read a line, or say why it is none."""
+    try:
+        return parse(line), ""
+    except (ValueError, LookupError) as error:
+        return None, str(error)
+
+
+def _count_frames(parse: Callable[[str], Found], lines: list[str]) -> int:
+    return sum(x is not None and x[1] is not None for x in (_parse(parse, y)[0] for y in lines))
 
 
 def _times_are_apart(path: Path) -> bool:
     """Whether the times of candump are differences (-td): from 0 on, up and down."""
-    found = [of_candump(line) for line in _lines(_head(path))]
+    found = [_parse(of_candump, line)[0] for line in _lines(_head(path))]
     times = [one[2] for one in found if one is not None and one[2] is not None]
     if len(times) < 3 or times[0]:
         return False
@@ -351,31 +337,30 @@ def _form(path: Path) -> str:
         return "blf"
     if head.startswith(SQLITE):
         return "db"
-    if b"\0" in head:
-        return "raw"
     lines = _lines(head)
     if not lines:
         return "raw"
+    most = max(1, MOSTLY * len(lines))
     entries = [x for x in lines if not x.startswith(";")]
     if any(x.startswith(";$FILEVERSION") for x in lines) or (
-        entries != lines and sum(map(bool, map(TRC_1_0.fullmatch, entries))) > MOSTLY * len(entries)
+        entries != lines
+        and _count_frames(TrcLines().read, entries) >= max(1, MOSTLY * len(entries))
     ):
         return "trc"
     if lines[0].startswith(CSV_HEADER):
         return "csv"
     if lines[0].lower().startswith(SAVVYCAN_HEADER):
         return "gvret"
+    asc = AscLines({})
     begins = {x.split()[0].lower() for x in lines[:6]}
-    if begins >= {"date", "base"} or sum(map(bool, map(find_asc_frame, lines))) >= MOSTLY * len(
-        lines
-    ):
+    if begins >= {"date", "base"} or _count_frames(asc.read, lines) + asc.unknown.total() >= most:
         return "asc"
     for form in ("candump", "slcan", "terminal"):
-        if sum(LINES[form](x) is not None for x in lines) >= MOSTLY * len(lines):
+        if _count_frames(LINES[form], lines) >= most:
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
-    hexes = [of_hex(x) for x in lines]
-    right = sum(x is not None for x in hexes) >= MOSTLY * len(lines)
-    data = b"".join(found[1] or b"" for found in hexes if found is not None)
+    hexes = [x for x in (_parse(of_hex, line)[0] for line in lines) if x is not None]
+    data = b"".join(x[1] for x in hexes)
     letters = sum(b & 15 > 9 or b > 0x9F for b in data)
-    return "hex" if right and len(data) >= 16 and letters > len(data) / 16 else "raw"
+    right = len(hexes) >= most and len(data) >= 16 and letters > len(data) / 16
+    return "hex" if right else "raw"

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import open_regular
 from tactile_rt.core.settings import take_options
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
@@ -150,9 +150,8 @@ def _check_file(path: Path) -> None:
     """Refuse what is no file, or begins as no recording does."""
     if not os.path.isfile(path):
         raise ConfigError(f"no file {path}")
-    check_no_pointer(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             begins = file.read(len(MAGIC))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None

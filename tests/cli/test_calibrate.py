@@ -203,7 +203,7 @@ def test_times_in_a_recording_do_as_well(call, device, tmp_path):
 
 def test_samples_that_were_calibrated_as_they_were_recorded_are_no_readings(refused, tmp_path):
     from tactile_rt.recording.description import Description
-    from tactile_rt.recording.importing.mending import Import, write_chunks
+    from tactile_rt.recording.importing.report import Import, write_chunks
 
     (chunk,) = cut(np.zeros((50, 2, 2)), SPEC.rate_hz, 50)
     about = Description(SPEC, 0, "", calibration=Calibration.of("cell", SPEC))

@@ -90,7 +90,7 @@ ODD = [
     (HALF[:-9], 3, "it ends before its end: 3 frames were read"),
     (HALF[:-2], 3, "it ends before its end: 3 frames were read"),
     (HALF, 4, "it ends before its end: 4 frames were read"),
-    (HALF.replace("02 FF", "ZZ FF") + END, 3, "no frame of an asc log: 1 (line 7: inv"),
+    (HALF.replace("02 FF", "ZZ FF") + END, 3, "no frame of an asc log: 1 (line 7: its"),
     (HALF.replace("1A0             Rx   d 3 02", "1A0             R#   d 3 02") + END, 3,
      "passed over, no frame of an asc log: 1 (line 7)"),
     (HALF.replace("02 FF 07", "02 FF") + END, 3, "an asc log: 1 (line 7: 2 of 3 bytes)"),
@@ -98,7 +98,7 @@ ODD = [
     (HALF.replace("1A0", "FA0") + END, 0, "no frame of an asc log: 4 (line 5: no such"),
     ("date mar. mars 5 2024\n" + ABSOLUTE + frames(CLASSIC), 4, "date, mar. mars 5 2024, is not"),
     (GOOD["trc 1.1"].replace("02 FF 07\n", "02 FF\n"), 3, "no frame of a trc log: 1 (l"),
-    (GOOD["trc 1.3"][:-2], 3, "passed over, no frame of a trc log: 1 (line 6: cut in a byte)"),
+    (GOOD["trc 1.3"][:-2], 3, "passed over, no frame of a trc log: 1 (line 6: its b"),
     (GOOD["trc 2.0"].replace("=2.0", "=9.0"), 0, "version '9.0' of a .trc is not read"),
     (GOOD["csv twice"].replace("Av8H", "Av8"), 3, "passed over, no frame of a csv log: 1 (line 5"),
 ]  # fmt: skip

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, name_some
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import open_regular
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import convert, read_toml
 from tactile_rt.core.stream import ArraySpec
@@ -196,9 +196,8 @@ class _Reader:
             raise lacking("codec can-dbc needs", "dbc", error) from None
         self.path, self.file = path, file
         self.dbc = path.parent / file.dbc
-        check_no_pointer(self.dbc)
         try:
-            with self.dbc.open("rb") as dbc:
+            with open_regular(self.dbc) as dbc:
                 content = dbc.read(MOST_BYTES + 1)
         except OSError as error:
             raise ConfigError(f"{path}, dbc: {self.dbc}: {error.strerror or error}") from None

@@ -21,12 +21,13 @@ from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
-from tactile_rt.drivers.can_lines import Occurrences
 from tactile_rt.drivers.codecs.ascii_mapping import parse_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.drivers.logs import Occurrences
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.importing.mending import Import, clock_of, mend_bag, write_chunks
+from tactile_rt.recording.importing.mending import mend_bag
 from tactile_rt.recording.importing.proposing import propose_fields
+from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
 from tactile_rt.recording.importing.table import (
     BESIDE,
     Table,
@@ -237,15 +238,15 @@ def import_bag(
         table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
         table.rows = _rows(table, bag, chosen.name, steps, channels)
         made = import_table(table, output, words, rate_hz)
-        made.report.out_of_order = bag.back
+        made.out_of_order = bag.back
         return _count_messages(made, chosen)
 
 
 def _count_messages(made: Import, topic: BagTopic) -> Import:
     """Count the messages that the bag's index tells, also those that were not read."""
-    report, unread = made.report, topic.messages - made.intact - made.corrupt
-    report.unit, report.total = "messages", max(topic.messages, made.intact + made.corrupt)
-    report.passed_over = report.total - report.read
+    unread = topic.messages - made.intact - made.corrupt
+    made.unit, made.total = "messages", max(topic.messages, made.intact + made.corrupt)
+    made.passed_over = made.total - made.read
     if unread > 0:
         made.notes.append(f"{unread} of {topic.messages} messages were not read")
     return made

@@ -1,24 +1,39 @@
-"""What came of an import: counts that add up, times, rates, ranges, and what is odd."""
+"""What came of an import, as a recording and in text."""
 
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.files import write_whole
+from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
+from tactile_rt.recording.description import SUMMARY, Description
+from tactile_rt.recording.layout import SAMPLES, encode_samples
+from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.writer import McapFile
 
-__all__ = ["ImportReport", "Measurer", "report_lines", "show_time"]
+__all__ = [
+    "Import", "clock_of", "measure_samples", "report_lines",
+    "write_chunks",
+]  # fmt: skip
 
-BLOCK = 4096  # samples that are measured together
-SHOWN = 8  # channels in text
+BLOCK: Final = 4096  # chunks that are measured together
+CHUNK_S: Final = 0.01  # of a chunk, as live sources have it
+FEWEST: Final = 100_000  # chunks beyond which they are longer
+UTC_FROM_NS: Final = 10**17  # a time that is larger counts from 1970
+SHOWN: Final = 8  # channels in text
 
 
 @dataclass
-class ImportReport:
+class Import:
     """What a file held, and what of it became samples.
 
     Attributes:
+        missing: The number of samples that never came, by the device's counter.
         unit: What `total`, `read` and `passed_over` count: bytes, lines, frames, messages or rows.
         out_of_order: How many times go back; None where nobody counted.
         found_hz: Rate by the times of the file; None where it has none.
@@ -29,6 +44,13 @@ class ImportReport:
         ranges: Smallest and largest valid value of each column, SI, by ELEMENT.CHANNEL.
     """
 
+    samples: int = 0
+    intact: int = 0
+    corrupt: int = 0
+    missing: int = 0
+    seconds: float = 0.0
+    rate_hz: float = 0.0
+    notes: list[str] = field(default_factory=list)
     unit: str = "rows"
     total: int = 0
     read: int = 0
@@ -44,72 +66,44 @@ class ImportReport:
     ranges: dict[str, tuple[float, float] | None] = field(default_factory=dict)
 
 
-class Measurer:
-    """Takes the samples as they are written, and fills in a `ImportReport`.
-
-    Args:
-        utc_offset_ns: What was taken off the times, ns.
-    """
-
-    def __init__(self, report: ImportReport, spec: ArraySpec, utc_offset_ns: int) -> None:
-        self._report, self._spec, self._offset = report, spec, utc_offset_ns
-        self._waiting: list[Chunk] = []
-        self._n = 0
-        self._low: NDArray[np.float32] = np.full(spec.shape, np.nan, np.float32)
-        self._high = self._low
-        self._seq: int | None = None
-        self._times = [0, 0]
-
-    def add(self, chunk: Chunk) -> None:
-        """Take samples."""
-        self._waiting.append(chunk)
-        if len(self._waiting) >= BLOCK:
-            self._measure()
-
-    def finish(self) -> None:
-        """Fill in times and ranges."""
-        self._measure()
-        report, spec = self._report, self._spec
-        report.first, report.last = (show_time(t + self._offset) for t in self._times)
-        names = [f"{e}.{c}" for e in spec.elements for c in spec.channels]
-        pairs = zip(self._low.ravel().tolist(), self._high.ravel().tolist(), strict=True)
-        report.units = dict(zip(spec.channels, spec.units, strict=True))
-        report.ranges = {
-            name: None if low != low else (low, high)
-            for name, (low, high) in zip(names, pairs, strict=True)
-        }
-
-    def _measure(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return
-        seq = np.concatenate([c.seq for c in waiting])
-        valid = np.concatenate([c.valid for c in waiting])
-        values = np.where(valid[..., None], np.concatenate([c.values for c in waiting]), np.nan)
-        if self._seq is None:
-            self._times[0] = int(waiting[0].t_ns[0])
-        self._times[1] = int(waiting[-1].t_ns[-1])
-        gaps = np.flatnonzero(
-            np.diff(seq, prepend=seq[0] - 1 if self._seq is None else self._seq) > 1
-        )
-        if len(gaps) and self._report.first_missing is None:
-            self._report.first_missing = self._n + int(gaps[0])
-        self._seq, self._n = int(seq[-1]), self._n + len(seq)
-        self._report.invalid += int((~valid.all(axis=1)).sum())
-        self._low = np.fmin(self._low, np.fmin.reduce(values))
-        self._high = np.fmax(self._high, np.fmax.reduce(values))
+def measure_samples(account: Import, path: Path) -> None:
+    """Fill in the number, times, gaps and ranges of the samples of a recording."""
+    stored = Recording(path)
+    spec, offset, chunks = stored.spec, stored.description.utc_offset_ns, iter(stored)
+    low = high = np.full(spec.shape, np.nan, np.float32)
+    n, seq, times = 0, 0, [0, 0]
+    while parts := list(islice(chunks, BLOCK)):
+        chunk = concatenate(parts)
+        values = np.where(chunk.valid[..., None], chunk.values, np.nan)
+        low, high = np.fmin(low, np.fmin.reduce(values)), np.fmax(high, np.fmax.reduce(values))
+        account.invalid += int((~chunk.valid.all(axis=1)).sum())
+        seq = seq if n else int(chunk.seq[0]) - 1
+        gaps = np.flatnonzero(np.diff(chunk.seq, prepend=seq) > 1)
+        if len(gaps) and account.first_missing is None:
+            account.first_missing = n + int(gaps[0])
+        times = [times[0] if n else int(chunk.t_ns[0]), int(chunk.t_ns[-1])]
+        n, seq = n + len(chunk), int(chunk.seq[-1])
+    account.samples, account.seconds = n, (times[1] - times[0]) / NS_PER_S
+    account.rate_hz = spec.rate_hz
+    account.first, account.last = (show_time(t + offset) for t in times)
+    account.units = dict(zip(spec.channels, spec.units, strict=True))
+    names = [f"{e}.{c}" for e in spec.elements for c in spec.channels]
+    pairs = zip(low.ravel().tolist(), high.ravel().tolist(), strict=True)
+    account.ranges = {
+        name: None if np.isnan(pair[0]) else pair for name, pair in zip(names, pairs, strict=True)
+    }
 
 
 def show_time(t_ns: int) -> str:
     """Write a time as UTC where it counts from 1970, else in seconds."""
-    if t_ns < 10**17:
+    if t_ns < UTC_FROM_NS:
         return f"{round(t_ns / NS_PER_S, 6):.12g} s"
     return datetime.fromtimestamp(t_ns // NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S") + (
         f".{t_ns % NS_PER_S // 1000:06d} UTC"
     )
 
 
-def report_lines(report: ImportReport) -> list[str]:
+def report_lines(report: Import) -> list[str]:
     """Write a report as lines of text: counts, times, and the range of each channel."""
     hz = [
         f"{rate:.6g} Hz {what}"
@@ -118,6 +112,8 @@ def report_lines(report: ImportReport) -> list[str]:
     ]
     order = "" if report.out_of_order is None else f", {report.out_of_order} out of order"
     lines = [
+        f"{report.samples} samples in, {report.intact} intact, {report.corrupt} corrupt, "
+        f"{report.missing} missing; {report.seconds:.6g} s at {report.rate_hz:.6g} Hz",
         f"{report.total} {report.unit}: {report.read} read, {report.passed_over} passed over{order}"
         f"; {report.invalid} samples have an invalid element",
         f"from {report.first} to {report.last}{''.join(f'; {x}' for x in hz)}",
@@ -133,3 +129,45 @@ def report_lines(report: ImportReport) -> list[str]:
     if len(of) > SHOWN:
         lines.append(f"and {len(of) - SHOWN} channels more")
     return lines
+
+
+def clock_of(first_ns: int) -> int:
+    """Return what to take off a file's times, ns: all if they count from 1970."""
+    return first_ns if first_ns >= UTC_FROM_NS else 0
+
+
+def write_chunks(
+    output: Path, about: Description, chunk: Chunk, account: Import, what: str
+) -> Import:
+    """Write a recording of these samples, cut as a live source would.
+
+    Args:
+        output: the file to write; it is there whole or not at all.
+        account: what became of the file; samples, seconds and rate are filled in.
+
+    Raises:
+        RecordingError: no sample is valid.
+    """
+    if not chunk.valid.any():
+        raise RecordingError(f"{what}: no number of a measurement in {len(chunk)} lines")
+    n, rate = len(chunk), about.spec.rate_hz
+    span_s = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
+    account.total, account.read = account.intact + account.corrupt, account.intact
+    account.passed_over = account.corrupt
+    account.found_hz = int(chunk.seq[-1] - chunk.seq[0]) / span_s if span_s else None
+    size = max(1, round(CHUNK_S * rate), n // FEWEST)
+
+    def fill(file: BinaryIO) -> None:
+        made = McapFile(file, about)
+        for at in range(0, n, size):
+            piece = slice(at, at + size)
+            part = Chunk(
+                chunk.seq[piece], chunk.t_ns[piece], chunk.values[piece], chunk.valid[piece]
+            )
+            made.add(SAMPLES, encode_samples(part), int(part.t_ns[-1]))
+        made.note(SUMMARY, {"samples": str(n), "packets": "0"})
+        made.finish()
+
+    write_whole(output, fill)
+    measure_samples(account, output)
+    return account

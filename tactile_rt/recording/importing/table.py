@@ -37,7 +37,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.importing.mending import Import, clock_of, write_chunks
+from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
 
 __all__ = ["BESIDE", "Table", "import_table", "place_columns", "shown_names"]
 

@@ -5,26 +5,24 @@ times, the device's own clock dates the samples; a device without one is taken t
 nominal rate, and what its counter or its damaged frames tell of lost samples takes time, too.
 """
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, Chunk, SourceStats
-from tactile_rt.drivers.can_lines import Occurrences
+from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
-from tactile_rt.drivers.logs import LineLog
+from tactile_rt.drivers.logs import CAN_FORMS, LineLog, Occurrences
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.description import SUMMARY, Description
-from tactile_rt.recording.importing.mending import Import, clock_of
-from tactile_rt.recording.importing.report import Measurer
+from tactile_rt.recording.importing.report import Import, clock_of, measure_samples
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
 
@@ -32,6 +30,7 @@ __all__ = ["import_wire"]
 
 PROBED, SHORTEST = 16_384, 8  # bytes
 FEW, UNUSUAL = 10, 1.2  # samples; how far their rate may be from the codec's
+LAST = 4  # packets that are fed byte by byte
 AHEAD = 4096  # packets in which a device may describe itself before samples must come
 
 
@@ -58,8 +57,7 @@ def import_wire(
         decoded = _Decoded(log, codec, about, stats)
         made = McapFile(file, decoded.about)
         made.add(WIRE, encode_packet(None, about.wire), 0)
-        measurer = Measurer(account.report, decoded.about.spec, decoded.about.utc_offset_ns)
-        first = last = packets = 0
+        packets = 0
         for packet, t_ns, chunk in decoded:
             made.add(WIRE, encode_packet(packet, about.wire), t_ns)
             packets += 1
@@ -67,10 +65,7 @@ def import_wire(
                 continue
             own = decoded.about.clock == "device"
             made.add(SAMPLES, encode_samples(chunk), t_ns if own else int(chunk.t_ns[-1]))
-            first = first if account.samples else int(chunk.t_ns[0])
-            last = int(chunk.t_ns[-1])
             account.samples += len(chunk)
-            measurer.add(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
         if log.wire == "serial" and decoded.unfinished:
@@ -79,12 +74,10 @@ def import_wire(
             account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
-        measurer.finish()
         _count(log, codec, decoded, account)
-        account.seconds = (last - first) / NS_PER_S
-        account.rate_hz = decoded.about.spec.rate_hz
 
     write_whole(output, fill)
+    measure_samples(account, output)
     account.intact, account.corrupt = codec.stats.intact, codec.stats.corrupt
     account.missing, account.notes = stats.missing, [*log.notes, *account.notes]
     if codec.stats.incomplete:
@@ -95,9 +88,9 @@ def import_wire(
     if account.samples >= FEW and not getattr(codec, "claims_rate", True):
         if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
             return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
-    account.report.said_hz = account.rate_hz
-    if account.report.found_hz is not None:
-        account.report.found_hz = came_hz
+    account.said_hz = account.rate_hz
+    if account.found_hz is not None:
+        account.found_hz = came_hz
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
         account.notes.append(
             f"they came at {came_hz:.4g} Hz, not at {account.rate_hz:g} Hz as is claimed: --rate "
@@ -109,13 +102,13 @@ def import_wire(
 
 def _count(log: LineLog, codec: Codec[Any], decoded: "_Decoded", account: Import) -> None:
     """Count what the file held, and how much of it was read."""
-    report, raw = account.report, log.form == "raw"
-    report.unit = {"raw": "bytes", "blf": "objects", "db": "frames"}.get(log.form, "lines")
-    report.total = log.total
-    report.read = log.total - decoded.skipped - decoded.unfinished if raw else log.frames
-    report.passed_over = report.total - report.read
-    report.out_of_order = log.back.n
-    report.found_hz = 1.0 if decoded.timed else None
+    account.unit = {"raw": "bytes", "blf": "objects", "db": "frames"}.get(log.form, "lines")
+    account.total, account.read = log.total, log.frames
+    if log.form == "raw":
+        account.read = log.total - decoded.skipped - decoded.unfinished
+    account.passed_over = account.total - account.read
+    account.out_of_order = log.back.n
+    account.found_hz = 1.0 if decoded.timed else None
     if decoded.corrupt.n:
         account.notes.append(f"corrupt frames: {decoded.corrupt}")
 
@@ -127,6 +120,11 @@ def _prepared(
     own, name, array = _own(fields), fields.get("codec", ""), fields.get("array", "")
     if not name:
         raise ConfigError("--as needs codec=NAME, see `tactile-rt codecs`")
+    if log.form == "raw" and ("can", name) in CODECS and ("serial", name) not in CODECS:
+        raise ConfigError(
+            f"{log.path} is no CAN log of {', '.join(CAN_FORMS)}, and codec {name} speaks over "
+            "can:; --form says which it is"
+        )
     if rate_hz and "rate_hz" in codec_class(log.wire, name).Options.__dataclass_fields__:
         own.setdefault("rate_hz", f"{rate_hz:g}")
     codec = make_codec(log.wire, name, own)
@@ -178,6 +176,7 @@ class _Decoded:
         packets = log.packets()
         if log.form in ("raw", "terminal"):  # which begin with their first line
             packets = _lead(packets, getattr(codec, "line_end", b""))
+        packets = _cut_last(packets)
         waiting: list[tuple[Any, int | None, Samples | None]] = []
         for packet, t_ns in packets:
             waiting.append((packet, t_ns, self._take(packet, t_ns)))
@@ -191,7 +190,7 @@ class _Decoded:
                     "array: give array=FILE.json in --as, as `tactile-rt describe` writes it"
                 )
             raise ConfigError(f"{log.path}: {why}")
-        self._packets = chain(waiting, self._fed(packets))
+        self._packets = chain(waiting, ((p, t_ns, self._take(p, t_ns)) for p, t_ns in packets))
         self.timed = self._stamped = bool(waiting) and waiting[0][1] is not None
         self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
         self._stamper = Stamper(codec, codec.spec, stats)
@@ -211,21 +210,6 @@ class _Decoded:
         """Count the bytes after the last sample or line of text."""
         return int(getattr(self._codec, "unfinished", self._rest))
 
-    def _fed(
-        self, packets: Iterator[tuple[Any, int | None]]
-    ) -> Iterator[tuple[Any, int | None, Samples | None]]:
-        """Packets and what they complete; `_rest` is what follows the last sample, bytes."""
-        packet, t_ns = next(packets, (None, None))
-        while packet is not None:
-            following, later = next(packets, (None, None))
-            if following is None and isinstance(packet, bytes):
-                yield packet, t_ns, self._fed_slowly(packet, t_ns or 0)
-            else:
-                samples = self._take(packet, t_ns)
-                self._rest = 0 if samples is not None else self._rest + len(packet)
-                yield packet, t_ns, samples
-            packet, t_ns = following, later
-
     def _take(self, packet: Any, t_ns: int | None) -> Samples | None:
         """Feed a packet, and note what it damages."""
         stats = self._codec.stats
@@ -233,21 +217,12 @@ class _Decoded:
         samples = self._codec.feed(packet, t_ns or 0)
         for _ in range(stats.corrupt - before):
             self.corrupt.add(self._at + 1)
-        self._at += len(packet) if isinstance(packet, bytes) else 1
+        n = len(packet) if isinstance(packet, bytes) else 1
+        self._at += n
+        self._rest += n
         if samples is not None:
-            self.skipped = stats.skipped
+            self.skipped, self._rest = stats.skipped, 0
         return samples
-
-    def _fed_slowly(self, packet: bytes, t_ns: int) -> Samples | None:
-        """The last bytes of a log one by one, to see where the last sample ends."""
-        found = []
-        for k in range(len(packet)):
-            samples = self._take(packet[k : k + 1], t_ns)
-            self._rest += 1
-            if samples is not None:
-                found.append(samples)
-                self._rest = 0
-        return _joined(found) if found else None
 
     def __iter__(self) -> Iterator[tuple[Any, int, Chunk | None]]:
         for packet, t_ns, samples in self._packets:
@@ -281,14 +256,15 @@ def _lead(packets: Iterator[tuple[Any, int | None]], lead: bytes) -> Iterator[An
         yield packet if k else lead + packet, t_ns
 
 
-def _joined(parts: list[Samples]) -> Samples:
-    """Samples of one codec as one."""
-    fields = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("values", "valid", "arrived_ns", "damaged", "count", "ticks", "status")
-        if getattr(parts[0], name) is not None
-    }
-    return Samples(**fields)
+def _cut_last(packets: Iterator[tuple[Any, int | None]]) -> Iterator[tuple[Any, int | None]]:
+    """Cut the last packets into bytes, which show where the last sample ends."""
+    last: deque[tuple[Any, int | None]] = deque()
+    for packet, t_ns in packets:
+        last.append((packet, t_ns))
+        if len(last) > LAST or not isinstance(packet, bytes):
+            yield last.popleft()
+    for packet, t_ns in last:
+        yield from ((packet[k : k + 1], t_ns) for k in range(len(packet)))
 
 
 def _why_none(log: LineLog, codec: Codec[Any], name: str) -> str:

@@ -33,7 +33,7 @@ def test_bytes_are_read_or_passed_over(tmp_path, noise, tail):
     data = b"".join(noise.get(k, b"") + p for k, p in enumerate(packets)) + packets[0][:tail]
     (tmp_path / "raw.bin").write_bytes(data)
     made = import_wire(read_log(tmp_path / "raw.bin"), tmp_path / "o.mcap", {"codec": "bota"})
-    report = made.report
+    report = made
     assert (report.unit, report.total) == ("bytes", len(data))
     assert report.read == FRAME * made.intact == FRAME * len(packets)
     assert report.read + report.passed_over == report.total
@@ -60,7 +60,7 @@ def test_messages_of_any_size_are_samples_of_the_largest(tmp_path_factory, sizes
     folder = tmp_path_factory.mktemp("bag")
     bag = arrays(folder / "bag", sizes)
     made = import_bag(bag, folder / "o.mcap")
-    report, fewer = made.report, [k for k, n in enumerate(sizes, 1) if n < max(sizes)]
+    report, fewer = made, [k for k, n in enumerate(sizes, 1) if n < max(sizes)]
     assert (report.unit, report.total, report.read) == ("messages", len(sizes), len(sizes))
     assert report.invalid == len(fewer) and len(report.ranges) == max(sizes)
     assert report.ranges[f"T{max(sizes) - 1}.value"] == (max(sizes) - 1,) * 2
@@ -72,7 +72,7 @@ def test_messages_of_any_size_are_samples_of_the_largest(tmp_path_factory, sizes
 def test_an_array_of_another_number_of_channels_is_no_sample(tmp_path):
     bag = arrays(tmp_path / "bag", [12, 8, 12, 6], {0: (4, 3), 1: (4, 2), 2: (4, 3), 3: (2, 3)})
     made = import_bag(bag, tmp_path / "o.mcap")
-    assert (made.intact, made.corrupt, made.report.passed_over) == (3, 1, 1)
+    assert (made.intact, made.corrupt, made.passed_over) == (3, 1, 1)
     assert "messages of another number of channels, left out: 1 (message 2)" in made.notes
 
 
@@ -91,7 +91,7 @@ def test_columns_are_proposed_for_messages_that_nobody_knows(tmp_path):
     assert about.columns == ""
     assert about.proposed == "pads.0.values.{0..2}=T0.c{0..2},pads.1.values.{0..2}=T1.c{0..2}"
     made = import_bag(tmp_path / "bag", tmp_path / "o.mcap", columns=about.proposed)
-    assert (made.samples, made.report.invalid) == (4, 3)
+    assert (made.samples, made.invalid) == (4, 3)
     assert any("invalid: 3 (message 1)" in note for note in made.notes)
 
 
@@ -106,9 +106,10 @@ def test_what_a_counter_misses_and_a_frame_lacks_is_told_with_its_place(tmp_path
     lines[20] = lines[20][:-2]
     (tmp_path / "can.log").write_text("\n".join(lines) + "\n\nnoise\n")
     made = import_wire(read_log(tmp_path / "can.log"), tmp_path / "o.mcap", {"codec": "aft200"})
-    report = made.report
+    report = made
     assert (report.unit, report.total, report.passed_over) == ("lines", len(lines) + 1, 1)
     assert f"passed over, no line of a candump log: 1 (line {len(lines) + 2})" in made.notes
     assert "corrupt frames: 1 (frame 21)" in made.notes
-    assert report_lines(report)[0].startswith("81 lines: 80 read, 1 passed over, 0 out of order")
-    assert report.said_hz == made.rate_hz and report.found_hz == pytest.approx(50, rel=0.03)
+    assert report_lines(report)[1].startswith("81 lines: 80 read, 1 passed over, 0 out of order")
+    assert report.said_hz == 1000 and made.rate_hz == report.found_hz
+    assert report.found_hz == pytest.approx(50, rel=0.03)
