@@ -124,7 +124,7 @@ def _sniff_port(
 ) -> None:
     from tactile_rt.drivers.links import SerialLink
     from tactile_rt.drivers.sniffing import ask_devices, hear_port, line_speeds, sniff_bytes
-    from tactile_rt.recording.importing.proposing import line_columns
+    from tactile_rt.recording.importing.proposing import propose_line_columns
 
     speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
     found: list[tuple[CodecFit, int]] = []
@@ -159,9 +159,8 @@ def _sniff_port(
         usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
         _run(url, fit, {} if usual else {"baud": str(baud)}, told)
         return
-    proposed = [
-        (seen[1], baud, seen[0]) for baud, data in texts if (seen := line_columns(data)) is not None
-    ]
+    printed = [(propose_line_columns(data), baud) for baud, data in texts]
+    proposed = [(p.samples, baud, p.columns) for p, baud in printed if p is not None]
     if proposed:
         n, baud, columns = max(proposed)
         told.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")

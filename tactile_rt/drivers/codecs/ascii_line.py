@@ -35,7 +35,7 @@ EXACT: Final = 2.0**53  # whole numbers up to here are exact
 NAN: Final = float("nan")
 
 _SPACES: Final = bytes.maketrans(b",;\t", b"   ")
-_WORDS: Final = re.compile(r"[^:=]*\w[^:=]*")
+_WORDS: Final = re.compile(r"[^:=]*[\w\0][^:=]*")  # no other label, no ruled line
 _PLAIN: Final = re.compile(rb"[-+0-9.eE \t;,]*")
 
 
@@ -292,10 +292,11 @@ class AsciiLine(SerialCodec):
         assert self._names is not None
         found = self._names.find(text)
         if not found:
-            self.stats.skipped += len(text)
+            if _WORDS.fullmatch(text):
+                self._refused(text)
+            else:
+                self.stats.skipped += len(text)
             if text.strip():
-                if (self.stats.intact or self._rows) and _WORDS.fullmatch(text):
-                    self.passed += 1
                 names = ", ".join(repr(c.label) for c in self._columns)
                 self.complaint = f"line {quoted(text)} has none of {names}"
             return
@@ -315,6 +316,7 @@ class AsciiLine(SerialCodec):
             absent = [c.label for i, c in enumerate(self._columns) if i not in came]
             self.complaint = f"{', '.join(map(repr, absent))} did not come"
         if 2 * len(came) >= self._width:
+            self.stats.incomplete += len(came) < self._width
             self._take([came.get(i, NAN) for i in range(self._width)], self._open_ns)
         else:
             self._refuse()

@@ -41,7 +41,9 @@ _TIME_UNIT: Final = re.compile(
 )
 _IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
-_TAIL_UNIT: Final = re.compile(r"_(mN|uN|N|Nm|mNm|kPa|Pa|uT|mT|T|degC|mV|V|mm|um|pF)$")
+_TAIL_UNIT: Final = re.compile(
+    r"_(mN|uN|N|Nm|mNm|gf|kgf|kPa|Pa|uT|mT|T|degC|C|K|rad|deg|mV|V|mm|um|pF)$"
+)
 _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
     (re.compile(pattern, re.IGNORECASE), channel, unit)
     for pattern, channel, unit in (
@@ -92,7 +94,7 @@ def guess_columns(
     if count is not None:
         kinds[count] = "count"
     for k, name in enumerate(names):  # times and counts beside those
-        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _COUNT.fullmatch(_bare(name))):
+        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _counts(name)):
             kinds[k] = "-"
     measured = [k for k, kind in enumerate(kinds) if not kind]
     if names:
@@ -230,6 +232,11 @@ def _bare(name: str) -> str:
     return _BRACKET.sub("", name).strip().strip('"')
 
 
+def _counts(name: str) -> bool:
+    """Return whether a name is that of a count; Fx_N is none."""
+    return _COUNT.fullmatch(_TAIL_UNIT.sub("", _bare(name))) is not None
+
+
 def _place_time(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], dated: Collection[int]
 ) -> tuple[int, str] | None:
@@ -282,7 +289,7 @@ def _place_count(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], kinds: Sequence[str]
 ) -> int | None:
     for k, v in enumerate(series):
-        if v is None or kinds[k] or (names and not _COUNT.fullmatch(_bare(names[k]))):
+        if v is None or kinds[k] or (names and not _counts(names[k])):
             continue
         if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all() and (v >= 0).all():
             steps = np.diff(v)  # what falls more often is a reading that goes round
@@ -332,7 +339,7 @@ def _parsed(name: str) -> tuple[str, str, str]:
         unit = word if word in UNITS else _ALIASES.get(word.lower(), "")
     bare = _bare(name)
     if not unit and (tail := _TAIL_UNIT.search(bare)):
-        unit, bare = tail[1], bare[: tail.start()]
+        unit, bare = _ALIASES.get(tail[1].lower(), tail[1]), bare[: tail.start()]
     for pattern, channel, usual in _QUANTITY:
         if (found := pattern.search(bare)) is None:
             continue

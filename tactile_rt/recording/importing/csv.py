@@ -223,6 +223,9 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
         names, units, below_names = _names(head[:first], delimiter, comma, width, spans)
         if names:
             break
+    else:  # without names, words may stand in the first rows, too
+        known = ((k, c) for k, c in numeric if len(c) == width)
+        first = next((k for k, c in known if usual and _is_number(c[usual[0]])), first)
     lines = sum(k >= (below_names if names else first) for k, _ in rows)
     if often < ENOUGH * lines:
         return None

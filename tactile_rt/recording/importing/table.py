@@ -136,9 +136,13 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     values, times, count = read.values, read.times, read.count
     if times is not None:
         if any(c.kind == "iso" for c in parsed) and times.max() < DAY_NS:
-            steps = np.diff(times, prepend=times[0])
+            # a wrong stamp is no midnight, so the days are counted of medians
+            around = np.lib.stride_tricks.sliding_window_view(np.pad(times, 2, mode="edge"), 5)
+            middle = np.median(around, axis=1).astype(np.int64)
+            steps = np.diff(middle, prepend=middle[0])
             days = np.cumsum((steps < -DAY_NS // 2).astype(int) - (steps > 23 * DAY_NS // 24))
-            times = times + DAY_NS * np.maximum(0, days)
+            late = middle + DAY_NS * np.maximum(0, days) - times
+            times = times + DAY_NS * np.round(late / DAY_NS).astype(np.int64)
         order, times = _sort_rows(times, account)
         values, count = values[order], None if count is None else count[order]
     seq, keep = _numbers(count, parsed, len(values), account)
