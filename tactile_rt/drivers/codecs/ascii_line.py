@@ -324,7 +324,7 @@ class AsciiLine(SerialCodec):
     def _refused(self, text: str) -> None:
         """Count a line that is no sample as what it is, and say why it is none."""
         words = fields(text)
-        numbers = [w for w in words if number(w) is not None]
+        numbers = [w for w in words if number(w) is not None and w.strip("-")]
         if words:
             self.complaint = self._why(text, words)
         if 2 * len(numbers) < len(words):  # mostly words: not meant as a sample
