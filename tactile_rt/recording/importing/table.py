@@ -12,10 +12,10 @@ replaced by one between its neighbours. A time that goes back for good begins an
 period after the row before; a time of day that falls by more than half a day is of the next day.
 """
 
-import re
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -52,7 +52,6 @@ FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 DAY_NS: Final = 86_400 * NS_PER_S
 SHOWN: Final = 600  # characters of the names that a message tells
-_DECIMAL: Final = re.compile(r"([+-]?)(\d+)(?:\.(\d*))?")
 
 
 @dataclass
@@ -99,23 +98,18 @@ def place_columns(
     labelled = [c.label for c in columns if c.label]
     if labelled and len(labelled) < len(columns):
         raise ConfigError(f"{where}: give all columns a name, NAME=COLUMN, or none")
-    if not labelled:
-        if names and len(columns) > len(names):
-            raise ConfigError(f"{where}: {len(columns)} columns for {len(names)} of the file")
-        left = names[len(columns) :]
-        return list(range(len(columns))), [f"left out: {shown_names(left)}"] if left else []
-    plain = {name.strip().lower(): k for k, name in enumerate(reversed(names))}
-    exact = {name: k for k, name in enumerate(reversed(names))}
-    places = []
+    if labelled and not names:
+        raise ConfigError(f"{where}: the file does not name its columns: give them by their places")
+    if not labelled and len(columns) > len(names) > 0:
+        raise ConfigError(f"{where}: {len(columns)} columns for {len(names)} of the file")
+    places = [] if labelled else list(range(len(columns)))
+    from_last = list(enumerate(names))[::-1]
+    known = {n.strip().lower(): k for k, n in from_last} | {n: k for k, n in from_last}
     for label in labelled:
-        found = exact.get(label, plain.get(label.strip().lower()))
+        found = known.get(label, known.get(label.strip().lower()))
         if found is None:
-            if not names:
-                raise ConfigError(
-                    f"{where}: the file does not name its columns: give them by their places"
-                )
             raise ConfigError(f"{where}: no column {label!r}; {nearest(label, names)}")
-        places.append(len(names) - 1 - found)
+        places.append(found)
     left = [n for k, n in enumerate(names) if k not in places and not n.startswith(BESIDE)]
     return places, [f"left out: {shown_names(left)}"] if left else []
 
@@ -175,8 +169,8 @@ def read_samples(
     places, notes = place_columns(parsed, table.names, where)
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
-    parts = _parts_of_seconds(parsed)
-    spec = array_of(mapping, tuple(c for k, c in enumerate(parsed) if k not in parts), where)
+    parts = ("us", "ns") if any(c.kind == "s" for c in parsed) else ()  # of its seconds
+    spec = array_of(mapping, tuple(c for c in parsed if c.kind not in parts), where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
         raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
     read = _read(table, parsed, places, spec)
@@ -251,29 +245,18 @@ def _read(
     )  # fmt: skip
 
 
-def _parts_of_seconds(columns: Sequence[Column]) -> list[int]:
-    """Which columns are the rest of a time whose seconds have a column of their own."""
-    seconds = any(c.kind == "s" for c in columns)
-    return [k for k, c in enumerate(columns) if seconds and c.kind in ("us", "ns")]
-
-
 def _number(cell: Any) -> float:
     """What a cell measures; NaN where there is none.
 
     Raises:
         ValueError: it is another word.
     """
-    if isinstance(cell, str):
-        try:
-            return float(cell)
-        except ValueError:
-            if not cell.strip():
-                return np.nan
-            found = number(cell.strip())
-            if found is None:
-                raise ValueError(f"{cell[:40]!r} is no number") from None
-            return found
-    return float(cell)
+    if not isinstance(cell, str):
+        return float(cell)
+    found = number(cell.strip() or "nan")
+    if found is None:
+        raise ValueError(f"{cell[:40]!r} is no number")
+    return found
 
 
 def _whole(cell: Any) -> int:
@@ -285,29 +268,17 @@ def _whole(cell: Any) -> int:
 
 def _time(cell: Any, column: Column) -> int:
     """A time in ns, exactly where it is written in decimals."""
-    unit = NS[column.kind]
-    if isinstance(cell, int | np.integer):
-        text = str(int(cell))
-    elif not isinstance(cell, str):
-        return round(float(cell) * column.scale * unit)
-    else:
-        text = in_seconds(cell.strip(), column.unit) if column.kind == "iso" else cell.strip()
-    found = _DECIMAL.fullmatch(text) if column.scale == 1.0 else None
-    if found is None:
-        try:
-            value = float(text) * column.scale * unit
-        except ValueError:
-            value = np.inf
-        if not abs(value) < 2.0**62:
-            hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
-            raise ValueError(f"{cell!r:.40} is no time{hint}")
-        return round(value)
-    part = found[3] or ""
-    scale: int = 10 ** len(part)
-    ns = int(found[2]) * unit + int(part or 0) * unit // scale
-    if ns >= 1 << 62:
-        raise ValueError(f"{cell!r:.40} is no time")
-    return -ns if found[1] == "-" else ns
+    text = str(cell).strip()
+    if column.kind == "iso":
+        text = in_seconds(text, column.unit)
+    try:
+        ns = Decimal(text) * NS[column.kind] * Decimal(column.scale)
+        if abs(ns) < 1 << 62:
+            return round(ns)
+    except InvalidOperation:  # it is no number
+        pass
+    hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
+    raise ValueError(f"{cell!r:.40} is no time{hint}")
 
 
 def _numbers(
@@ -400,8 +371,7 @@ def _strictly(
     forward = steps[ends] > 0
     if not forward.any():
         raise ConfigError("all lines have one time: leave its column out, and give --rate")
-    stretches = int((steps < 0).sum())
-    repeats = int((steps == 0).sum())
+    stretches, repeats = int((steps < 0).sum()), int((steps == 0).sum())
     usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
     rows = np.diff(ends, prepend=-1)
     long = steps[ends] > EVEN[1] * np.median((steps[ends] / rows)[usual]) * rows
@@ -415,8 +385,7 @@ def _strictly(
     if repeats:
         account.notes.append(f"{repeats} lines have the time of the one before: spread evenly")
         times = _spread(times, period)
-    rate = NS_PER_S / period
-    return times, float(f"{rate:.6g}")
+    return times, float(f"{NS_PER_S / period:.6g}")
 
 
 def _spread(times: NDArray[np.int64], period: float) -> NDArray[np.int64]:
