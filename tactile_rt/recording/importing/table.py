@@ -31,6 +31,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     Column,
     LineMapping,
     array_of,
+    order_columns,
     parse_columns,
     read_mapping,
 )
@@ -197,8 +198,7 @@ class ReadRows:
 def _read(
     table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec
 ) -> ReadRows:
-    at = {(c.element, c.channel): k for k, c in enumerate(columns)}
-    order = [at[e, c] for e in spec.elements for c in spec.channels]
+    order = order_columns(columns, spec)
     scale = np.array([columns[k].scale for k in order])
     offset = np.array([columns[k].offset for k in order])
     measured = [places[k] for k in order]
