@@ -191,7 +191,7 @@ def _between_digits(line: str) -> bool:
 
 
 def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvForm]]:
-    """Fit a form to the first lines: how well it fits, and the form; empty: it does not."""
+    """Return how well this form fits the lines, and the form; empty: not."""
     rows = [
         (k, _cells(x, delimiter, comma))
         for k, x in enumerate(head)
