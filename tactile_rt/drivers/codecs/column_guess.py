@@ -23,6 +23,7 @@ __all__ = ["guess_columns", "guess_line_columns"]
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
+PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
 SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
 Rows = Sequence[Sequence[float | None]]
 
@@ -169,7 +170,12 @@ def _of_places(lines: list[str]) -> list[str] | None:
         labelled = _of_labels(lines)  # names tell more than places
         if labelled is not None and len(labelled) >= len(numeric) - 1:
             return labelled
-    dated = {k for k in numeric if all(_is_date(line, c[k]) for line, c in same[:20])}
+    clocks = [(line, c) for line, c in same[:20] if in_seconds(line) != line]
+    dated = {
+        k
+        for k in numeric
+        if len(clocks) == len(same[:20]) and all(c[k] not in line for line, c in clocks)
+    }
     words, _ = guess_columns((), rows, dated)
     if not _measures(words):
         return None
@@ -179,10 +185,6 @@ def _of_places(lines: list[str]) -> list[str] | None:
 
 def _measures(words: Iterable[str]) -> bool:
     return any("." in word for word in words if not word.startswith("time"))
-
-
-def _is_date(line: str, word: str) -> bool:
-    return word not in line and in_seconds(line) != line
 
 
 def _numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
@@ -235,15 +237,11 @@ def _place_time(
             if rising or (steps >= 0).mean() > MOSTLY:
                 return k, f"time:{_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
-            # a ramp of a measurement is as steady hardly ever, and from 1970 none counts
-            if np.std(steps) <= np.mean(steps) or _is_utc(v):
+            # a ramp of a measurement is as steady hardly ever, and none counts from 1970
+            since_1970 = any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in PER_SECOND)
+            if np.std(steps) <= np.mean(steps) or since_1970:
                 return k, f"time:{_time_unit('', v)}"
     return None
-
-
-def _is_utc(v: NDArray[np.float64]) -> bool:
-    """Whether these are times from 1970 on, of 2001 to 2065, in s, ms, us or ns."""
-    return any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in (1, 1e3, 1e6, 1e9))
 
 
 def _time_unit(name: str, v: NDArray[np.float64]) -> str:

@@ -52,6 +52,7 @@ EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
 FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 DAY_NS: Final = 86_400 * NS_PER_S
+EXACT: Final = 2.0**53  # whole numbers up to here are exact
 SHOWN: Final = 600  # characters of the names that a message tells
 
 
@@ -228,7 +229,10 @@ def _read(
             if not clocks and table.times_ns is not None:
                 t_ns = table.times_ns[-1]
             if counter is not None:
-                counts.append(_whole(cells[counter]))
+                count = _number(cells[counter])
+                if not count.is_integer() or abs(count) >= EXACT:
+                    raise ValueError(f"{cells[counter]!r:.40} is no count")
+                counts.append(int(count))
         except (ValueError, OverflowError) as error:
             corrupt += 1
             complaint = complaint or str(error)
@@ -246,24 +250,13 @@ def _read(
 
 
 def _number(cell: Any) -> float:
-    """What a cell measures; NaN where there is none.
-
-    Raises:
-        ValueError: it is another word.
-    """
+    """What a cell measures; NaN where there is none."""
     if not isinstance(cell, str):
         return float(cell)
     found = number(cell.strip() or "nan")
     if found is None:
         raise ValueError(f"{cell[:40]!r} is no number")
     return found
-
-
-def _whole(cell: Any) -> int:
-    value = _number(cell)
-    if not value.is_integer() or abs(value) >= 2.0**53:
-        raise ValueError(f"{cell!r:.40} is no count")
-    return int(value)
 
 
 def _time(cell: Any, column: Column) -> int:
