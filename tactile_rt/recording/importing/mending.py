@@ -123,9 +123,8 @@ def write_chunks(
     n, rate = len(chunk), about.spec.rate_hz
     span_s = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
     report = account.report
-    report.total, report.read, report.passed_over = (
-        account.intact + account.corrupt, account.intact, account.corrupt,
-    )  # fmt: skip
+    report.read, report.passed_over = account.intact, account.corrupt
+    report.total = report.read + report.passed_over
     report.found_hz = int(chunk.seq[-1] - chunk.seq[0]) / span_s if span_s else None
     measurer = Measurer(report, about.spec, about.utc_offset_ns)
     measurer.add(chunk)
@@ -136,9 +135,7 @@ def write_chunks(
         made = McapFile(file, about)
         for at in range(0, n, size):
             piece = slice(at, at + size)
-            part = Chunk(
-                chunk.seq[piece], chunk.t_ns[piece], chunk.values[piece], chunk.valid[piece]
-            )
+            part = Chunk(*(x[piece] for x in (chunk.seq, chunk.t_ns, chunk.values, chunk.valid)))
             made.add(SAMPLES, encode_samples(part), int(part.t_ns[-1]))
         made.note(SUMMARY, {"samples": str(n), "packets": "0"})
         made.finish()

@@ -150,11 +150,7 @@ def propose_fields(paths: Sequence[str]) -> str:
         groups.setdefault(tuple(array), []).append(path)
     words = []
     for path in max(groups.values(), key=len, default=[]):
-        places = [s for s in path.split(".") if s.isdecimal()]
-        if not places:
-            words.append(f"{path}=S.{path.replace('.', '_')}")
-        elif len(places) == 1:
-            words.append(f"{path}=T{places[0]}.value")
-        else:
-            words.append(f"{path}=T{'_'.join(places[:-1])}.c{places[-1]}")
+        *places, last = [s for s in path.split(".") if s.isdecimal()] or [""]
+        whole = f"T{last}.value" if last else f"S.{path.replace('.', '_')}"
+        words.append(f"{path}=" + (f"T{'_'.join(places)}.c{last}" if places else whole))
     return compress_columns(words)

@@ -154,10 +154,8 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
-    about = Description(
-        spec, zero, table.path.name,
-        session={"imported": table.path.name, "columns": columns},
-    )  # fmt: skip
+    session = {"imported": table.path.name, "columns": columns}
+    about = Description(spec, zero, table.path.name, session=session)
     return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
 
 
