@@ -135,7 +135,9 @@ def write_chunks(
         made = McapFile(file, about)
         for at in range(0, n, size):
             piece = slice(at, at + size)
-            part = Chunk(*(x[piece] for x in (chunk.seq, chunk.t_ns, chunk.values, chunk.valid)))
+            part = Chunk(
+                chunk.seq[piece], chunk.t_ns[piece], chunk.values[piece], chunk.valid[piece]
+            )
             made.add(SAMPLES, encode_samples(part), int(part.t_ns[-1]))
         made.note(SUMMARY, {"samples": str(n), "packets": "0"})
         made.finish()
