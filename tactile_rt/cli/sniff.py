@@ -1,6 +1,7 @@
 """`tactile-rt sniff`: which codec, speed or columns fit a port, a bus, or a file."""
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 from urllib.parse import quote, urlencode
@@ -13,13 +14,18 @@ from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.core.errors import ConfigError, RecordingError
 
 if TYPE_CHECKING:
-    from tactile_rt.drivers.logs import LineLog
+    from rich.table import Table
+
     from tactile_rt.drivers.sniffing import CodecFit, Tried
 
 NOTHING = 1  # exit code: nothing fits
 SHOWN = 6  # fits
 DESCRIBE = "frames of one length can be described: codec=binary_frame"
 GUESSED_HZ = 100  # where nothing tells the time
+FORMS = {
+    "raw": "bytes as they are", "hex": "bytes in hexadecimal",
+    "terminal": "lines of text and when each came",
+}  # fmt: skip
 
 
 @app.command(epilog="tactile-rt sniff /dev/ttyUSB0 --ask")
@@ -76,31 +82,28 @@ def sniff(
 
 
 class _Told:
-    """What is found, told as it comes, or as JSON at the end.
-
-    Attributes:
-        alone: Whether JSON goes to stdout, and nothing else.
-    """
+    """What is found, told as it comes, or as JSON at the end."""
 
     def __init__(self, target: str, json: Path | None) -> None:
-        self._json = json
-        self.alone = json == STDOUT
+        self._json, self._alone = json, json == STDOUT
         self._all: dict[str, Any] = {"target": target, "fits": [], "said": [], "command": None}
 
-    def keep(self, what: str, value: Any) -> None:
-        """Something for the JSON."""
+    def show(self, what: str, value: Any, table: "Table") -> None:
+        """A table, and what it shows for the JSON."""
         self._all[what] = value
+        if not self._alone:
+            print_table(table)
 
     def say(self, text: str) -> None:
         """A line."""
         self._all["said"].append(text)
-        if not self.alone:
+        if not self._alone:
             typer.echo(text)
 
     def go_on(self, command: str) -> None:
         """The last line: how to go on."""
         self._all["command"] = command
-        if not self.alone:
+        if not self._alone:
             typer.echo(command)
         told_as_json(self._all, self._json)
 
@@ -115,29 +118,22 @@ class _Told:
 
 
 def _sniff_port(
-    port: str,
-    seconds: float,
-    bauds: list[int] | None,
-    further: "list[Tried]",
-    ask: bool,
+    port: str, seconds: float, bauds: list[int] | None, further: "list[Tried]", ask: bool,
     told: _Told,
-) -> None:
+) -> None:  # fmt: skip
     from tactile_rt.drivers.links import SerialLink
     from tactile_rt.drivers.sniffing import ask_devices, hear_port, line_speeds, sniff_bytes
-    from tactile_rt.recording.importing.proposing import line_columns
+    from tactile_rt.recording.importing.proposing import propose_line_columns
 
     speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
     found: list[tuple[CodecFit, int]] = []
     texts: list[tuple[int, bytes]] = []
-    came = 0
     for baud, _, data in hear_port(port, seconds, speeds):
-        came += len(data)
         typer.echo(f"{baud} bit/s: {len(data)} bytes", err=True)
         found += [(fit, baud) for fit in sniff_bytes(data, further)]
         texts.append((baud, data))
     if not found and ask:
         typer.echo("asking for samples as each codec does", err=True)
-
         for speed in bauds or [0]:  # 0: each codec's own
 
             def connect(codec: Any, speed: int = speed) -> SerialLink:
@@ -153,15 +149,14 @@ def _sniff_port(
     )  # fmt: skip
     url = f"serial://{port}" if "://" not in port else f"serial:{port}"
     if found:
-        _show([fit for fit, _ in found], told, [str(baud) for _, baud in found])
+        _show([fit for fit, _ in found], told, [baud for _, baud in found])
         fit, baud = found[0]
         # what USB brings is the same at every speed
         usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
         _run(url, fit, {} if usual else {"baud": str(baud)}, told)
         return
-    proposed = [
-        (seen[1], baud, seen[0]) for baud, data in texts if (seen := line_columns(data)) is not None
-    ]
+    printed = [(propose_line_columns(data), baud) for baud, data in texts]
+    proposed = [(p.samples, baud, p.columns) for p, baud in printed if p is not None]
     if proposed:
         n, baud, columns = max(proposed)
         told.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
@@ -169,10 +164,9 @@ def _sniff_port(
         fields |= {} if baud == 115_200 else {"baud": str(baud)}
         told.go_on(f"tactile-rt run --source {shlex.quote(f'{url}?{_query(fields)}')}")
         return
-    if not came:
-        told.nothing(
-            f"nothing came from {port}", "" if ask else "try --ask: it may have to be started"
-        )
+    if not any(data for _, data in texts):
+        hint = "" if ask else "try --ask: it may have to be started"
+        told.nothing(f"nothing came from {port}", hint)
     told.nothing(f"nothing fits what came from {port}", DESCRIBE)
 
 
@@ -228,59 +222,32 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     if path.is_dir():
         raise ConfigError(f"{path} is a folder, and no bag: name a file")
     log = read_log(path)
-    typer.echo(f"{path}: {_form(log.form)}", err=True)
-    if log.wire == "can":
-        frames = []
-        for packet, _ in log.packets():
-            frames += packet
-            if len(frames) >= LOOK_FRAMES:
-                break
-        fits = sniff_frames(frames, further)
-        if not fits:
-            _show_identifiers(frames, told)
-            for note in log.notes:
-                told.say(note)
-            told.nothing(
-                f"no codec fits {path}",
-                "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'",
-            )
-        _show(fits, told)
-        _import(path, fits[0], told)
-        return
-    data = _begins(log, LOOK_BYTES)
-    fits = sniff_bytes(data, further)
+    typer.echo(f"{path}: {FORMS.get(log.form, f'a CAN log ({log.form})')}", err=True)
+    of_bus = log.wire == "can"
+    begun: Any = [] if of_bus else bytearray()
+    for packet, _ in log.packets():
+        begun += packet
+        if len(begun) >= (LOOK_FRAMES if of_bus else LOOK_BYTES):
+            break
+    data = b"" if of_bus else bytes(begun)
+    fits = sniff_frames(begun, further) if of_bus else sniff_bytes(data, further)
     if fits:
         _show(fits, told)
         _import(path, fits[0], told)
+    elif of_bus:
+        _show_identifiers(begun, told)
+        for note in log.notes:
+            told.say(note)
+        hint = "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'"
+        told.nothing(f"no codec fits {path}", hint)
     elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, told):
         told.nothing(f"nothing fits {path}", DESCRIBE)
-
-
-def _begins(log: "LineLog", n: int) -> bytes:
-    """The first bytes of a line, some n."""
-    data = bytearray()
-    for packet, _ in log.packets():
-        data += packet
-        if len(data) >= n:
-            break
-    return bytes(data)
-
-
-def _form(form: str) -> str:
-    told = {
-        "raw": "bytes as they are", "hex": "bytes in hexadecimal",
-        "terminal": "lines of text and when each came",
-    }  # fmt: skip
-    return told.get(form, f"a CAN log ({form})")
 
 
 def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
     fields = fit.fields
     if not fit.described:
-        told.say(
-            "it has not described its array here: array=FILE.json, as `tactile-rt describe` writes "
-            "it, says what it is"
-        )
+        told.say("it has not described its array: array=FILE.json, by `tactile-rt describe`, does")
         fields["array"] = "FILE.json"
     quoted = shlex.quote(_query(fields)) if len(fields) > 1 else _query(fields)
     told.go_on(f"tactile-rt import {shlex.quote(str(path))} --as {quoted}")
@@ -296,16 +263,14 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     if not proposed.columns:
         told.nothing(f"no columns are found with which it is read: {proposed.said}"[:200])
     told.say(f"{proposed.said}: names and units are for you to say")
-    quoted = shlex.quote(str(path))
+    rate, option, columns = "", "--columns", proposed.columns
     if not proposed.table:
-        fields = _query({"codec": "ascii_line", "columns": proposed.columns})
-        told.go_on(f"tactile-rt import {quoted} --as {shlex.quote(fields)}")
-        return True
-    rate = ""
-    if not proposed.timed:
+        option, columns = "--as", _query({"codec": "ascii_line", "columns": columns})
+    elif not proposed.timed:
         told.say(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
         rate = f" --rate {GUESSED_HZ}"
-    told.go_on(f"tactile-rt import {quoted} --columns {shlex.quote(proposed.columns)}{rate}")
+    command = f"tactile-rt import {shlex.quote(str(path))} {option} {shlex.quote(columns)}{rate}"
+    told.go_on(command)
     return True
 
 
@@ -328,9 +293,7 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
     for topic in topics:
         table.add_row(topic.name, topic.type, str(topic.messages), topic.columns)
-    told.keep("topics", topics)
-    if not told.alone:
-        print_table(table)
+    told.show("topics", topics, table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     proposed = [t for t in topics if t.proposed]
     if not known and proposed:
@@ -349,25 +312,22 @@ def _sniff_bag(path: Path, told: _Told) -> None:
 # what is said
 
 
-def _show(fits: "list[CodecFit]", told: _Told, speeds: list[str] | None = None) -> None:
+def _show(fits: "list[CodecFit]", told: _Told, speeds: Sequence[int] = ()) -> None:
     from rich.table import Table
 
-    found = [dict(vars(fit)) for fit in fits[:SHOWN]]
-    if speeds:
-        found = [{**one, "baud": int(speed)} for one, speed in zip(found, speeds, strict=False)]
-    told.keep("fits", found)
-    if told.alone:
-        return
+    found = [
+        vars(fit) | ({"baud": speeds[k]} if speeds else {}) for k, fit in enumerate(fits[:SHOWN])
+    ]
     names = ["codec", "options", *(["baud"] if speeds else []), "intact", "corrupt", "explains"]
     table = Table(*names, "notices damage", box=None, header_style="bold")
-    for k, fit in enumerate(fits[:SHOWN]):
-        options = "&".join(f"{a}={b}" for a, b in fit.options.items())
-        table.add_row(
-            fit.codec, options, *([speeds[k]] if speeds else []), str(fit.intact),
-            str(fit.corrupt), f"{fit.explained:.0%}",
-            f"{fit.proof:.0%}" if fit.wire == "serial" else "by CAN",
-        )  # fmt: skip
-    print_table(table)
+    for one in found:
+        one = one | {
+            "options": "&".join(f"{a}={b}" for a, b in one["options"].items()),
+            "explains": f"{one['explained']:.0%}",
+        }
+        proof = f"{one['proof']:.0%}" if one["wire"] == "serial" else "by CAN"
+        table.add_row(*(str(one[name]) for name in names), proof)
+    told.show("fits", found, table)
 
 
 def _show_identifiers(frames: "list[Any]", told: _Told) -> None:

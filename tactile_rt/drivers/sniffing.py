@@ -14,17 +14,16 @@ most that it can.
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.core.stream import EndOfStream
 from tactile_rt.drivers.catalogue import CODECS
-from tactile_rt.drivers.codec import CanFrame, Codec, Command, Samples, codec_class
+from tactile_rt.drivers.codec import CanFrame, Codec, Command, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import Link, SerialLink
 from tactile_rt.drivers.opening import make_codec, open_line
@@ -104,11 +103,12 @@ def sniff_bytes(data: bytes, further: Sequence[Tried] = ()) -> list[CodecFit]:
 
 
 def _fitting(data: bytes, further: Sequence[Tried]) -> list[CodecFit]:
-    if any(data == (data[:p] * (len(data) // p + 1))[: len(data)] for p in (1, 2, 3, 4)):
+    if any(data[p:] == data[:-p] for p in (1, 2, 3, 4)):
         return []  # nothing is said in it
-    pieces = [data[at : at + PIECE] for at in range(0, len(data), PIECE)]
-    hurt = _damaged(data)
-    worse = [hurt[at : at + PIECE] for at in range(0, len(hurt), PIECE)]
+    pieces, worse = (
+        [whole[at : at + PIECE] for at in range(0, len(data), PIECE)]
+        for whole in (data, _damaged(data))
+    )
     fits = []
     for codec, options in _candidates("serial", further, ()):
         fit = _fed("serial", codec, options, pieces, len(data))
@@ -145,18 +145,21 @@ def _candidates(
     for codec, options in further:
         make_codec(wire, codec, dict(options))  # refused before anything is fed
         yield codec, dict(options)
+    for name, kind in _codecs(wire):
+        if not _needs_file(kind):
+            yield from ((name, options) for options in ({}, *kind.variants(seen)))
+
+
+def _codecs(wire: str) -> Iterator[tuple[str, type[Codec[Any]]]]:
+    """List the codecs of a wire, but those whose library is not installed."""
     for of, name in CODECS:
-        if of != wire:
-            continue
-        try:
-            kind = codec_class(wire, name)
-        except ConfigError:
-            continue  # what it needs is not installed
-        if set(NEEDS_A_FILE) & set(kind.Options.__dataclass_fields__):
-            continue
-        yield name, {}
-        for options in kind.variants(seen):
-            yield name, options
+        if of == wire:
+            with suppress(ConfigError):
+                yield name, codec_class(wire, name)
+
+
+def _needs_file(kind: type[Codec[Any]]) -> bool:
+    return bool(set(NEEDS_A_FILE) & set(kind.Options.__dataclass_fields__))
 
 
 def _fed(
@@ -164,17 +167,16 @@ def _fed(
 ) -> CodecFit:
     codec: Codec[Any] = make_codec(wire, name, dict(options))
     samples, valid = 0, 0.0
-    limit = None if codec.full_scale is None else BORNE * np.array(codec.full_scale)
+    limit = np.inf if codec.full_scale is None else BORNE * np.array(codec.full_scale)
     for packet in packets:
         found = codec.feed(packet, 0)
         if found is not None:
             samples += len(found)
-            good = found.valid if limit is None else _borne(found, limit)
+            good = found.valid & ~np.any(np.abs(found.values) > limit, axis=2)
             valid += float(good.mean()) * len(found)
     stats = codec.stats
-    whole = samples - stats.incomplete if stats.incomplete else samples
     described = codec.spec is not None
-    if described and samples and (valid < COMPLETE * samples or whole < COMPLETE * samples):
+    if described and min(valid, samples - stats.incomplete) < COMPLETE * samples:
         samples = 0
     silent = not described or bool(codec.complaint)  # there may be samples all the same
     return CodecFit(
@@ -182,12 +184,6 @@ def _fed(
         max(0.0, 1.0 - stats.skipped / max(1, total)), described=described,
         likely=stats.intact >= LEAST and (samples >= LEAST - 1 or silent),
     )  # fmt: skip
-
-
-def _borne(found: Samples, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(sample, element) the valid loads that are within the limit of each channel."""
-    borne: NDArray[np.bool_] = found.valid & np.all(np.abs(found.values) <= limit, axis=2)
-    return borne
 
 
 def _damaged(data: bytes) -> bytes:
@@ -201,14 +197,10 @@ def _damaged(data: bytes) -> bytes:
 
 def _ranked(fits: list[CodecFit]) -> list[CodecFit]:
     """The best first: what explains more, or as much with more proof, or with fewer options."""
-
-    def worth(fit: CodecFit) -> tuple[float, ...]:
-        return (
-            round(min(1.0, fit.explained) * (0.5 + 0.5 * fit.proof), 1),
-            round(fit.explained, 2), -len(fit.options), fit.intact,
-        )  # fmt: skip
-
-    return sorted(fits, key=worth, reverse=True)
+    return sorted(fits, reverse=True, key=lambda fit: (
+        round(min(1.0, fit.explained) * (0.5 + 0.5 * fit.proof), 1),
+        round(fit.explained, 2), -len(fit.options), fit.intact,
+    ))  # fmt: skip
 
 
 # what comes over a line that nobody knows anything about
@@ -217,16 +209,8 @@ def _ranked(fits: list[CodecFit]) -> list[CodecFit]:
 def line_speeds() -> list[tuple[int, str]]:
     """(baud, parity) of every serial codec, the most usual first, then of other boards."""
     found: list[tuple[int, str]] = []
-    for wire, name in CODECS:
-        if wire != "serial":
-            continue
-        try:
-            kind = codec_class(wire, name)
-            codec: Any = kind if set(NEEDS_A_FILE) & set(
-                kind.Options.__dataclass_fields__
-            ) else make_codec(wire, name, {})  # fmt: skip
-        except ConfigError:
-            continue  # what it needs is not installed
+    for name, kind in _codecs("serial"):
+        codec: Any = kind if _needs_file(kind) else make_codec("serial", name, {})
         found.append((codec.baud, codec.parity))
     usual = sorted(set(found), key=lambda speed: (-found.count(speed), speed))
     return usual + [(s, "N") for s in SPEEDS if (s, "N") not in usual]
@@ -239,8 +223,7 @@ def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Itera
         seconds: how long to listen at each, s.
         speeds: (baud, parity) of each.
     """
-    link = SerialLink(port, *speeds[0])
-    try:
+    with closing(SerialLink(port, *speeds[0])) as link:
         wait = FIRST_S
         for k, (baud, parity) in enumerate(speeds):
             if k:
@@ -253,8 +236,6 @@ def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Itera
                 more = link.receive(left)
                 data += more[0] if more else b""
             yield baud, parity, bytes(data)
-    finally:
-        link.close()
 
 
 def hear_bus(url: str, seconds: float) -> list[CanFrame]:
@@ -263,15 +244,12 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
     Args:
         url: ``can:INTERFACE:CHANNEL``, with the bus's options.
     """
-    link: Link[Any] = open_line(url)
     frames: list[CanFrame] = []
-    try:
+    with closing(open_line(url)) as link:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             found = link.receive(left)
             frames += found[0] if found else ()
-    finally:
-        link.close()
     return frames
 
 
@@ -284,16 +262,10 @@ def ask_devices(
         seconds: how long to listen after the first sample, s.
     """
     connect(make_codec(wire, "native", {})).close()  # told once, not for every codec
-    for of, name in CODECS:
-        if of != wire:
+    for name, kind in _codecs(wire):
+        if _needs_file(kind):
             continue
-        try:
-            kind = codec_class(wire, name)
-            if set(NEEDS_A_FILE) & set(kind.Options.__dataclass_fields__):
-                continue
-            codec = make_codec(wire, name, {})
-        except ConfigError:
-            continue
+        codec = make_codec(wire, name, {})
         if not codec.polls and not codec.commands(Command.START):
             continue
         heard: list[Any] = []
@@ -302,7 +274,7 @@ def ask_devices(
                 lambda codec=codec: connect(codec), codec,  # type: ignore[misc]
                 DeviceOptions(name, start_s=START_S, reconnect=False), name,
             ) as source:  # fmt: skip
-                source.tap(partial(_keep, heard))
+                source.tap(lambda packet, _, heard=heard: heard.append(packet))  # type: ignore[misc]
                 end = time.monotonic() + seconds
                 while (left := end - time.monotonic()) > 0:
                     source.read(left)
@@ -311,7 +283,3 @@ def ask_devices(
         packets = [p for p in heard if p is not None]
         whole: Any = b"".join(packets) if wire == "serial" else [f for p in packets for f in p]
         yield codec, whole
-
-
-def _keep(heard: list[Any], packet: Any, t_ns: int) -> None:
-    heard.append(packet)

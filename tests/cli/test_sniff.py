@@ -96,10 +96,10 @@ FILES = {
         "--columns T{0..1}.value --rate 100",
     ),
     "one bad cell": (
-        lambda: b"t,Fx\n" + b"".join(
+        lambda: b"time_s,Fx_N\n" + b"".join(
             b"0.%02d,%s\n" % (k, b"?!" if k == 7 else b"%d" % k) for k in range(20)
         ),
-        "--columns t=time:s,Fx=S.fx:N",
+        "--columns time_s=time:s,Fx_N=S.fx:N",
     ),
     "columns that are there in turn, or never": (
         lambda: b"t,a,b,c\n" + b"".join(

@@ -22,6 +22,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     Column,
     LineMapping,
     array_of,
+    order_columns,
     parse_columns,
     read_mapping,
 )
@@ -35,7 +36,7 @@ EXACT: Final = 2.0**53  # whole numbers up to here are exact
 NAN: Final = float("nan")
 
 _SPACES: Final = bytes.maketrans(b",;\t", b"   ")
-_WORDS: Final = re.compile(r"[^:=]*\w[^:=]*")
+_WORDS: Final = re.compile(r"[^:=]*[\w\0][^:=]*")  # no other label, no ruled line
 _PLAIN: Final = re.compile(rb"[-+0-9.eE \t;,]*")
 
 
@@ -70,6 +71,10 @@ class AsciiLineOptions:
             raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
+def _has_digit(word: str) -> bool:
+    return any(map(str.isdigit, word))
+
+
 class AsciiLine(SerialCodec):
     """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter.
 
@@ -91,10 +96,9 @@ class AsciiLine(SerialCodec):
 
     def __init__(self, options: AsciiLineOptions) -> None:
         where = options.mapping or "columns"
+        mapping = LineMapping(columns=(options.columns,))
         if options.mapping:
             mapping = read_mapping(options.mapping)
-        else:
-            mapping = LineMapping(columns=(options.columns,))
         if options.rate_hz:
             mapping = msgspec.structs.replace(mapping, rate_hz=options.rate_hz)
         self.claims_rate = bool(options.mapping or options.rate_hz)
@@ -102,8 +106,7 @@ class AsciiLine(SerialCodec):
         spec = array_of(mapping, columns, where)
         super().__init__(spec)
         self._columns, self._width = columns, len(columns)
-        at = {(c.element, c.channel): i for i, c in enumerate(columns)}
-        self._order = [at[e, c] for e in spec.elements for c in spec.channels]
+        self._order = order_columns(columns, spec)
         self._scale = np.array([columns[i].scale for i in self._order])
         self._offset = np.array([columns[i].offset for i in self._order])
         self._count = self._time = -1
@@ -154,10 +157,8 @@ class AsciiLine(SerialCodec):
         self._open_ns = self._open_bytes = 0
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
-        send = {Command.START: self._start, Command.STOP: self._stop, Command.POLL: self._poll}[
-            command
-        ]
-        return (Step(send),) if send else ()
+        sent = {Command.START: self._start, Command.STOP: self._stop, Command.POLL: self._poll}
+        return (Step(sent[command]),) if sent[command] else ()
 
     # the device's side
 
@@ -165,9 +166,8 @@ class AsciiLine(SerialCodec):
         values = np.where(chunk.valid[..., None], chunk.values, np.nan).astype(np.float64)
         numbers = (values.reshape(len(chunk), -1) - self._offset) / self._scale
         packets = []
-        for seq, t_ns, row in zip(
-            chunk.seq.tolist(), chunk.t_ns.tolist(), numbers.tolist(), strict=True
-        ):
+        rows = zip(chunk.seq.tolist(), chunk.t_ns.tolist(), numbers.tolist(), strict=True)
+        for seq, t_ns, row in rows:
             words = ["0"] * self._width
             for at, value in zip(self._order, row, strict=True):
                 words[at] = f"{value:.9g}"
@@ -191,18 +191,15 @@ class AsciiLine(SerialCodec):
         said: dict[str, Any] = {}
         for column, word in zip(self._columns, words, strict=True):
             *path, last = column.label.split(".")
-            if column.kind == "-" or (path and last.isdecimal()):
-                continue
-            here = said
-            for key in path:
-                here = here.setdefault(key, {})
-            here[last] = word if column.kind == "iso" else float(word)
-        for column, word in zip(self._columns, words, strict=True):
-            base, _, place = column.label.rpartition(".")
-            if base and place.isdecimal():
-                row = said.setdefault(base, [])
-                row += [0.0] * (int(place) + 1 - len(row))
-                row[int(place)] = float(word)
+            if path and last.isdecimal():
+                row = said.setdefault(".".join(path), [])
+                row += [0.0] * (int(last) + 1 - len(row))
+                row[int(last)] = float(word)
+            elif column.kind != "-":
+                here = said
+                for key in path:
+                    here = here.setdefault(key, {})
+                here[last] = word if column.kind == "iso" else float(word)
         return msgspec.json.encode(said).decode()
 
     def respond(self, packet: bytes) -> bytes:
@@ -228,14 +225,13 @@ class AsciiLine(SerialCodec):
             if joined:
                 self._refuse()
             return
-        if self._names is None:
-            words = line.translate(_SPACES).split()
-            if len(words) == self._width and _PLAIN.fullmatch(line) and b",," not in line:
-                try:
-                    self._take([float(word) for word in words], t_ns)
-                    return
-                except ValueError:  # 1-2, say
-                    pass
+        words = line.translate(_SPACES).split() if self._names is None else []
+        if len(words) == self._width and _PLAIN.fullmatch(line) and b",," not in line:
+            try:
+                self._take([float(word) for word in words], t_ns)
+                return
+            except ValueError:  # 1-2, say
+                pass
         text = line.decode("utf-8", "replace")
         if self._names is not None:
             self._gather(text, t_ns)
@@ -248,12 +244,13 @@ class AsciiLine(SerialCodec):
         """A row is a sample, if what counts in it is a whole number, and the time a time."""
         count = row[self._count] if self.count_bits is not None else 0.0
         ticks = row[self._time] / self._per_tick if self.tick_ns is not None else 0.0
-        if abs(ticks) < EXACT and abs(count) < EXACT and count.is_integer():
+        counts = abs(count) < EXACT and count.is_integer()
+        if counts and abs(ticks) < EXACT:
             self._rows.append(row)
             self._about.append((t_ns, self._damaged))
             self._damaged = 0
         else:
-            at = self._time if abs(count) < EXACT and count.is_integer() else self._count
+            at = self._time if counts else self._count
             self.complaint = f"column {at + 1} ({self._columns[at].kind}) is {row[at]:g}"
             self._refuse()
 
@@ -263,7 +260,7 @@ class AsciiLine(SerialCodec):
             words = fields(text, words_are_names)
             if text.rstrip().endswith((",", ";")) and len(words) == self._width - 1:
                 words.append("nan")
-            for some in (words, [w for w in words if any(map(str.isdigit, w)) or number(w)]):
+            for some in (words, [w for w in words if _has_digit(w) or number(w)]):
                 row = self._fitting(some)
                 if row is not None and 2 * len(row) >= len(words):
                     return row
@@ -276,12 +273,10 @@ class AsciiLine(SerialCodec):
         row, measured, missing = [], 0, 0
         for column, word in zip(self._columns, words, strict=True):
             value = number(word)
-            if value is None:
-                if column.kind not in ("-", "value") or (
-                    column.kind == "value" and any(map(str.isdigit, word))
-                ):
+            if value is None and column.kind != "-":
+                if column.kind != "value" or _has_digit(word):
                     return None
-                missing += column.kind == "value"
+                missing += 1
             measured += column.kind == "value"
             row.append(NAN if value is None else value)
         return row if 2 * missing <= measured else None
@@ -292,10 +287,11 @@ class AsciiLine(SerialCodec):
         assert self._names is not None
         found = self._names.find(text)
         if not found:
-            self.stats.skipped += len(text)
+            if _WORDS.fullmatch(text):
+                self._refused(text)
+            else:
+                self.stats.skipped += len(text)
             if text.strip():
-                if (self.stats.intact or self._rows) and _WORDS.fullmatch(text):
-                    self.passed += 1
                 names = ", ".join(repr(c.label) for c in self._columns)
                 self.complaint = f"line {quoted(text)} has none of {names}"
             return
@@ -315,6 +311,7 @@ class AsciiLine(SerialCodec):
             absent = [c.label for i, c in enumerate(self._columns) if i not in came]
             self.complaint = f"{', '.join(map(repr, absent))} did not come"
         if 2 * len(came) >= self._width:
+            self.stats.incomplete += len(came) < self._width
             self._take([came.get(i, NAN) for i in range(self._width)], self._open_ns)
         else:
             self._refuse()
@@ -322,7 +319,7 @@ class AsciiLine(SerialCodec):
     def _refused(self, text: str) -> None:
         """Count a line that is no sample as what it is, and say why it is none."""
         words = fields(text)
-        numbers = [w for w in words if number(w) is not None]
+        numbers = [w for w in words if number(w) is not None and w.strip("-")]
         if words:
             self.complaint = self._why(text, words)
         if 2 * len(numbers) < len(words):  # mostly words: not meant as a sample
@@ -369,6 +366,7 @@ def _find_names(columns: tuple[Column, ...], where: str) -> Names | None:
         return None
     if len(labels) != len(columns):
         told = [c.label for c in columns]
-        what = next((f"{t!r} stands there twice" for t in told if t and told.count(t) > 1), "")
-        raise ConfigError(f"{where}: " + (what or "give all columns a name, NAME=COLUMN, or none"))
+        what = [f"{t!r} stands there twice" for t in labels if told.count(t) > 1]
+        what.append("give all columns a name, NAME=COLUMN, or none")
+        raise ConfigError(f"{where}: {what[0]}")
     return Names(labels)

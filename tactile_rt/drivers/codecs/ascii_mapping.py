@@ -20,8 +20,9 @@ SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Witho
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -40,6 +41,7 @@ __all__ = [
     "Element",
     "LineMapping",
     "array_of",
+    "order_columns",
     "parse_column",
     "parse_columns",
     "read_mapping",
@@ -71,8 +73,7 @@ _KNOWN: Final = {
 
 _MEASUREMENT: Final = re.compile(r"([^.*:\s]+)\.([^.*:\s]+)(?:\*([^:\s]+))?(?::(.+))?")
 _SECONDS: Final = re.compile(r"time(?:\*([^:\s]+))?:s")
-_TIME: Final = re.compile(r"time:(ms|us|ns)(?::(\d+))?")
-_COUNT: Final = re.compile(r"count(?::(\d+))?")
+_WHOLE: Final = re.compile(r"(count|time:(?:ms|us|ns))(?::(\d+))?")
 _WHISKER: Final = re.compile(r"([A-Z])(\d{1,2})")
 
 
@@ -176,12 +177,13 @@ def parse_column(word: str, where: str) -> Column:
         return Column("-")
     if word in ("time:iso", "time:mdy", "time:dmy"):
         return Column("iso", unit=word[5:].removeprefix("iso"))
-    if found := _COUNT.fullmatch(word):
-        return Column("count", bits=_bits(found[1], where))
+    if found := _WHOLE.fullmatch(word):
+        bits = int(found[2] or 32)
+        if not 1 <= bits <= MOST_BITS:
+            raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
+        return Column(found[1].removeprefix("time:"), bits=bits)
     if found := _SECONDS.fullmatch(word):
         return Column("s", scale=_scale(found[1], where))
-    if found := _TIME.fullmatch(word):
-        return Column(found[1], bits=_bits(found[2], where))
     found = _MEASUREMENT.fullmatch(word)
     if found is None:
         raise ConfigError(
@@ -221,12 +223,11 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
                 f"{where}: {c.element}.{c.channel} is in {c.unit}, another {c.channel} in "
                 f"{units[c.channel]}"
             )
-    for element in elements:
-        for channel in units:
-            if (element, channel) not in seen:
-                raise ConfigError(
-                    f"{where}: no column {element}.{channel}; every element needs every channel"
-                )
+    for element, channel in product(elements, units):
+        if (element, channel) not in seen:
+            raise ConfigError(
+                f"{where}: no column {element}.{channel}; every element needs every channel"
+            )
     for what, kinds in (("count", ["count"]), ("time", ["s", "iso", "ms", "us", "ns"])):
         if sum(c.kind in kinds for c in columns) > 1:
             raise ConfigError(f"{where}: {what} stands there twice")
@@ -250,6 +251,12 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
         raise ConfigError(f"{where}: {error}") from None
 
 
+def order_columns(columns: Sequence[Column], spec: ArraySpec) -> list[int]:
+    """Return the place of each element's channels among the columns."""
+    at = {(c.element, c.channel): k for k, c in enumerate(columns)}
+    return [at[e, c] for e in spec.elements for c in spec.channels]
+
+
 def _grid(elements: tuple[str, ...], poses: list[Element]) -> tuple[tuple[int, int], ...]:
     names = [_WHISKER.fullmatch(e) for e in elements]
     cells = [
@@ -267,10 +274,3 @@ def _scale(text: str | None, where: str) -> float:
     if not (np.isfinite(scale) and scale):
         raise ConfigError(f"{where}: scale must be a number other than 0, not {text!r}")
     return scale
-
-
-def _bits(text: str | None, where: str) -> int:
-    bits = int(text or 32)
-    if not 1 <= bits <= MOST_BITS:
-        raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
-    return bits

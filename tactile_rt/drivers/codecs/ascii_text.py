@@ -45,14 +45,10 @@ _SIGNS: Final = frozenset("=:/~#*")
 
 def number(word: Any) -> float | None:
     """What is printed; NaN for what a board prints in place of a number, None for another word."""
-    if isinstance(word, bool):
-        return float(word)
     if isinstance(word, int | float):
         return float(word) if abs(word) < 1e300 else NAN
-    if word is None:
-        return NAN
     if not isinstance(word, str):
-        return None
+        return NAN if word is None else None
     try:
         return None if "_" in word else float(word)
     except ValueError:

@@ -23,6 +23,7 @@ __all__ = ["guess_columns", "guess_line_columns"]
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
+PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
 SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
 Rows = Sequence[Sequence[float | None]]
 
@@ -39,23 +40,23 @@ _COUNT: Final = re.compile(
 _TIME_UNIT: Final = re.compile(
     r"(?:^|[_ ([/.]|millis|micros)(s|sec|secs|ms|us|µs|ns|nsec|nsecs)\W*$"
 )
+_UNITS_OF_TIME: Final = {"sec": "s", "secs": "s", "µs": "us", "nsec": "ns", "nsecs": "ns"}
 _IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
-_TAIL_UNIT: Final = re.compile(r"_(mN|uN|N|Nm|mNm|kPa|Pa|uT|mT|T|degC|mV|V|mm|um|pF)$")
+_TAIL_UNIT: Final = re.compile(
+    r"_(mN|uN|N|Nm|mNm|gf|kgf|kPa|Pa|uT|mT|T|degC|C|K|rad|deg|mV|V|mm|um|pF)$"
+)
+_BEGIN, _END = r"(?:^|[\W_])", r"(?:$|[\W_]|(?=\d))"
 _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
     (re.compile(pattern, re.IGNORECASE), channel, unit)
     for pattern, channel, unit in (
-        (r"(?:^|[\W_])(?:f|force|forces)[\W_]*([xyz])(?:$|[\W_]|(?=\d))", "f{}", "N"),
-        (r"(?:^|[\W_])(?:t|m|torques?|moment|tau)[\W_]*([xyz])(?:$|[\W_]|(?=\d))", "m{}", "Nm"),
-        (
-            r"(?:^|[\W_])(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])(?:$|[\W_]|(?=\d))",
-            "b{}",
-            "",
-        ),
-        (r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
+        (_BEGIN + r"(?:f|force|forces)[\W_]*([xyz])" + _END, "f{}", "N"),
+        (_BEGIN + r"(?:t|m|torques?|moment|tau)[\W_]*([xyz])" + _END, "m{}", "Nm"),
+        (_BEGIN + r"(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])" + _END, "b{}", ""),
+        (_BEGIN + r"(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
         (r"^(?:force|load|weight)$", "force", ""),
         (r"(?<=[\W_])([xyz])(?:$|[\W_])", "{}", ""),
-        (r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", "pressure", ""),
+        (_BEGIN + r"(?:pressure|press)(?:$|[\W_])", "pressure", ""),
         (r"(?:^|(?<=\d))([xyz])$", "{}", ""),
         (r"^([xyz])(?=\d+$)", "{}", ""),
     )
@@ -82,23 +83,19 @@ def guess_columns(
     Args:
         rows: cells of some rows, None for what is no number.
     """
-    width = len(names) or max((len(r) for r in rows), default=0)
+    width = len(names) or max(map(len, rows), default=0)
     series = [_column(rows, k) for k in range(width)]
     kinds: list[str] = ["" if s is not None else "-" for s in series]
-    time = _place_time(names, series, dated)
-    if time is not None:
+    if (time := _place_time(names, series, dated)) is not None:
         kinds[time[0]] = time[1]
-    count = _place_count(names, series, kinds)
-    if count is not None:
+    if (count := _place_count(names, series, kinds)) is not None:
         kinds[count] = "count"
     for k, name in enumerate(names):  # times and counts beside those
-        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _COUNT.fullmatch(_bare(name))):
+        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _counts(name)):
             kinds[k] = "-"
     measured = [k for k, kind in enumerate(kinds) if not kind]
-    if names:
-        words = _by_names(names, measured)
-    else:
-        words = {k: f"T{i}.value" for i, k in enumerate(measured)}
+    plain = {k: f"T{i}.value" for i, k in enumerate(measured)}
+    words = _by_names(names, measured) if names else plain
     return [words.get(k, kinds[k] or "-") for k in range(width)], time is not None
 
 
@@ -109,7 +106,9 @@ def guess_line_columns(data: bytes) -> list[str] | None:
     if label and any(line.startswith(label[1]) for line in lines):  # whole; it may begin a sample
         lines.insert(0, first)
     lines = [x for x in lines[:-1] if re.search(r"\w", x)][:LOOKED_AT]
-    if len(lines) < LEAST or _unprintable(lines):
+    text = "".join(lines).replace("\t", " ")
+    odd = sum(not c.isprintable() or c == "\ufffd" for c in text)
+    if len(lines) < LEAST or 20 * odd > len(text):
         return None
     return _of_objects(lines) or _of_places(lines) or _of_labels(lines)
 
@@ -120,10 +119,8 @@ def _of_objects(lines: list[str]) -> list[str] | None:
     for line in lines:
         with suppress(msgspec.DecodeError, UnicodeEncodeError):
             said.append(msgspec.json.decode(line, type=dict[str, Any]))
-    if len(said) < MOSTLY * len(lines):
-        return None
     each = [dict(_numbers(one, "")) for one in said]
-    return _named(each)
+    return _named(each) if len(said) >= MOSTLY * len(lines) else None
 
 
 def _of_labels(lines: list[str]) -> list[str] | None:
@@ -131,25 +128,18 @@ def _of_labels(lines: list[str]) -> list[str] | None:
     each: list[dict[str, float]] = []
     used = 0
     for line in lines:
-        found: dict[str, float] = {}
-        covered = 0
-        for label in _LABELLED.finditer(in_seconds(line)):
-            value = number(label[2])
-            if value is not None:
-                found[label[1].strip()] = value
-                covered += len(label[0])
-        if 2 * covered < len(line.strip()):  # a log in words, which has a number here and there
+        labels = _LABELLED.finditer(in_seconds(line))
+        told = [(label, v) for label in labels if (v := number(label[2])) is not None]
+        found = {label[1].strip(): value for label, value in told}
+        # a log in words has a number here and there
+        if not found or 2 * sum(len(label[0]) for label, _ in told) < len(line.strip()):
             continue
-        used += bool(found)
-        if not found:
-            continue
+        used += 1
         if each and set(found).isdisjoint(each[-1]):
             each[-1] |= found
         else:
             each.append(found)
-    if used < MOSTLY * len(lines):
-        return None
-    return _named(each)
+    return _named(each) if used >= MOSTLY * len(lines) else None
 
 
 def _named(each: list[dict[str, float]]) -> list[str] | None:
@@ -180,7 +170,12 @@ def _of_places(lines: list[str]) -> list[str] | None:
         labelled = _of_labels(lines)  # names tell more than places
         if labelled is not None and len(labelled) >= len(numeric) - 1:
             return labelled
-    dated = {k for k in numeric if all(_is_date(line, c[k]) for line, c in same[:20])}
+    clocks = [(line, c) for line, c in same[:20] if in_seconds(line) != line]
+    dated = {
+        k
+        for k in numeric
+        if len(clocks) == len(same[:20]) and all(c[k] not in line for line, c in clocks)
+    }
     words, _ = guess_columns((), rows, dated)
     if not _measures(words):
         return None
@@ -192,10 +187,6 @@ def _measures(words: Iterable[str]) -> bool:
     return any("." in word for word in words if not word.startswith("time"))
 
 
-def _is_date(line: str, word: str) -> bool:
-    return word not in line and in_seconds(line) != line
-
-
 def _numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
     if isinstance(value, dict):
         for key, one in value.items():
@@ -205,12 +196,6 @@ def _numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
             yield from _numbers(one, f"{at}.{k}")
     elif isinstance(value, int | float) and not isinstance(value, bool) and at:
         yield at, float(value)
-
-
-def _unprintable(lines: list[str]) -> bool:
-    text = "".join(lines)
-    odd = sum(not c.isprintable() and c != "\t" for c in text) + text.count("\ufffd")
-    return odd * 20 > len(text)
 
 
 # what a column is
@@ -230,11 +215,16 @@ def _bare(name: str) -> str:
     return _BRACKET.sub("", name).strip().strip('"')
 
 
+def _counts(name: str) -> bool:
+    """Return whether a name is that of a count; Fx_N is none."""
+    return _COUNT.fullmatch(_TAIL_UNIT.sub("", _bare(name))) is not None
+
+
 def _place_time(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], dated: Collection[int]
 ) -> tuple[int, str] | None:
-    for k in sorted(dated):
-        return k, "time:iso"
+    if dated:
+        return min(dated), "time:iso"
     known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))]
     known = known or [k for k, name in enumerate(names) if _IN_SECONDS.search(name)]
     for k in [*known, *(() if known else range(len(series)))]:
@@ -247,26 +237,20 @@ def _place_time(
             if rising or (steps >= 0).mean() > MOSTLY:
                 return k, f"time:{_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
-            # a ramp of a measurement is as steady hardly ever, and from 1970 none counts
-            if np.std(steps) <= np.mean(steps) or _is_utc(v):
+            # a ramp of a measurement is as steady hardly ever, and none counts from 1970
+            since_1970 = any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in PER_SECOND)
+            if np.std(steps) <= np.mean(steps) or since_1970:
                 return k, f"time:{_time_unit('', v)}"
     return None
-
-
-def _is_utc(v: NDArray[np.float64]) -> bool:
-    """Whether these are times from 1970 on, of 2001 to 2065, in s, ms, us or ns."""
-    return any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in (1, 1e3, 1e6, 1e9))
 
 
 def _time_unit(name: str, v: NDArray[np.float64]) -> str:
     """The unit of a time, by its name, by how long ago it began, or by its steps."""
     if found := _TIME_UNIT.search(name.strip().lower().replace("μ", "µ")):
-        told = found[1].replace("µ", "u").removesuffix("s") if len(found[1]) > 2 else found[1]
-        return {"sec": "s", "nsec": "ns", "µs": "us"}.get(told, told)
-    if "millis" in name.lower():
-        return "ms"
-    if "micros" in name.lower():
-        return "us"
+        return _UNITS_OF_TIME.get(found[1], found[1])
+    for word, unit in (("millis", "ms"), ("micros", "us")):
+        if word in name.lower():
+            return unit
     size = float(np.nanmedian(np.abs(v)))
     for least, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s")):
         if size > least:
@@ -282,7 +266,7 @@ def _place_count(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], kinds: Sequence[str]
 ) -> int | None:
     for k, v in enumerate(series):
-        if v is None or kinds[k] or (names and not _COUNT.fullmatch(_bare(names[k]))):
+        if v is None or kinds[k] or (names and not _counts(names[k])):
             continue
         if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all() and (v >= 0).all():
             steps = np.diff(v)  # what falls more often is a reading that goes round
@@ -313,15 +297,10 @@ def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     if not shapes:
         return {}
     best = max(shapes, key=lambda s: (len(s) * shapes[s], len(s)))
-    units = {c: {chosen[g[c]][2] for g in groups.values() if frozenset(g) == best} for c in best}
-    words = {}
-    for element, g in groups.items():
-        if frozenset(g) != best:
-            continue
-        for channel, k in g.items():
-            (unit,) = units[channel] if len(units[channel]) == 1 else ("",)
-            words[k] = f"{element}.{channel}:{unit or '1'}"
-    return words
+    whole = {element: g for element, g in groups.items() if frozenset(g) == best}
+    each = {c: {chosen[g[c]][2] for g in whole.values()} for c in best}
+    units = {c: "".join(found) if len(found) == 1 else "" for c, found in each.items()}
+    return {k: f"{e}.{c}:{units[c] or '1'}" for e, g in whole.items() for c, k in g.items()}
 
 
 def _parsed(name: str) -> tuple[str, str, str]:
@@ -332,7 +311,7 @@ def _parsed(name: str) -> tuple[str, str, str]:
         unit = word if word in UNITS else _ALIASES.get(word.lower(), "")
     bare = _bare(name)
     if not unit and (tail := _TAIL_UNIT.search(bare)):
-        unit, bare = tail[1], bare[: tail.start()]
+        unit, bare = _ALIASES.get(tail[1].lower(), tail[1]), bare[: tail.start()]
     for pattern, channel, usual in _QUANTITY:
         if (found := pattern.search(bare)) is None:
             continue

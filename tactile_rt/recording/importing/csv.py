@@ -33,7 +33,7 @@ DELIMITERS: Final = (";", "\t", ",", "|", " ")
 NAMES: Final = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}
 _REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a spreadsheet
 LONGEST: Final = 1 << 20  # characters of a line
-_COMMA: Final = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
+_COMMA: Final = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
     r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|[munk\u00b5]?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)"
     r"|[mu]?N[ .*\u00b7-]?m{1,2}|deg|degC|kgf?|%|bar|counts?"
@@ -43,7 +43,6 @@ _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pair
     r"[\[(](?=[\s\[(]*(?:[-+.]*\d|nan\b))(?=[^\])]*[\s,;])"
     r"(?:[-+.\deEnNaAiIfF\s,;]|[\[(][-+.\deEnNaAiIfF\s,;]*[\])])*[\])]"
 )
-_NUMBER_COMMA: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ def csv_form(
     told = NAMES.get(delimiter, delimiter)
     if len(told) > 1:
         raise ConfigError(f"--delimiter is one character, tab or space, not {delimiter!r}")
-    best: tuple[float, CsvForm] | None = None
+    fits: list[tuple[float, CsvForm]] = []
     for one in (told,) if told else DELIMITERS:
         for comma in (decimal == ",",) if decimal else (False, True):
             if comma and one == ",":
@@ -96,15 +95,13 @@ def csv_form(
             between = 2 * sum(map(_between_digits, head)) > len(head)
             if not comma and not decimal and one == " " and between:
                 continue  # 5,01 -7 0,25
-            found = _tried(head, one, comma)
-            if found is not None and (best is None or found[0] > best[0] + 1e-9):
-                best = found
-    if best is None:
+            fits += _fit(head, one, comma)
+    if not fits:
         raise RecordingError(
             f"{path} is no table of numbers: no delimiter cuts most of its lines into as many "
             "numbers (--delimiter, --skip and --lines tell how it is written)"
         )
-    form = best[1]
+    _, form = max(fits, key=lambda fit: round(fit[0], 9))
     return replace(form, first=skip + form.first * lines, lines=lines)
 
 
@@ -166,8 +163,7 @@ def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
         cells = [x for c in cells for x in (_split_list(c) if _LIST.search(c) else (c,))]
     if len(cells) > 1 and line.rstrip(" ").endswith(delimiter):
         del cells[-1]  # a delimiter at the end of each line
-    return [c.replace(",", ".") if _NUMBER_COMMA.fullmatch(c.strip()) else c for c in cells] \
-        if comma else cells  # fmt: skip
+    return [c.replace(",", ".") if comma and _COMMA.fullmatch(c) else c for c in cells]
 
 
 def _split_list(cell: str) -> list[str]:
@@ -178,7 +174,7 @@ def _split_list(cell: str) -> list[str]:
 
 def _is_there(cell: str) -> bool:
     """Whether this may stand where numbers do."""
-    return not cell.strip() or number(cell.strip()) is not None or _is_number(cell)
+    return number(cell.strip() or "nan") is not None or _is_number(cell)
 
 
 def _is_number(cell: str) -> bool:
@@ -194,8 +190,8 @@ def _between_digits(line: str) -> bool:
     return len(words) > 1 and bool(cut) and all(map(_COMMA.fullmatch, cut))
 
 
-def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm] | None:
-    """How well this fits, and the form that it gives."""
+def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvForm]]:
+    """Return how well this form fits the lines, and the form; empty: not."""
     rows = [
         (k, _cells(x, delimiter, comma))
         for k, x in enumerate(head)
@@ -204,7 +200,7 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_there, c)) >= len(c) > 0]
     widths = Counter(len(c) for _, c in numeric)
     if not widths:
-        return None
+        return []
     width, often = max(widths.items(), key=lambda w: (w[1], w[0]))
     named = any(len(c) == width + 1 for k, c in rows if k < numeric[0][0])
     if (widths[width + 1] or named) and all(
@@ -223,9 +219,12 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
         names, units, below_names = _names(head[:first], delimiter, comma, width, spans)
         if names:
             break
+    else:  # without names, words may stand in the first rows, too
+        known = ((k, c) for k, c in numeric if len(c) == width)
+        first = next((k for k, c in known if usual and _is_number(c[usual[0]])), first)
     lines = sum(k >= (below_names if names else first) for k, _ in rows)
     if often < ENOUGH * lines:
-        return None
+        return []
     share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
     usual = [n for n, times in widths.items() if times >= OFTEN * len(numeric)]
     if names:  # the first rows may lack what is usual, and all rows what is seldom there
@@ -239,9 +238,8 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     heads = frozenset(
         x.strip() for x in head[:first] if not all(map(_is_there, x.split(delimiter)))
     )
-    return score, CsvForm(
-        delimiter, comma, names, first, width, 1, units, frozenset(usual), heads
-    )  # fmt: skip
+    form = CsvForm(delimiter, comma, names, first, width, 1, units, frozenset(usual), heads)
+    return [(score, form)]
 
 
 def _spans(line: str, delimiter: str, comma: bool) -> list[int]:
@@ -260,16 +258,11 @@ def _names(
     units: tuple[str, ...] = ()
     end, next_above = 0, True
     for k, line in reversed(list(enumerate(above, start=1))):
-        text = line
-        for mark in ("#", "//"):
-            text = text.removeprefix(mark)
-        if delimiter == " ":
-            cells = re.findall(r'"[^"]*"|[^\s,;]+', text)
-        else:
-            cells = _cells(text, delimiter, comma)
-        cells = [c.strip().strip('"').strip() for c in cells]
-        if line.startswith("%") and len(cells) != width:
-            cells = cells[1:] if cells[:1] == ["%"] else cells
+        text = line.removeprefix("#").removeprefix("//")
+        apart = re.findall(r'"[^"]*"|[^\s,;]+', text) if delimiter == " " else None
+        cells = [c.strip(' \t"') for c in apart or _cells(text, delimiter, comma)]
+        if len(cells) != width and cells[:1] == ["%"]:
+            del cells[0]
         if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
             cells.append("")
         if len(cells) == len(spans):  # the names of lists

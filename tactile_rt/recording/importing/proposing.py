@@ -18,7 +18,6 @@ from tactile_rt.recording.importing.table import read_samples
 
 __all__ = [
     "ProposedColumns",
-    "line_columns",
     "propose_columns",
     "propose_fields",
     "propose_line_columns",
@@ -43,11 +42,12 @@ class ProposedColumns:
     table: bool
     timed: bool
     said: str
+    samples: int = 0
 
 
-def line_columns(data: bytes) -> tuple[str, int] | None:
-    """The columns of lines that a board prints, in words, and how many lines are samples by them;
-    None: there are none."""
+def propose_line_columns(data: bytes) -> ProposedColumns | None:
+    """The columns of what a board printed; None where it printed no samples."""
+    data = b"\n" + data  # it begins with a line
     guess = guess_line_columns(data) or guess_line_columns(data[len(data) // 2 :])
     if guess is None:
         return None
@@ -57,8 +57,11 @@ def line_columns(data: bytes) -> tuple[str, int] | None:
     except ConfigError:
         return None
     codec.feed(data, 0)
-    whole, corrupt = codec.stats.intact, codec.stats.corrupt
-    return (columns, whole) if whole >= max(LEAST, corrupt) else None
+    whole, lines = codec.stats.intact, len(data.splitlines()) - 1
+    if whole < max(LEAST, codec.stats.corrupt):
+        return None
+    said = f"{whole} samples in the first {lines} lines"
+    return ProposedColumns(columns, False, "time" in columns, said, whole)
 
 
 def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
@@ -79,15 +82,6 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
         return told or _of_table(path, form)
     tried = _try_import(path, form, replace(told, table=True))
     return tried if tried.columns else _of_table(path, form) or tried
-
-
-def propose_line_columns(data: bytes) -> ProposedColumns | None:
-    """The columns of what a board printed; None where it printed no samples."""
-    told = line_columns(b"\n" + data)  # a file begins with a line
-    if told is None:
-        return None
-    columns, n = told
-    return ProposedColumns(columns, False, "time" in columns, f"{n} lines are samples")
 
 
 def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
@@ -156,11 +150,7 @@ def propose_fields(paths: Sequence[str]) -> str:
         groups.setdefault(tuple(array), []).append(path)
     words = []
     for path in max(groups.values(), key=len, default=[]):
-        places = [s for s in path.split(".") if s.isdecimal()]
-        if not places:
-            words.append(f"{path}=S.{path.replace('.', '_')}")
-        elif len(places) == 1:
-            words.append(f"{path}=T{places[0]}.value")
-        else:
-            words.append(f"{path}=T{'_'.join(places[:-1])}.c{places[-1]}")
+        *places, last = [s for s in path.split(".") if s.isdecimal()] or [""]
+        whole = f"T{last}.value" if last else f"S.{path.replace('.', '_')}"
+        words.append(f"{path}=" + (f"T{'_'.join(places)}.c{last}" if places else whole))
     return compress_columns(words)

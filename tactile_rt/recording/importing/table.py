@@ -12,10 +12,10 @@ replaced by one between its neighbours. A time that goes back for good begins an
 period after the row before; a time of day that falls by more than half a day is of the next day.
 """
 
-import re
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +31,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     Column,
     LineMapping,
     array_of,
+    order_columns,
     parse_columns,
     read_mapping,
 )
@@ -51,8 +52,8 @@ EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
 FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 DAY_NS: Final = 86_400 * NS_PER_S
+EXACT: Final = 2.0**53  # whole numbers up to here are exact
 SHOWN: Final = 600  # characters of the names that a message tells
-_DECIMAL: Final = re.compile(r"([+-]?)(\d+)(?:\.(\d*))?")
 
 
 @dataclass
@@ -99,23 +100,18 @@ def place_columns(
     labelled = [c.label for c in columns if c.label]
     if labelled and len(labelled) < len(columns):
         raise ConfigError(f"{where}: give all columns a name, NAME=COLUMN, or none")
-    if not labelled:
-        if names and len(columns) > len(names):
-            raise ConfigError(f"{where}: {len(columns)} columns for {len(names)} of the file")
-        left = names[len(columns) :]
-        return list(range(len(columns))), [f"left out: {shown_names(left)}"] if left else []
-    plain = {name.strip().lower(): k for k, name in enumerate(reversed(names))}
-    exact = {name: k for k, name in enumerate(reversed(names))}
-    places = []
+    if labelled and not names:
+        raise ConfigError(f"{where}: the file does not name its columns: give them by their places")
+    if not labelled and len(columns) > len(names) > 0:
+        raise ConfigError(f"{where}: {len(columns)} columns for {len(names)} of the file")
+    places = [] if labelled else list(range(len(columns)))
+    from_last = list(enumerate(names))[::-1]
+    known = {n.strip().lower(): k for k, n in from_last} | {n: k for k, n in from_last}
     for label in labelled:
-        found = exact.get(label, plain.get(label.strip().lower()))
+        found = known.get(label, known.get(label.strip().lower()))
         if found is None:
-            if not names:
-                raise ConfigError(
-                    f"{where}: the file does not name its columns: give them by their places"
-                )
             raise ConfigError(f"{where}: no column {label!r}; {nearest(label, names)}")
-        places.append(len(names) - 1 - found)
+        places.append(found)
     left = [n for k, n in enumerate(names) if k not in places and not n.startswith(BESIDE)]
     return places, [f"left out: {shown_names(left)}"] if left else []
 
@@ -136,9 +132,13 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     values, times, count = read.values, read.times, read.count
     if times is not None:
         if any(c.kind == "iso" for c in parsed) and times.max() < DAY_NS:
-            steps = np.diff(times, prepend=times[0])
+            # a wrong stamp is no midnight, so the days are counted of medians
+            around = np.lib.stride_tricks.sliding_window_view(np.pad(times, 2, mode="edge"), 5)
+            middle = np.median(around, axis=1).astype(np.int64)
+            steps = np.diff(middle, prepend=middle[0])
             days = np.cumsum((steps < -DAY_NS // 2).astype(int) - (steps > 23 * DAY_NS // 24))
-            times = times + DAY_NS * np.maximum(0, days)
+            late = middle + DAY_NS * np.maximum(0, days) - times
+            times = times + DAY_NS * np.round(late / DAY_NS).astype(np.int64)
         order, times = _sort_rows(times, account)
         values, count = values[order], None if count is None else count[order]
     seq, keep = _numbers(count, parsed, len(values), account)
@@ -154,10 +154,8 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
-    about = Description(
-        spec, zero, table.path.name,
-        session={"imported": table.path.name, "columns": columns},
-    )  # fmt: skip
+    session = {"imported": table.path.name, "columns": columns}
+    about = Description(spec, zero, table.path.name, session=session)
     return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
 
 
@@ -171,8 +169,8 @@ def read_samples(
     places, notes = place_columns(parsed, table.names, where)
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
-    parts = _parts_of_seconds(parsed)
-    spec = array_of(mapping, tuple(c for k, c in enumerate(parsed) if k not in parts), where)
+    parts = ("us", "ns") if any(c.kind == "s" for c in parsed) else ()  # of its seconds
+    spec = array_of(mapping, tuple(c for c in parsed if c.kind not in parts), where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
         raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
     read = _read(table, parsed, places, spec)
@@ -199,8 +197,7 @@ class ReadRows:
 def _read(
     table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec
 ) -> ReadRows:
-    at = {(c.element, c.channel): k for k, c in enumerate(columns)}
-    order = [at[e, c] for e in spec.elements for c in spec.channels]
+    order = order_columns(columns, spec)
     scale = np.array([columns[k].scale for k in order])
     offset = np.array([columns[k].offset for k in order])
     measured = [places[k] for k in order]
@@ -230,7 +227,10 @@ def _read(
             if not clocks and table.times_ns is not None:
                 t_ns = table.times_ns[-1]
             if counter is not None:
-                counts.append(_whole(cells[counter]))
+                count = _number(cells[counter])
+                if not count.is_integer() or abs(count) >= EXACT:
+                    raise ValueError(f"{cells[counter]!r:.40} is no count")
+                counts.append(int(count))
         except (ValueError, OverflowError) as error:
             corrupt += 1
             complaint = complaint or str(error)
@@ -247,63 +247,29 @@ def _read(
     )  # fmt: skip
 
 
-def _parts_of_seconds(columns: Sequence[Column]) -> list[int]:
-    """Which columns are the rest of a time whose seconds have a column of their own."""
-    seconds = any(c.kind == "s" for c in columns)
-    return [k for k, c in enumerate(columns) if seconds and c.kind in ("us", "ns")]
-
-
 def _number(cell: Any) -> float:
-    """What a cell measures; NaN where there is none.
-
-    Raises:
-        ValueError: it is another word.
-    """
-    if isinstance(cell, str):
-        try:
-            return float(cell)
-        except ValueError:
-            if not cell.strip():
-                return np.nan
-            found = number(cell.strip())
-            if found is None:
-                raise ValueError(f"{cell[:40]!r} is no number") from None
-            return found
-    return float(cell)
-
-
-def _whole(cell: Any) -> int:
-    value = _number(cell)
-    if not value.is_integer() or abs(value) >= 2.0**53:
-        raise ValueError(f"{cell!r:.40} is no count")
-    return int(value)
+    """What a cell measures; NaN where there is none."""
+    if not isinstance(cell, str):
+        return float(cell)
+    found = number(cell.strip() or "nan")
+    if found is None:
+        raise ValueError(f"{cell[:40]!r} is no number")
+    return found
 
 
 def _time(cell: Any, column: Column) -> int:
     """A time in ns, exactly where it is written in decimals."""
-    unit = NS[column.kind]
-    if isinstance(cell, int | np.integer):
-        text = str(int(cell))
-    elif not isinstance(cell, str):
-        return round(float(cell) * column.scale * unit)
-    else:
-        text = in_seconds(cell.strip(), column.unit) if column.kind == "iso" else cell.strip()
-    found = _DECIMAL.fullmatch(text) if column.scale == 1.0 else None
-    if found is None:
-        try:
-            value = float(text) * column.scale * unit
-        except ValueError:
-            value = np.inf
-        if not abs(value) < 2.0**62:
-            hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
-            raise ValueError(f"{cell!r:.40} is no time{hint}")
-        return round(value)
-    part = found[3] or ""
-    scale: int = 10 ** len(part)
-    ns = int(found[2]) * unit + int(part or 0) * unit // scale
-    if ns >= 1 << 62:
-        raise ValueError(f"{cell!r:.40} is no time")
-    return -ns if found[1] == "-" else ns
+    text = str(cell).strip()
+    if column.kind == "iso":
+        text = in_seconds(text, column.unit)
+    try:
+        ns = Decimal(text) * NS[column.kind] * Decimal(column.scale)
+        if abs(ns) < 1 << 62:
+            return round(ns)
+    except InvalidOperation:  # it is no number
+        pass
+    hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
+    raise ValueError(f"{cell!r:.40} is no time{hint}")
 
 
 def _numbers(
@@ -396,8 +362,7 @@ def _strictly(
     forward = steps[ends] > 0
     if not forward.any():
         raise ConfigError("all lines have one time: leave its column out, and give --rate")
-    stretches = int((steps < 0).sum())
-    repeats = int((steps == 0).sum())
+    stretches, repeats = int((steps < 0).sum()), int((steps == 0).sum())
     usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
     rows = np.diff(ends, prepend=-1)
     long = steps[ends] > EVEN[1] * np.median((steps[ends] / rows)[usual]) * rows
@@ -411,8 +376,7 @@ def _strictly(
     if repeats:
         account.notes.append(f"{repeats} lines have the time of the one before: spread evenly")
         times = _spread(times, period)
-    rate = NS_PER_S / period
-    return times, float(f"{rate:.6g}")
+    return times, float(f"{NS_PER_S / period:.6g}")
 
 
 def _spread(times: NDArray[np.int64], period: float) -> NDArray[np.int64]:

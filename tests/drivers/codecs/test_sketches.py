@@ -110,7 +110,10 @@ def test_of_several_lines_none_comes_into_another_sample(lost: int) -> None:
     assert told == [[k, k, k] for k in range(2 if lost else 1, 5)]
     assert codec.stats.corrupt == 0
     codec.forget()
-    samples = codec.feed(b"joined\n" + b"".join(lines[:3] + lines[4:]), T0)
+    samples = codec.feed(
+        b"joined\n" + b"".join(lines[:3] + lines[4:] + [b"\0\0\0\n", b"-1.5\n"]), T0
+    )
+    assert (codec.stats.incomplete, codec.stats.corrupt, codec.passed) == (1, 1, 1)
     assert samples.valid[:, 0].tolist() == [True, False, True, True]
     assert samples.values[2, 0].tolist() == [3, 3, 3]
 

@@ -73,11 +73,13 @@ def test_a_column_that_comes_late_takes_no_row_with_it(tmp_path, late):
     assert chunk.valid[:, 1].tolist() == [k >= late for k in range(310)]
 
 
-def test_a_word_in_the_first_row_is_counted_as_in_all_others(tmp_path):
-    lines = (f"{k / 100},{'OVERLOAD' if k % 10 == 0 else k},{k}\n" for k in range(N))
-    (tmp_path / "t.csv").write_text("t,x,y\n" + "".join(lines))
-    made, _, _ = imported(tmp_path / "t.csv", "t=time:s,x=S.fx,y=S.fy")
-    assert (made.samples, made.corrupt) == (N - 5, 5)
+@pytest.mark.parametrize("head", ["t,x,y\n", ""])
+def test_a_word_in_the_first_rows_is_counted_as_in_all_others(tmp_path, head):
+    lines = (f"{k / 100},{'OVERLOAD' if k % 10 < 2 else k},{k}\n" for k in range(N))
+    (tmp_path / "t.csv").write_text(head + "".join(lines))
+    columns = "t=time:s,x=S.fx,y=S.fy" if head else "time:s,S.fx,S.fy"
+    made, _, _ = imported(tmp_path / "t.csv", columns)
+    assert (made.samples, made.corrupt) == (N - 10, 10)
 
 
 def test_a_time_of_seconds_and_the_rest(tmp_path):

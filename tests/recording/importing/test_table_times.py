@@ -59,10 +59,10 @@ def test_a_stamp_that_is_early_or_late_delays_none_after_it(tmp_path, off, every
     assert len(made.notes) == 1 and made.notes[0].startswith(f"{N // every} {DATED}")
 
 
-@pytest.mark.parametrize("wrong", [500.0, 0.0, 0.5])
+@pytest.mark.parametrize("wrong", [500.0, 0.0, 0.5, 60_000.0])
 def test_one_stamp_that_is_far_off_is_left_out(tmp_path, wrong):
-    times = [*EVEN[:20], wrong, *EVEN[21:]]
-    made, chunk = imported(tmp_path / "t.csv", [f"{t:.4f},{k}" for k, t in enumerate(times)])
+    lines = [f"{clock(t)},{k}" for k, t in enumerate([*EVEN[:20], wrong, *EVEN[21:]])]
+    made, chunk = imported(tmp_path / "t.csv", lines, "t=time:iso,Fx=S.fx:N")
     assert chunk.t_ns.tolist() == [10_000_000 * k for k in range(N)]
     assert len(made.notes) == 1 and DATED in made.notes[0]
 
