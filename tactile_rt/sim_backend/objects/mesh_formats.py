@@ -33,13 +33,12 @@ __all__ = [
 
 Array = NDArray[Any]
 Meshes = list[trimesh.Trimesh]
-PLY_TYPES: Final = {
+PLY_TYPES: Final = {  # the others are called as in NumPy
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "int64": "i8", "uint64": "u8", "float": "f4", "float16": "f2", "float32": "f4",
-    "float64": "f8", "double": "f8",
+    "float": "f4", "double": "f8",
 }  # fmt: skip
 MOST_NODES: Final = 10_000  # of a scene, with every time that one is used
+SAME: Final = 1e-9  # so far areas of the same triangles may be from each other, of them
 MAX_FACES = 2_000_000  # a minute
 
 
@@ -137,9 +136,8 @@ def read_obj(path: Path, content: bytes) -> Meshes:
     mesh = _mesh(vertices, np.where(relative, np.maximum(back, 0), corners) - 1, sizes, 1)
     with suppress(Exception):
         theirs = load_meshes(path, content, len(mesh.faces))
-        if not relative.any() and np.isclose(
-            sum(m.area for m in theirs), mesh.area, rtol=1e-9, atol=0
-        ):
+        covered = sum(float(m.area) for m in theirs)
+        if not relative.any() and abs(covered - mesh.area) <= SAME * covered:
             return theirs
     return [mesh]
 
@@ -176,24 +174,23 @@ def read_ply(path: Path, content: bytes) -> Meshes:
         if line[0] == "element":
             elements[line[1]] = int(line[2]), {}
         elif line[0] == "property":
-            kinds = [order + PLY_TYPES[kind] for kind in line[1:-1] if kind != "list"]
+            names = [PLY_TYPES.get(kind, kind) for kind in line[1:-1] if kind != "list"]
+            kinds = [np.dtype("f8" if text else name).newbyteorder(order).str for name in names]
             list(elements.values())[-1][1][line[-1]] = kinds
     at, found = 0, {}
     for name, (count, properties) in elements.items():
-        read = {key: ["<f8"] * len(kinds) for key, kinds in properties.items()}
-        found[name], at = _read_rows(name, data, at, count, read if text else properties)
+        found[name], at = _read_rows(name, data, at, count, properties)
     if at != len(data):
         raise ValueError(f"its header tells of {at} bytes, {len(data)} are there")
     points = elements.get("vertex", (0, {}))[1]
     if missing := [axis for axis in "xyz" if axis not in points]:
         raise ValueError(f"its vertices have no {missing[0]}")
-    vertices = np.column_stack([found["vertex"][k][1].astype(points[k][0]) for k in "xyz"])
+    vertices = np.column_stack([found["vertex"][k][1] for k in "xyz"])
     lists = [key for key, kinds in elements.get("face", (0, {}))[1].items() if len(kinds) > 1]
-    names = [key for key in ("vertex_index", "vertex_indices", *lists) if key in lists]
-    sizes, corners = found["face"][names[0]] if names else (np.zeros(0, int), np.zeros(0, int))
     if "tristrips" in elements:
         raise ValueError("it holds strips of triangles, `tristrips`; save it as faces")
-    return [_mesh(vertices, corners, sizes)]
+    called = [key for key in ("vertex_index", "vertex_indices", *lists) if key in lists]
+    return [_mesh(vertices, *found["face"][called[0]][::-1])] if called else []
 
 
 def _read_rows(
@@ -228,9 +225,7 @@ def _read_rows(
             sizes[key].append(np.full(len(rows), rows[key].shape[1]))
             values[key].append(rows[key].ravel())
         at, left = at + rows.nbytes, left - len(rows)
-    return {
-        k: (np.concatenate(sizes[k]), np.concatenate(values[k][1:] or values[k])) for k in kinds
-    }, at
+    return {k: (np.concatenate(sizes[k]), np.concatenate(values[k])) for k in kinds}, at
 
 
 def read_stl(path: Path, content: bytes) -> Meshes:
@@ -243,10 +238,10 @@ def read_stl(path: Path, content: bytes) -> Meshes:
         if not content.lower().rstrip().rpartition(b"\n")[2].lstrip().startswith(b"endsolid"):
             raise ValueError(f"cut short: no `endsolid` after {facets} facets")
         return load_meshes(path, content, facets)
-    if there < 0:
-        raise ValueError("cut short, or no STL: neither text nor a header")
     raise ValueError(
-        f"{'cut short: ' * (there < 50 * told)}its header tells {told} triangles of 50 bytes, "
+        "cut short, or no STL: neither text nor a header"
+        if there < 0
+        else f"{'cut short: ' * (there < 50 * told)}its header tells {told} triangles of 50 bytes, "
         f"{there} bytes are there"
     )
 

@@ -4,15 +4,16 @@ import numpy as np
 from manifold3d import triangulate
 from numpy.typing import NDArray
 
-__all__ = ["cut_polygons"]
+__all__ = ["cut_polygons", "flat"]
 
 MOST_CORNERS = 10_000
 SLIVER = 1e-9  # of all extents squared: a triangle of less area shows nowhere
 FOLD = 1e-6  # of a polygon's area: a triangle of a fan that lies so far outside folds back over it
 Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 
-def cut_polygons(vertices: NDArray[np.floating], corners: Ints, sizes: Ints) -> Ints:
+def cut_polygons(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Cut polygons into triangles that cover them, in their order.
 
     Args:
@@ -32,7 +33,7 @@ def cut_polygons(vertices: NDArray[np.floating], corners: Ints, sizes: Ints) -> 
     faces: Ints = np.stack([corners[start], corners[step + 1], corners[step + 2]], axis=1)
     if sizes.max(initial=3) == 3:
         return faces
-    places = np.ascontiguousarray(vertices.T, float)
+    places: Floats = np.ascontiguousarray(vertices.T, float)
     a, b, c = (places[:, corner] for corner in faces.T)
     areas = _cross(b - a, c - a)
     whole = np.add.reduceat(areas, first, axis=1)
@@ -42,7 +43,8 @@ def cut_polygons(vertices: NDArray[np.floating], corners: Ints, sizes: Ints) -> 
     for polygon in np.unique(owner[outside]):
         own = slice(first[polygon], first[polygon] + counts[polygon])
         ring = np.append(faces[own][0, :2], faces[own, 2])
-        ears = _cut_ears(places[:, ring].T, whole[:, polygon], ring)
+        seen = flat((places[:, ring] - places[:, ring[:1]]).T, whole[:, polygon] / area[own][0])
+        ears = ring[np.asarray(triangulate([seen]), np.int64)]
         a, b, c = (places[:, corner] for corner in ears.T)
         sizes_of = (np.linalg.norm(x, axis=0).sum() for x in (_cross(b - a, c - a), areas[:, own]))
         if np.subtract(*sizes_of) < -FOLD * area[own][0]:  # else it crosses itself
@@ -50,12 +52,13 @@ def cut_polygons(vertices: NDArray[np.floating], corners: Ints, sizes: Ints) -> 
     return faces
 
 
-def _cross(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+def _cross(a: Floats, b: Floats) -> Floats:
     return np.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
 
 
-def _cut_ears(places: NDArray[np.floating], normal: NDArray[np.floating], ring: Ints) -> Ints:
-    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    across /= np.linalg.norm(across)
-    plane = np.stack([across, np.cross(normal / np.linalg.norm(normal), across)], axis=1)
-    return ring[np.asarray(triangulate([(places - places[0]) @ plane]), np.int64)]
+def flat(points: Floats, normal: Floats) -> Floats:
+    """Project points (n, 3) along a normal: (n, 2)."""
+    one = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    one /= np.linalg.norm(one)
+    seen: Floats = points @ np.stack([one, np.cross(normal, one)], axis=1)
+    return seen
