@@ -152,7 +152,7 @@ def some(points: Floats) -> Floats:
 
 
 def _inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_]:
-    """(n,) whether a ray from points (n, 3) leaves a solid once more than it enters it."""
+    """Return (n,) whether a ray out of each point (n, 3) leaves a solid, net."""
     inside = np.zeros(len(points), bool)
     for solid in solids:
         low, high = np.split(np.array(solid.bounding_box()), 2)

@@ -228,14 +228,14 @@ def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
 
 def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
     """All triangles of the files of one object in one mesh, z up, in the unit of the files."""
-    mesh = _joined([_part(path, up) for path in paths])
+    mesh = _join([_part(path, up) for path in paths])
     largest = max(mesh.extents.max(), np.abs(mesh.bounds).max())
     if np.sort(mesh.extents)[1] <= POINT * largest:
         raise ConfigError(f"{paths[0]}: all its triangles lie on one line; export it again")
     return mesh
 
 
-def _joined(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def _join(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     # by hand: what colours and textures the bodies have is dropped
     joined = trimesh.util.append_faces([m.vertices for m in meshes], [m.faces for m in meshes])
     return trimesh.Trimesh(*joined, process=False)
@@ -259,7 +259,7 @@ def _part(path: Path, up: str) -> trimesh.Trimesh:
     check_number(path, number)
     if not number:
         raise ConfigError(f"{path}: holds no triangles; export a surface mesh, not points or lines")
-    mesh = _joined(meshes)
+    mesh = _join(meshes)
     mesh.remove_unreferenced_vertices()
     if not np.isfinite(mesh.vertices).all():
         bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())

@@ -58,7 +58,11 @@ class _Beside(trimesh.resolvers.FilePathResolver):
 
 
 def load_meshes(path: Path, content: bytes, told: int = -1) -> Meshes:
-    """Let the library read the bodies of a file, of so many triangles if they are told."""
+    """Let the library read the bodies of a file.
+
+    Args:
+        told: how many triangles they must have; negative: not known.
+    """
     kind = path.suffix.lower()[1:]
     # materials would be dropped, and pictures that are missing be complained of
     materials: dict[str, Any] = {} if kind in ("stl", "3mf") else {"skip_materials": True}

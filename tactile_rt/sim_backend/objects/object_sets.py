@@ -102,7 +102,7 @@ class ObjectSet:
     def check(
         self, progress: Callable[[str], None] = lambda name: None
     ) -> dict[str, TactileObject]:
-        """Load every object once: those that can be used, without their pieces; see `skipped`."""
+        """Load every object once: the usable ones, without pieces; see `skipped`."""
         found = {}
         for name in self.names:
             progress(name)

@@ -16,7 +16,7 @@ ACROSS = 8  # pictures in a row
 
 
 def write_contact_sheet(out: Path, things: Mapping[str, TactileObject | None]) -> None:
-    """Write a picture (.png) of objects by their names; of None, that it cannot be used."""
+    """Write a picture (.png) of named objects; None: one that cannot be used."""
     down = -(-len(things) // ACROSS)
     figure = Figure(figsize=(ACROSS * 1.6, down * 1.85), dpi=100)
     for place, (name, thing) in enumerate(things.items(), 1):
