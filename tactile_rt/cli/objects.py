@@ -44,12 +44,11 @@ def get(
         "folder": folder, "objects": len(listed), "kinds": kinds, "missing": missing,
         "licences": licences,
     }  # fmt: skip
-    if told_as_json(told, json):
-        raise typer.Exit(1 if missing else 0)
-    typer.echo(
-        f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in {folder}; "
-        f"licences: {', '.join(licences)}, see objects.csv"
-    )
+    if not told_as_json(told, json):
+        typer.echo(
+            f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in "
+            f"{folder}; licences: {', '.join(licences)}, see objects.csv"
+        )
     raise typer.Exit(1 if missing else 0)
 
 

@@ -137,7 +137,9 @@ def deviation(
     Args:
         solids: what the surface encloses. What of a piece lies inside them is not its outside.
     """
-    made = TriangleSurface(_broad(np.concatenate([piece.triangles for piece in pieces])))
+    triangles = np.concatenate([piece.triangles for piece in pieces])
+    edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2).max(axis=1)
+    made = TriangleSurface(triangles[2 * trimesh.triangles.area(triangles) > NEEDLE * edges])
     missed = made.distance(some(drawn.points))
     points = some(made.middles)
     away = drawn.about(points)
@@ -166,12 +168,6 @@ def shuffled(planes: Floats) -> Floats:
     """The planes in an order in which any few look all round (golden-ratio sequence)."""
     ordered: Floats = planes[np.argsort(np.arange(len(planes)) * 0.6180339887 % 1)]
     return ordered
-
-
-def _broad(triangles: Floats) -> Floats:
-    edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2).max(axis=1)
-    broad: Floats = triangles[2 * trimesh.triangles.area(triangles) > NEEDLE * edges]
-    return broad
 
 
 def _gap(triangles: Floats, points: Floats) -> Floats:

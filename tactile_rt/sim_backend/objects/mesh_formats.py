@@ -179,7 +179,7 @@ def read_ply(path: Path, content: bytes) -> Meshes:
             elements[line[1]] = int(line[2]), {}
         elif line[0] == "property":
             names = [PLY_TYPES.get(kind, kind) for kind in line[1:-1] if kind != "list"]
-            kinds = [np.dtype("f8" if text else name).newbyteorder(order).str for name in names]
+            kinds = [order + np.dtype("f8" if text else name).str[1:] for name in names]
             list(elements.values())[-1][1][line[-1]] = kinds
     at, found = 0, {}
     for name, (count, properties) in elements.items():
