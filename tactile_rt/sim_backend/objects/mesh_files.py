@@ -208,7 +208,7 @@ def check_mesh_file(path: Path) -> None:
 def mesh_content(path: Path) -> bytes:
     """Return the bytes of a mesh file and of the files of numbers that a .gltf names."""
     content = path.read_bytes()
-    if path.suffix.lower() == ".gltf":
+    if path.suffix.lower() == ".gltf" and content.count(b"{") <= MOST_OBJECTS:
         with suppress(*NO_GLTF, RecursionError):
             content += b"".join(_read_buffers(path, json.loads(content)))
     return content
