@@ -469,11 +469,13 @@ def change_mesh(b: Variant, rng: random.Random) -> Iterator[Variant]:
 def _read_mesh(path: Path) -> tuple[Any, Sequence[str]]:
     from tactile_rt.sim_backend.objects.meshes import load_mesh
 
-    pieces = load_mesh(path).pieces
+    thing = load_mesh(path)
+    pieces = thing.pieces
     bounds = np.array([p.bounds for p in pieces])
     extents = bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)
     volume = sum(float(abs(p.volume)) for p in pieces)
-    return np.append(extents / extents.max(), volume / extents.prod()), ()
+    notes = ["not closed, taken as plates"] if thing.made_by == "plates" else []
+    return np.append(extents / extents.max(), volume / extents.prod()), notes
 
 
 def make_sessions(folder: Path) -> Iterator[Variant]:

@@ -44,12 +44,11 @@ def get(
         "folder": folder, "objects": len(listed), "kinds": kinds, "missing": missing,
         "licences": licences,
     }  # fmt: skip
-    if told_as_json(told, json):
-        raise typer.Exit(1 if missing else 0)
-    typer.echo(
-        f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in {folder}; "
-        f"licences: {', '.join(licences)}, see objects.csv"
-    )
+    if not told_as_json(told, json):
+        typer.echo(
+            f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in "
+            f"{folder}; licences: {', '.join(licences)}, see objects.csv"
+        )
     raise typer.Exit(1 if missing else 0)
 
 
@@ -76,18 +75,16 @@ def check(
     opened = open_objects(folder)
     console = Console(stderr=True)
     with progress_bar(console, "loading", total=len(opened.names), counted=True) as update:
-        report = opened.check(lambda name: update(advance=1))
+        usable = opened.check(lambda name: update(advance=1))
     if plot:
         with needing("view"):
             from tactile_rt.sim_backend.views.contact_sheet import write_contact_sheet
-        usable = report.surface_error
-        write_contact_sheet(
-            plot, {n: opened.load(n) if n in usable else None for n in opened.names}
-        )
+        things = {n: opened.load(n) if n in usable else None for n in opened.names}
+        write_contact_sheet(plot, things)
     found = []
     for kind in dict.fromkeys(opened.categories.values()):
         names = [name for name in opened.names if opened.categories[name] == kind]
-        errors = [report.surface_error[n] for n in names if n in report.surface_error]
+        errors = [usable[n].surface_error for n in names if n in usable]
         worst = SIZE_MM * max(errors) if errors else None
         found.append(
             {"kind": kind, "objects": len(names), "usable": len(errors), "worst_mm": worst}
@@ -96,6 +93,8 @@ def check(
         "kind": "kind", "objects": "objects", "usable": "usable", "worst_mm": "worst, mm of 40",
     }  # fmt: skip
     show_table(found, headings, json)
-    for why in report.skipped.values():
+    if plates := [thing for thing in usable.values() if thing.made_by == "plates"]:
+        console.print(f"{len(plates)} of {len(opened.names)} are not closed, taken as plates")
+    for why in opened.skipped.values():
         console.print(escape(why), soft_wrap=True, highlight=False)
-    raise typer.Exit(1 if report.skipped else 0)
+    raise typer.Exit(1 if opened.skipped else 0)

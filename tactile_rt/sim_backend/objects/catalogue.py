@@ -6,6 +6,7 @@ may add categories (`core.packages`): of one plan, and known by their names only
 """
 
 import difflib
+import logging
 import re
 import zlib
 from collections.abc import Callable
@@ -43,6 +44,7 @@ __all__ = [
     "promised_object",
 ]
 
+log = logging.getLogger("tactile_rt.sim_backend.objects")
 _Builder = Callable[[np.random.Generator], list[trimesh.Trimesh]]
 
 _KNOWN: dict[str, _Builder] = {
@@ -129,6 +131,8 @@ def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], 
     """
     if Path(target).suffix or "/" in target or "\\" in target:
         mesh = load_mesh(Path(target), detail)
+        if mesh.made_by == "plates":
+            log.warning("%s: not closed, taken as plates", target)
         return lambda: mesh
     match = re.fullmatch(r"(.+)-(\d+)", target)
     category, index = (match[1], int(match[2])) if match else (target, 0)

@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from tactile_rt.sim_backend.objects.deviation import FACES, TILE, shuffled, surface_of, tiles
+from tactile_rt.sim_backend.objects.polygons import flat
 
-__all__ = ["Joining", "SheetPieces", "SolidPieces"]
+__all__ = ["SheetPieces", "SolidPieces"]
 
 P = TypeVar("P")
 Floats = NDArray[np.float64]
@@ -153,7 +154,7 @@ class SheetPieces:
             normal = patch.area / size
             index = np.array(sorted(patch.corners))
             points = mesh.vertices[index]
-            hull = _outline(points, normal)
+            hull = _hull(flat(points, normal))
             if hull is None:
                 continue
             index, points = index[hull.vertices], points[hull.vertices]
@@ -182,29 +183,13 @@ class SheetPieces:
         points = vertices[list(patch.corners)]
         if np.ptp(points @ normal) > 2 * self._tolerance:
             return None
-        hull = _outline(points, normal)
+        hull = _hull(flat(points, normal))
         if hull is None:
             return None
         begin, end = vertices[np.array(list(patch.outline))].transpose(1, 0, 2)
-        along = _flat((begin + ALONG * (end - begin)).reshape(-1, 3), normal)
+        along = flat((begin + ALONG * (end - begin)).reshape(-1, 3), normal)
         depth = -(along @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=1)
         return patch if depth.max() <= self._tolerance else None
-
-
-def _flat(points: Floats, normal: Floats) -> Floats:
-    """(n, 2) points seen along a normal."""
-    one = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    one /= np.linalg.norm(one)
-    seen: Floats = points @ np.stack([one, np.cross(normal, one)], axis=1)
-    return seen
-
-
-def _outline(points: Floats, normal: Floats) -> ConvexHull | None:
-    """The convex outline of points seen along a normal; None of those on a line."""
-    try:
-        return ConvexHull(_flat(points, normal))
-    except QhullError:
-        return None
 
 
 class SolidPieces:

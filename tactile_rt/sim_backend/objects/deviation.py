@@ -6,7 +6,6 @@ between the points, which are TILE apart, or farther on a surface of more than `
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import manifold3d
 import numpy as np
@@ -18,7 +17,6 @@ from scipy.spatial import cKDTree
 __all__ = [
     "FACES",
     "TILE",
-    "Deviation",
     "TriangleSurface",
     "bodies_of",
     "deviation",
@@ -38,7 +36,6 @@ NEEDLE = 1e-6  # triangles lower than this, in largest extents, have no normal t
 INSIDE = 1e-5  # what is nearer to the surface than this counts wherever it lies
 RAY = np.array([2.1, 0.13, 0.37])  # out of the unit box, along no axis
 MOST_POINTS = 20_000  # looked at, of either surface
-TIE = 1e-9  # tiles as near as each other
 
 
 def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
@@ -47,8 +44,9 @@ def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
     Turning one that is wound inward fills it if it is a void, which nothing can touch, and puts it
     right if it is a body.
     """
-    arrays = manifold3d.Mesh64(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64))
-    return [b if b.volume() > 0 else _turn_outward(b) for b in Manifold(arrays).decompose()]
+    bodies = _solid(mesh.vertices, mesh.faces).decompose()
+    turned = ((b, surface_of(b)) for b in bodies)
+    return [b if b.volume() > 0 else _solid(s.vertices, s.faces[:, ::-1]) for b, s in turned]
 
 
 def outer_solid(bodies: Sequence[Manifold]) -> Manifold:
@@ -66,28 +64,8 @@ def surface_of(solid: Manifold) -> trimesh.Trimesh:
     )
 
 
-def _turn_outward(body: Manifold) -> Manifold:
-    arrays = body.to_mesh64()
-    corners, faces = arrays.vert_properties[:, :3], arrays.tri_verts[:, ::-1]
-    return Manifold(manifold3d.Mesh64(corners.copy(), faces.copy()))
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """Distances between a mesh and the outside of pieces, in fractions of the largest extent.
-
-    Attributes:
-        missed: The farthest that the mesh is from the pieces' surfaces.
-        beyond: The farthest that the pieces' surfaces are from the mesh, outside what it encloses.
-    """
-
-    missed: float
-    beyond: float
-
-    @property
-    def largest(self) -> float:
-        """The Hausdorff distance."""
-        return max(self.beyond, self.missed)
+def _solid(corners: Floats, faces: NDArray[np.int64]) -> Manifold:
+    return Manifold(manifold3d.Mesh64(np.array(corners, np.float64), np.array(faces, np.uint64)))
 
 
 def tiles(triangles: Floats, size: float = TILE) -> Floats:
@@ -111,7 +89,6 @@ class TriangleSurface:
     Attributes:
         tiles: The (n, 3, 3) corners of the tiles that the surface is cut into.
         middles: The (n, 3) centroids of the tiles.
-        normals: The (n, 3) unit normals of the tiles; of those without an area, zero.
         points: The (m, 3) middles, and the corners that the surface came with.
         reach: The farthest that a point of a tile is from its tile's middle.
     """
@@ -122,8 +99,6 @@ class TriangleSurface:
         corners = np.unique(triangles.reshape(-1, 3), axis=0)
         self.points = np.concatenate([self.middles, corners])
         self.reach = float(np.linalg.norm(self.tiles - self.middles[:, None], axis=2).max())
-        across = np.cross(*np.diff(self.tiles, axis=1).transpose(1, 0, 2))
-        self.normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
         self._tree = cKDTree(self.middles)
 
     def about(self, points: Floats) -> Floats:
@@ -131,23 +106,6 @@ class TriangleSurface:
         _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
         best: Floats = np.min([_gap(self.tiles[tile], points) for tile in near.T], axis=0)
         return best
-
-    def behind(self, points: Floats) -> NDArray[np.bool_]:
-        """(n,) whether points (n, 3) lie on the inner side of the nearest tile.
-
-        Of several tiles that meet in the nearest point, the one that is seen most from above tells.
-        """
-        _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
-        least, height = np.full(len(points), np.inf), np.zeros(len(points))
-        for tile in near.T:
-            way = points - trimesh.triangles.closest_point(self.tiles[tile], points)
-            away = np.linalg.norm(way, axis=1)
-            above = np.einsum("ij,ij->i", way, self.normals[tile])
-            better = (away < least - TIE) | ((away < least + TIE) & (abs(above) > abs(height)))
-            height[better] = above[better]
-            least = np.minimum(least, away)
-        behind: NDArray[np.bool_] = height < 0
-        return behind
 
     def distance(self, points: Floats) -> Floats:
         """(n,) distance of points (n, 3) to the surface.
@@ -173,25 +131,21 @@ class TriangleSurface:
 
 def deviation(
     drawn: TriangleSurface, pieces: Sequence[trimesh.Trimesh], solids: Sequence[Manifold] = ()
-) -> Deviation:
-    """Distance between a surface and convex pieces.
+) -> float:
+    """Measure the Hausdorff distance between a surface and the outside of convex pieces.
 
     Args:
         solids: what the surface encloses. What of a piece lies inside them is not its outside.
     """
-    made = TriangleSurface(_broad(np.concatenate([piece.triangles for piece in pieces])))
+    triangles = np.concatenate([piece.triangles for piece in pieces])
+    edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2).max(axis=1)
+    made = TriangleSurface(triangles[2 * trimesh.triangles.area(triangles) > NEEDLE * edges])
     missed = made.distance(some(drawn.points))
     points = some(made.middles)
     away = drawn.about(points)
-    far = np.flatnonzero(away > INSIDE)
-    far = far[~_inside(points[far], solids)]
-    away[far] = drawn.distance(points[far]) if len(far) else 0.0
-    beyond = float(away[away <= INSIDE].max(initial=0.0))
-    for k in far[np.argsort(-away[far])].tolist():  # the nearest tile may have told the wrong side
-        if not _enclosed(points[k], solids):
-            beyond = max(beyond, float(away[k]))
-            break
-    return Deviation(float(missed.max()), beyond)
+    far = points[away > INSIDE]
+    beyond = drawn.distance(far[~_inside(far, solids)])
+    return float(np.concatenate([missed, away[away <= INSIDE], beyond]).max())
 
 
 def some(points: Floats) -> Floats:
@@ -199,20 +153,14 @@ def some(points: Floats) -> Floats:
     return points[:: 1 + len(points) // MOST_POINTS]
 
 
-def _enclosed(point: Floats, solids: Sequence[Manifold]) -> bool:
-    """Whether a ray from a point leaves one of the solids once more than it enters it."""
-    begin, end = point.tolist(), (point + RAY).tolist()
-    return any(len(solid.ray_cast(begin, end)) % 2 for solid in solids)
-
-
 def _inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 3) lie in a solid, as its nearest tile has it."""
+    """Return (n,) whether a ray out of each point (n, 3) leaves a solid, net."""
     inside = np.zeros(len(points), bool)
     for solid in solids:
         low, high = np.split(np.array(solid.bounding_box()), 2)
-        near = np.flatnonzero(~inside & ((points > low) & (points < high)).all(axis=1))
-        if len(near):
-            inside[near] = TriangleSurface(surface_of(solid).triangles).behind(points[near])
+        for k in np.flatnonzero(~inside & ((points > low) & (points < high)).all(axis=1)):
+            hits = solid.ray_cast(points[k].tolist(), (points[k] + RAY).tolist())
+            inside[k] = len(hits) % 2
     return inside
 
 
@@ -220,12 +168,6 @@ def shuffled(planes: Floats) -> Floats:
     """The planes in an order in which any few look all round (golden-ratio sequence)."""
     ordered: Floats = planes[np.argsort(np.arange(len(planes)) * 0.6180339887 % 1)]
     return ordered
-
-
-def _broad(triangles: Floats) -> Floats:
-    edges = np.linalg.norm(triangles[:, [1, 2, 0]] - triangles, axis=2).max(axis=1)
-    broad: Floats = triangles[2 * trimesh.triangles.area(triangles) > NEEDLE * edges]
-    return broad
 
 
 def _gap(triangles: Floats, points: Floats) -> Floats:

@@ -44,8 +44,8 @@ class MeshDetail:
 
     def differing(self) -> dict[str, float | int | bool | str]:
         """What of it is not as it is by default."""
-        mine = {name: getattr(self, name) for name in asdict(STANDARD)}
-        return {name: value for name, value in mine.items() if value != getattr(STANDARD, name)}
+        usual = asdict(STANDARD)
+        return {k: getattr(self, k) for k in usual if getattr(self, k) != usual[k]}
 
 
 STANDARD = MeshDetail()

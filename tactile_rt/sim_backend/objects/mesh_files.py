@@ -1,9 +1,9 @@
 """Mesh files: read into triangles, or refused with one line that says why.
 
 A file may come from elsewhere. Formats of plain numbers are as long as what they hold, and their
-parsers notice if not. The others can say in a few bytes what takes gigabytes: archives that unpack
-to them, scenes that hold a thing that holds a thing ten times, meshes that Draco compressed. Of
-these the sizes are looked up before a library builds them.
+readers notice if not (see `mesh_formats`). The others can say in a few bytes what takes gigabytes:
+archives that unpack to them, scenes that hold a thing that holds a thing ten times, meshes that
+Draco compressed. Of these the sizes are looked up before a library builds them.
 """
 
 import base64
@@ -12,10 +12,8 @@ import logging
 import re
 import struct
 import zipfile
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from io import BytesIO
 from pathlib import Path
@@ -27,14 +25,14 @@ import trimesh
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer
-from tactile_rt.sim_backend.objects.mesh_formats import READERS, Found
+from tactile_rt.sim_backend.objects import mesh_formats
+from tactile_rt.sim_backend.objects.mesh_formats import MOST_NODES, check_number, load_meshes
 
 __all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
 
 MOST_UNPACKED: Final = 256 << 20  # bytes of an archive ...
 MOST_RATIO: Final = 100  # ... and times its own size; XML of numbers has 10
 SMALL: Final = 16 << 20  # bytes that an archive may unpack to at any ratio
-MOST_NODES: Final = 10_000  # of a scene, with every time that one is used
 MOST_OBJECTS: Final = 100_000  # of glTF's JSON
 MOST_POINTS: Final = 6_000_000  # of a mesh that Draco compressed
 
@@ -44,161 +42,114 @@ HARMLESS: Final = re.compile(
 )
 GLB_JSON: Final = struct.Struct("<4sIIII")  # head of the file and of its first chunk
 DRACO: Final = b"DRACO"
-MAX_FACES = 2_000_000  # a minute
+NO_GLTF: Final = (ValueError, KeyError, TypeError, AttributeError, IndexError)
 POINT = 1e-9  # of all extents: smaller is none
-Y_UP = (".glb", ".gltf")  # by their standard; COLLADA files say it, the others are z-up
 TO_Z_UP: Final = {  # from the axis that points up
     "x": np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
 }
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what matters of a file is told here
 
 
-def _check_archive(name: str, content: bytes) -> int:
-    try:
-        with zipfile.ZipFile(BytesIO(content)) as archive:
-            members = archive.infolist()
-            size = sum(member.file_size for member in members)
-            if size > min(MOST_UNPACKED, max(SMALL, MOST_RATIO * len(content))):
-                raise ConfigError(
-                    f"{name}: {len(content)} bytes that unpack to {size >> 20} MiB are no mesh; "
-                    "export it again"
-                )
-            named = {m.filename: archive.read(m) for m in members if m.filename.endswith(".model")}
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError,
-            ValueError, OSError):  # fmt: skip
-        return -1  # the mesh library says what is wrong with it
-    models = list(named.values())
-    _check_nodes(name, _xml_nodes(name, models, "object", "component", "objectid"))
-    if any(b"beamlattice>" in model for model in models):
-        raise ConfigError(f"{name}: it holds a beam lattice; export it as a mesh of triangles")
-    parts = [m for n, m in named.items() if "3d/3dmodel.model" not in n.lower()]
-    if any(part.count(b"<mesh>") > 1 for part in parts):  # the library takes all for each
-        raise ConfigError(f"{name}: several parts share a file within it; export it as one mesh")
-    return -1
-
-
-def _xml_nodes(
-    name: str, texts: Sequence[bytes], node: str, use: str, reference: str
-) -> dict[str, list[str]]:
-    """Return the nodes that the elements `use` within each node refer to."""
+def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     from lxml import etree
 
+    with zipfile.ZipFile(BytesIO(content)) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+        if size > min(MOST_UNPACKED, max(SMALL, MOST_RATIO * len(content))):
+            raise ValueError(f"{len(content)} bytes that unpack to {size >> 20} MiB are no mesh")
+        models = {n: archive.read(n) for n in archive.namelist() if n.endswith(".model")}
     used: dict[str, list[str]] = {}
-    number = 0
-    for text in texts:
-        if use.encode() not in text and use.encode("utf-16-le") not in text:
-            continue
-        inside: list[str] = []
-        try:
-            for event, element in etree.iterparse(BytesIO(text), events=("start", "end")):
-                kind = etree.QName(element).localname
-                if kind == node and event == "start":
-                    number += 1
-                    inside.append(element.get("id") or f" {number}")
-                    used.setdefault(inside[-1], [])
-                    if len(inside) > 1:  # a node within a node is used by it
-                        used[inside[-2]].append(inside[-1])
-                elif kind == node:
-                    inside.pop()
-                elif kind == use and event == "start" and inside:
-                    used[inside[-1]].append(str(element.get(reference)).removeprefix("#"))
-                if event == "end":
-                    element.clear()
-                if number > MOST_NODES:
-                    raise ConfigError(f"{name}: a scene of more than {MOST_NODES} nodes; join them")
-        except (etree.XMLSyntaxError, ValueError):
-            pass  # the mesh library says what is wrong with it
-    return used
+    for name, text in models.items():
+        if b"beamlattice>" in text:
+            raise ValueError("it holds a beam lattice; export it as a mesh of triangles")
+        # of a file within, the library takes all parts for each
+        if "3d/3dmodel.model" not in name.lower() and text.count(b"<mesh>") > 1:
+            raise ValueError("several parts share a file within it; export it as one mesh")
+        for _, thing in etree.iterparse(BytesIO(text), tag="{*}object"):
+            parts = thing.iter("{*}component")
+            used[str(thing.get("id"))] = [str(part.get("objectid")) for part in parts]
+            thing.clear()
+    _check_nodes(used)
+    return load_meshes(path, content)
 
 
-def _check_nodes(name: str, used: Mapping[str, Sequence[str]]) -> None:
+def _check_nodes(used: Mapping[str, Sequence[str]]) -> None:
     """Refuse scenes that use nodes more often than can be built, or in a circle."""
     times: dict[str, int] = {}  # nodes that a node is, with all that it uses
     try:
         for node in TopologicalSorter(used).static_order():
             times[node] = 1 + sum(times[below] for below in used.get(node, ()))
-            if times[node] > MOST_NODES:
-                raise ConfigError(
-                    f"{name}: a scene of more than {MOST_NODES} nodes, as often as they are "
-                    "used; join them"
-                )
+            if max(times[node], len(used)) > MOST_NODES:
+                raise ValueError(f"a scene of more than {MOST_NODES} nodes; join them")
     except CycleError:
-        raise ConfigError(f"{name}: a node of its scene holds itself; export it again") from None
+        raise ValueError("a node of its scene holds itself") from None
 
 
-def _check_collada(name: str, content: bytes) -> int:
-    _check_nodes(name, _xml_nodes(name, [content], "node", "instance_node", "url"))
-    return -1
-
-
-def _check_gltf(name: str, content: bytes) -> int:
-    """Refuse what is not supported; return how many triangles the scene tells of."""
+def _read_gltf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     text, binary = content, b""
     if content[:4] == b"glTF" and len(content) >= GLB_JSON.size:
         _, _, whole, length, _ = GLB_JSON.unpack_from(content)
         if whole > len(content):
-            raise ConfigError(f"{name}: cut short, {len(content)} of {whole} bytes; copy it again")
+            raise ValueError(f"cut short, {len(content)} of {whole} bytes; copy it again")
         text = content[GLB_JSON.size : GLB_JSON.size + length]
         binary = content[GLB_JSON.size + length + 8 :]
     if text.count(b"{") > MOST_OBJECTS:
-        raise ConfigError(f"{name}: more than {MOST_OBJECTS} objects in its JSON; join them")
-    try:
-        scene = json.loads(text)
-        nodes = {
-            str(i): [str(x) for x in n.get("children", ())]
-            for i, n in enumerate(scene.get("nodes", ()))
-        }
-        primitives = [p for mesh in scene.get("meshes", ()) for p in mesh.get("primitives", ())]
-        draco = [d for p in primitives if (d := _draco_of(scene, p, binary))]
-        unsupported = _find_unsupported(scene, primitives, Path(name))
-    except RecursionError:
-        raise ConfigError(f"{name}: its JSON is nested too deep; export it again") from None
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError):
-        return -1  # the mesh library says what is wrong with it
-    if unsupported:
-        raise ConfigError(f"{name}: {unsupported}")
-    if len(nodes) > MOST_NODES:
-        raise ConfigError(f"{name}: a scene of more than {MOST_NODES} nodes; join them")
-    _check_nodes(name, nodes)
-    for data in draco:
-        if max(_draco_sizes(data)) > MOST_POINTS:
-            raise ConfigError(
-                f"{name}: Draco's data tells of more than {MOST_POINTS} points; export it again"
-            )
-    with suppress(ValueError, KeyError, TypeError, AttributeError, IndexError):
-        return _count_drawn(scene)
-    return -1
+        raise ValueError(f"more than {MOST_OBJECTS} objects in its JSON; join them")
+    scene = json.loads(text)
+    nodes = enumerate(scene.get("nodes", ()))
+    _check_nodes({str(i): [str(x) for x in node.get("children", ())] for i, node in nodes})
+    _check_supported(scene)
+    for buffer in (binary, *_read_buffers(path, scene)):
+        for match in re.finditer(DRACO, buffer):
+            if max(_draco_sizes(buffer[match.start() : match.start() + 64])) > MOST_POINTS:
+                raise ValueError(f"Draco's data tells of more than {MOST_POINTS} points")
+    told = -1
+    with suppress(*NO_GLTF):
+        told = _count_drawn(scene)
+    meshes = load_meshes(path, content, told)
+    for mesh in meshes:
+        if DRACO in content and len(mesh.vertices) and not np.ptp(mesh.vertices, axis=0).any():
+            raise ValueError("what Draco compressed cannot be unpacked")
+        mesh.metadata["up"] = "y"  # by its standard
+    return meshes
 
 
-def _find_unsupported(scene: Any, primitives: Sequence[Any], path: Path) -> str:
-    """Say what of a glTF the mesh library would leave out or misread; empty: nothing."""
+def _read_buffers(path: Path, scene: Any) -> Iterator[bytes]:
+    """Read the buffers of a glTF that are not in its binary part."""
+    for buffer in scene.get("buffers", ()):
+        uri = buffer.get("uri", "")
+        if uri.startswith("data:"):
+            yield base64.b64decode(uri.partition(",")[2])
+        elif uri:
+            beside = path.parent / unquote(uri)
+            if not beside.is_file():
+                raise ValueError(f"{uri}, which it names, is not beside it; copy both")
+            check_no_pointer(beside)
+            if beside.stat().st_size < buffer["byteLength"]:
+                raise ValueError(f"{uri}, which it names, is cut short; copy it again")
+            yield beside.read_bytes()
+
+
+def _check_supported(scene: Any) -> None:
+    """Refuse what of a glTF the mesh library would leave out or misread."""
     for required in scene.get("extensionsRequired", ()):
         if not HARMLESS.match(required):
             how = "`gltfpack -noq -i IN -o OUT` writes it without" if "meshopt" in required else ""
-            return f"it needs {required}, which is not supported; {how or 'export it without'}"
+            raise ValueError(
+                f"it needs {required}, which is not supported" + f"; {how}" * bool(how)
+            )
     if any("EXT_mesh_gpu_instancing" in n.get("extensions", ()) for n in scene.get("nodes", ())):
-        return "its nodes have copies by EXT_mesh_gpu_instancing; export it without"
-    for buffer in scene.get("buffers", ()):
-        beside = path.parent / unquote(uri := buffer.get("uri", ""))
-        if uri and not uri.startswith("data:"):
-            if not beside.is_file():
-                return f"{uri}, which it names, is not beside it; copy both, or export a .glb"
-            check_no_pointer(beside)
-            if beside.stat().st_size < buffer["byteLength"]:
-                return f"{uri}, which it names, is cut short; copy it again"
-    for primitive in (p for p in primitives if p.get("mode", 4) > 3):
+        raise ValueError("its nodes have copies by EXT_mesh_gpu_instancing")
+    for primitive in (p for mesh in scene.get("meshes", ()) for p in mesh["primitives"]):
         if primitive.get("mode", 4) > 5:
-            return "it holds fans of triangles (mode 6); export plain triangles"
-        used = [
-            primitive["attributes"]["POSITION"],
-            *([primitive.get("indices")] * ("indices" in primitive)),
-        ]
-        places, *_ = read = [scene["accessors"][i] for i in used]
+            raise ValueError("it holds fans of triangles (mode 6); export plain triangles")
+        used = (primitive["attributes"].get("POSITION"), primitive.get("indices"))
+        read = [scene["accessors"][i] for i in used if i is not None]
         if any("sparse" in accessor for accessor in read):
-            return "its vertices are a sparse accessor; export it without"
-        if places.get("normalized"):
-            return "its vertices are normalized integers; `gltf-transform dequantize IN OUT`"
-    return ""
+            raise ValueError("its vertices are a sparse accessor")
+        if any(accessor.get("normalized") for accessor in read):
+            raise ValueError("its vertices are normalized; `gltf-transform dequantize IN OUT`")
 
 
 def _count_drawn(scene: Any) -> int:
@@ -213,26 +164,9 @@ def _count_drawn(scene: Any) -> int:
     return drawn
 
 
-def _draco_of(scene: Any, primitive: Any, binary: bytes) -> bytes:
-    """The beginning of a primitive's data as Draco compressed it; empty if it did not."""
-    found = primitive.get("extensions", {}).get("KHR_draco_mesh_compression")
-    if found is None:
-        return b""
-    view = scene["bufferViews"][found["bufferView"]]
-    uri = scene["buffers"][view["buffer"]].get("uri", "")
-    if uri.startswith("data:"):
-        binary = base64.b64decode(uri.partition(",")[2])
-    elif uri:
-        return b""
-    at = view.get("byteOffset", 0)
-    return binary[at : at + 64]
-
-
 def _draco_sizes(data: bytes) -> tuple[int, ...]:
     """Read the two numbers of faces, points or vertices that Draco's data begins with."""
-    if data[:5] != DRACO or len(data) < 13:
-        return (0,)
-    found, at = [0, 0], 11 if data[8] == 0 else 12
+    found, at = [0, 0], 11 if data[8:9] == b"\0" else 12
     for i in range(2):
         for shift in range(0, 70, 7):
             byte = data[at] if at < len(data) else 0
@@ -243,19 +177,17 @@ def _draco_sizes(data: bytes) -> tuple[int, ...]:
     return tuple(found)
 
 
-# Every format that can be read, with the check of what it says of itself.
-FORMATS: Final[dict[str, Callable[[str, bytes], int] | None]] = {
-    ".obj": None,
-    ".stl": None,
-    ".ply": None,
-    ".glb": _check_gltf,
-    ".gltf": _check_gltf,
-    ".off": None,
-    ".dae": _check_collada,
-    ".3mf": _check_archive,
+READERS: Final[dict[str, Callable[[Path, bytes], list[trimesh.Trimesh]]]] = {
+    ".obj": mesh_formats.read_obj,
+    ".stl": mesh_formats.read_stl,
+    ".ply": mesh_formats.read_ply,
+    ".glb": _read_gltf,
+    ".gltf": _read_gltf,
+    ".off": mesh_formats.read_off,
+    ".dae": mesh_formats.read_dae,
+    ".3mf": _read_3mf,
 }
-MESH_SUFFIXES = tuple(FORMATS)
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what matters of a file is told here
+MESH_SUFFIXES = tuple(READERS)
 
 
 def check_mesh_file(path: Path) -> None:
@@ -270,28 +202,16 @@ def check_mesh_file(path: Path) -> None:
         raise ConfigError(f"{path}: no such file")
     if path.stat().st_size == 0:
         raise ConfigError(f"{path}: the file is empty; export it again")
+    check_no_pointer(path)
 
 
 def mesh_content(path: Path) -> bytes:
-    """Return the bytes of a mesh file and of the files of numbers that a .gltf names.
-
-    Raises:
-        ConfigError: it unpacks to more than it can be expected to hold.
-    """
-    content, _ = _read_checked(path)
-    if path.suffix.lower() == ".gltf":
-        with suppress(ValueError, KeyError, TypeError, AttributeError, OSError):
-            for buffer in json.loads(content)["buffers"]:
-                if not buffer["uri"].startswith("data:"):
-                    content += (path.parent / unquote(buffer["uri"])).read_bytes()
+    """Return the bytes of a mesh file and of the files of numbers that a .gltf names."""
+    content = path.read_bytes()
+    if path.suffix.lower() == ".gltf" and content.count(b"{") <= MOST_OBJECTS:
+        with suppress(*NO_GLTF, RecursionError):
+            content += b"".join(_read_buffers(path, json.loads(content)))
     return content
-
-
-def _read_checked(path: Path) -> tuple[bytes, int]:
-    """Read a file and the number of triangles it tells; refuse archive bombs."""
-    check_no_pointer(path)
-    content, check = path.read_bytes(), FORMATS[path.suffix.lower()]
-    return content, check(str(path), content) if check else -1
 
 
 def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
@@ -308,59 +228,24 @@ def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
 
 def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
     """All triangles of the files of one object in one mesh, z up, in the unit of the files."""
-    parts = [_part(path, up) for path in paths]
-    joined = trimesh.util.append_faces([m.vertices for m in parts], [m.faces for m in parts])
-    mesh = trimesh.Trimesh(*joined, process=False)
+    mesh = _join([_part(path, up) for path in paths])
     largest = max(mesh.extents.max(), np.abs(mesh.bounds).max())
     if np.sort(mesh.extents)[1] <= POINT * largest:
         raise ConfigError(f"{paths[0]}: all its triangles lie on one line; export it again")
     return mesh
 
 
+def _join(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    # by hand: what colours and textures the bodies have is dropped
+    joined = trimesh.util.append_faces([m.vertices for m in meshes], [m.faces for m in meshes])
+    return trimesh.Trimesh(*joined, process=False)
+
+
 def _part(path: Path, up: str) -> trimesh.Trimesh:
     check_mesh_file(path)
-    found = _read_meshes(path)
-    # joined by hand: what colours and textures the bodies have is dropped
-    joined = trimesh.util.append_faces(
-        [m.vertices for m in found.meshes], [m.faces for m in found.meshes]
-    )
-    mesh = trimesh.Trimesh(*joined, process=False)
-    mesh.remove_unreferenced_vertices()
-    if not np.isfinite(mesh.vertices).all():
-        bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
-        raise ConfigError(f"{path}: {bad} vertices are not finite numbers; export it again")
-    if (up or found.up) in TO_Z_UP:
-        mesh.vertices = mesh.vertices @ TO_Z_UP[up or found.up].T
-    return mesh
-
-
-def _read_meshes(path: Path) -> Found:
-    """Read the bodies of a file in their places; refuse it if some are missing."""
-    content, told = _read_checked(path)
     suffix = path.suffix.lower()
-    axis = "y" if suffix in Y_UP else "z"
     try:
-        found = READERS[suffix](content) if suffix in READERS else Found(told=told, up=axis)
-        if found.same or not found.meshes:
-            try:
-                found = _choose(found, _load_meshes(path, content))
-            except ConfigError:
-                raise
-            except Exception:
-                if not found.again and not found.meshes:
-                    raise
-                found = found.again(content) if found.again else found
-        number = sum(len(mesh.faces) for mesh in found.meshes)
-        _check_number(path, number)
-        for vertices, faces in (
-            (np.asarray(m.vertices), m.faces) for m in found.meshes if len(m.faces)
-        ):
-            if vertices.shape[1:] != (3,):
-                raise ValueError("a vertex has fewer than 3 coordinates; is it cut short?")
-            if outside := [i for i in (faces.min(), faces.max()) if not 0 <= i < len(vertices)]:
-                raise ValueError(f"a face names vertex {outside[0]}, of {len(vertices)}")
-            if suffix in Y_UP and not np.ptp(vertices, axis=0).any() and DRACO in content:
-                raise ValueError("what Draco compressed cannot be unpacked")
+        meshes = READERS[suffix](path, path.read_bytes())
     except ConfigError:
         raise
     except Exception as error:  # the parsers raise whatever their format trips over
@@ -370,43 +255,16 @@ def _read_meshes(path: Path) -> Found:
         raise ConfigError(
             f"{path}: cannot be read as {suffix} ({reason[:120]}); export it again"
         ) from error
+    number = sum(len(mesh.faces) for mesh in meshes)
+    check_number(path, number)
     if not number:
         raise ConfigError(f"{path}: holds no triangles; export a surface mesh, not points or lines")
-    return found
-
-
-def _choose(found: Found, theirs: list[trimesh.Trimesh]) -> Found:
-    """Take what the library read, if it is as many triangles as the file tells."""
-    told = sum(len(mesh.faces) for mesh in found.meshes) if found.meshes else found.told
-    number = sum(len(mesh.faces) for mesh in theirs)
-    if told not in (-1, number):
-        raise ValueError(f"it tells {told} triangles, {number} of them can be read")
-    return replace(found, meshes=theirs)
-
-
-def _check_number(path: Path, faces: int) -> None:
-    if faces > MAX_FACES:
-        raise ConfigError(
-            f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
-        )
-
-
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Files that a .gltf names, as URLs write them."""
-
-    def get(self, name: str) -> Any:
-        return super().get(unquote(name))
-
-
-def _load_meshes(path: Path, content: bytes) -> list[trimesh.Trimesh]:
-    """Let the library read the bodies of a file."""
-    kind = path.suffix.lower()[1:]
-    # materials would be dropped, and pictures that are missing be complained of
-    materials: dict[str, Any] = {} if kind in ("stl", "3mf") else {"skip_materials": True}
-    scene = trimesh.load_scene(
-        BytesIO(content), file_type=kind, process=False, resolver=_Beside(str(path)), **materials
-    )
-    names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
-    # told before a mesh that is used a thousand times is copied
-    _check_number(path, sum(len(getattr(scene.geometry[name], "faces", ())) for name in names))
-    return [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]
+    mesh = _join(meshes)
+    mesh.remove_unreferenced_vertices()
+    if not np.isfinite(mesh.vertices).all():
+        bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+        raise ConfigError(f"{path}: {bad} vertices are not finite numbers; export it again")
+    axis = up or meshes[0].metadata.get("up", "z")
+    if axis in TO_Z_UP:
+        mesh.vertices = mesh.vertices @ TO_Z_UP[axis].T
+    return mesh

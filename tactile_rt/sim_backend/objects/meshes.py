@@ -21,9 +21,8 @@ import contextlib
 import hashlib
 import logging
 import os
-import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import replace
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +34,7 @@ from fast_simplification import simplify
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
+from tactile_rt.core.files import write_whole
 from tactile_rt.sim_backend.objects.convex_parts import SheetPieces, SolidPieces
 from tactile_rt.sim_backend.objects.deviation import (
     TriangleSurface,
@@ -48,13 +48,13 @@ from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM, STANDARD, MeshDe
 from tactile_rt.sim_backend.objects.mesh_files import check_mesh_file, mesh_content, read_triangles
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-__all__ = ["Pieces", "cache_key", "load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
+__all__ = ["load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
 
 SHARES = (0.25, 0.5, 1.0)  # of the most triangles, that are tried
 HASTE = (3.0, 7.0, 10.0)  # how fast the cost of an edge that goes may grow, until few are left
 Floats = NDArray[np.float64]
 log = logging.getLogger("tactile_rt.sim_backend.objects")
-RECIPE = 5  # of the pieces; raised when the same file would become others
+RECIPE = 6  # of the pieces; raised when the same file would become others
 DIGITS = 7  # of a largest extent: corners nearer than 4e-6 mm at 40 mm are one
 MERGE_DIGITS = 6  # vertices closer than 1e-6 of the largest extent are one
 SPECK = 1e-6  # a body of less volume than this (largest extent cubed) touches nothing
@@ -73,26 +73,7 @@ FLUSH = 0.999  # so parallel (cosine) to a neighbour is a face that got lost
 MANY = 2000  # triangles that take some seconds
 
 
-@dataclass(frozen=True)
-class Pieces:
-    """Convex pieces of a mesh, in the unit box, and how they came about.
-
-    Attributes:
-        surface_error: The farthest that their surface is from the mesh's, in fractions of the
-            largest extent.
-    """
-
-    meshes: tuple[trimesh.Trimesh, ...]
-    surface_error: float
-    made_by: str
-
-
-def cache_key(content: bytes, *settings: object) -> str:
-    """Name for what is made of a file's content with these settings."""
-    return hashlib.sha256(hashlib.sha256(content).digest() + repr(settings).encode()).hexdigest()
-
-
-def read_pieces(key: str) -> Pieces | None:
+def read_pieces(key: str) -> TactileObject | None:
     """Read the pieces under this key; None if there are none, or they are damaged."""
     path = _path(key)
     if path is None:
@@ -107,32 +88,25 @@ def read_pieces(key: str) -> Pieces | None:
     meshes = tuple(
         trimesh.Trimesh(v, f, process=False) for v, f in zip(corners, faces, strict=True)
     )
-    return Pieces(meshes, error, made_by)
+    return TactileObject("", "", meshes, error, made_by)
 
 
-def write_pieces(key: str, pieces: Pieces) -> None:
+def write_pieces(key: str, thing: TactileObject) -> None:
     """Keep the pieces under this key, if there is a place to keep them."""
     path = _path(key)
     if path is None:
         return
+    arrays = {
+        "vertices": np.concatenate([m.vertices for m in thing.pieces]),
+        "faces": np.concatenate([m.faces for m in thing.pieces]).astype(np.int32),
+        "corners": [len(m.vertices) for m in thing.pieces],
+        "sides": [len(m.faces) for m in thing.pieces],
+        "surface_error": thing.surface_error,
+        "made_by": thing.made_by,
+    }
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(
-                    file,
-                    vertices=np.concatenate([m.vertices for m in pieces.meshes]),
-                    faces=np.concatenate([m.faces for m in pieces.meshes]).astype(np.int32),
-                    corners=[len(m.vertices) for m in pieces.meshes],
-                    sides=[len(m.faces) for m in pieces.meshes],
-                    surface_error=pieces.surface_error,
-                    made_by=pieces.made_by,
-                )
-            os.replace(name, path)  # another process may have written the same meanwhile
-        except BaseException:
-            os.unlink(name)
-            raise
+        write_whole(path, lambda file: np.savez(file, **arrays))
 
 
 def _path(key: str) -> Path | None:
@@ -172,14 +146,9 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
 
 
 def _with_faces(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
-    fewer = mesh
+    arrays, fewer = (np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32)), mesh
     for haste in HASTE:
-        corners, faces = simplify(
-            np.asarray(mesh.vertices, np.float64),
-            np.asarray(mesh.faces, np.int32),
-            target_count=number,
-            agg=haste,
-        )
+        corners, faces = simplify(*arrays, target_count=number, agg=haste)
         fewer = trimesh.Trimesh(corners, faces, process=False)
         if len(faces) <= 1.2 * number:
             break
@@ -194,34 +163,32 @@ def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:
     check_mesh_file(path)
     asked = (detail.surface_error_mm, detail.max_pieces, detail.hull, detail.up)
     makers = [version(p) for p in ("manifold3d", "trimesh", "scipy", "fast-simplification")]
-    key = cache_key(mesh_content(path), path.suffix.lower(), *asked, RECIPE, makers)
-    pieces = read_pieces(key)
-    if pieces is None:
+    settings = repr((path.suffix.lower(), *asked, RECIPE, makers)).encode()
+    key = hashlib.sha256(hashlib.sha256(mesh_content(path)).digest() + settings).hexdigest()
+    thing = read_pieces(key)
+    if thing is None:
         began = time.monotonic()
         mesh = read_triangles(path, detail.up)
-        faces = len(mesh.faces)
-        if faces > MANY:
-            log.info("%s: %d triangles to pieces; this takes some seconds, once", path, faces)
-        with np.errstate(all="ignore"):  # parts without a volume have no centre
-            pieces = _pieces(mesh, detail)
-        write_pieces(key, pieces)
-        if faces > MANY:
-            error, took = SIZE_MM * pieces.surface_error, time.monotonic() - began
+        slow = len(mesh.faces) > MANY
+        if slow:
             log.info(
-                "%s: %d pieces within %.2f mm at 40 mm, %.1f s",
-                path,
-                len(pieces.meshes),
-                error,
-                took,
+                "%s: %d triangles to pieces; this takes some seconds, once", path, len(mesh.faces)
             )
-    return TactileObject(path.stem, path.stem, pieces.meshes, pieces.surface_error, pieces.made_by)
+        with np.errstate(all="ignore"):  # parts without a volume have no centre
+            thing = _pieces(mesh, detail)
+        write_pieces(key, thing)
+        if slow:
+            error, took = SIZE_MM * thing.surface_error, time.monotonic() - began
+            told = "%s: %d pieces within %.2f mm at 40 mm, %.1f s"
+            log.info(told, path, len(thing.pieces), error, took)
+    return replace(thing, name=path.stem, category=path.stem)
 
 
-def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> Pieces:
+def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject:
     drawn = TriangleSurface(mesh.triangles)
     if detail.hull:
         hull = (mesh.convex_hull,)
-        return Pieces(hull, deviation(drawn, hull).largest, "hull")
+        return TactileObject("", "", hull, deviation(drawn, hull), "hull")
     tolerance = detail.surface_error_mm / SIZE_MM
     bodies, sheet = _simplify_parts(*_bodies_and_sheet(_mended(mesh)), SIMPLER * tolerance)
     if len(bodies) > detail.max_pieces:
@@ -242,9 +209,9 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> Pieces:
         left -= len(solid)
         corners += solid.corners(spare=max(0, detail.max_pieces - len(corners) - left - len(solid)))
     pieces = tuple(_piece(c) for c in corners)
-    error = deviation(drawn, pieces, bodies).largest
+    error = deviation(drawn, pieces, bodies)
     made_by = "plates" if sheets else "bodies" if len(pieces) == len(bodies) else "pieces"
-    return Pieces(pieces, error, made_by)
+    return TactileObject("", "", pieces, error, made_by)
 
 
 def _piece(corners: Floats) -> trimesh.Trimesh:

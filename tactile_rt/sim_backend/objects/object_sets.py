@@ -14,8 +14,8 @@ sheets become thin plates.
 
 import json
 import re
-from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -29,7 +29,7 @@ from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-__all__ = ["FOLDER_TABLE", "ObjectSet", "Origin", "SetReport", "open_objects"]
+__all__ = ["FOLDER_TABLE", "ObjectSet", "Origin", "open_objects"]
 
 SHAPENET_FILE = Path("models") / "model_normalized.obj"
 TAXONOMY = "taxonomy.json"
@@ -53,20 +53,6 @@ class Origin(msgspec.Struct, frozen=True):
 class _Row(Origin, frozen=True, kw_only=True):
     category: str
     name: str
-
-
-@dataclass(frozen=True)
-class SetReport:
-    """What a folder's objects come to.
-
-    Attributes:
-        surface_error: The surface error of every usable object, by its name, in fractions of its
-            largest extent.
-    """
-
-    made_by: dict[str, int]
-    surface_error: dict[str, float]
-    skipped: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -113,20 +99,16 @@ class ObjectSet:
             raise
         return replace(found, name=name.replace("/", "-"), category=self.categories[name])
 
-    def check(self, progress: Callable[[str], None] = lambda name: None) -> SetReport:
-        """Load every object once: how many can be used, how well, and why the others cannot."""
-        errors: dict[str, float] = {}
-        made_by: Counter[str] = Counter()
+    def check(
+        self, progress: Callable[[str], None] = lambda name: None
+    ) -> dict[str, TactileObject]:
+        """Load every object once: the usable ones, without pieces; see `skipped`."""
+        found = {}
         for name in self.names:
             progress(name)
-            try:
-                found = self.load(name)
-            except ConfigError:
-                continue  # noted by `load`
-            errors[name] = found.surface_error
-            made_by[found.made_by] += 1
-        skipped = {name: self.skipped[name] for name in self.names if name not in errors}
-        return SetReport(dict(sorted(made_by.items())), errors, skipped)
+            with suppress(ConfigError):  # noted by `load`
+                found[name] = replace(self.load(name), pieces=())
+        return found
 
 
 def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:

@@ -4,17 +4,16 @@ import numpy as np
 from manifold3d import triangulate
 from numpy.typing import NDArray
 
-__all__ = ["cut_polygons", "group_by_corners"]
+__all__ = ["cut_polygons", "flat"]
 
 MOST_CORNERS = 10_000
 SLIVER = 1e-9  # of all extents squared: a triangle of less area shows nowhere
 FOLD = 1e-6  # of a polygon's area: a triangle of a fan that lies so far outside folds back over it
 Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
 
 
-def cut_polygons(
-    vertices: NDArray[np.floating], corners: Ints, sizes: Ints
-) -> tuple[Ints, NDArray[np.bool_]]:
+def cut_polygons(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Cut polygons into triangles that cover them, in their order.
 
     Args:
@@ -23,8 +22,7 @@ def cut_polygons(
         sizes: how many corners each has, 3 at least.
 
     Returns:
-        (m, 3) vertices of triangles, `size - 2` for each polygon, and whether it is of a polygon
-        that a fan would leave, so that it was cut at its ears.
+        (m, 3) vertices of triangles, `size - 2` for each polygon.
     """
     if sizes.max(initial=3) > MOST_CORNERS:
         raise ValueError(f"a face has {sizes.max()} corners, more than {MOST_CORNERS}; split it")
@@ -34,40 +32,33 @@ def cut_polygons(
     step = np.arange(len(owner)) + 2 * owner
     faces: Ints = np.stack([corners[start], corners[step + 1], corners[step + 2]], axis=1)
     if sizes.max(initial=3) == 3:
-        return faces, np.zeros(len(faces), bool)
-    places = np.ascontiguousarray(vertices.T, float)
+        return faces
+    places: Floats = np.ascontiguousarray(vertices.T, float)
     a, b, c = (places[:, corner] for corner in faces.T)
     areas = _cross(b - a, c - a)
     whole = np.add.reduceat(areas, first, axis=1)
     share = (areas * whole[:, owner]).sum(axis=0)
     area = np.linalg.norm(whole, axis=0)[owner]
     outside = share < -area * np.maximum(FOLD * area, SLIVER * np.ptp(places, axis=1).max() ** 2)
-    better = np.zeros(len(faces), bool)
     for polygon in np.unique(owner[outside]):
         own = slice(first[polygon], first[polygon] + counts[polygon])
         ring = np.append(faces[own][0, :2], faces[own, 2])
-        ears = _cut_ears(places[:, ring].T, whole[:, polygon], ring)
+        seen = flat((places[:, ring] - places[:, ring[:1]]).T, whole[:, polygon] / area[own][0])
+        ears = ring[np.asarray(triangulate([seen]), np.int64)]
         a, b, c = (places[:, corner] for corner in ears.T)
         sizes_of = (np.linalg.norm(x, axis=0).sum() for x in (_cross(b - a, c - a), areas[:, own]))
         if np.subtract(*sizes_of) < -FOLD * area[own][0]:  # else it crosses itself
-            faces[own], better[own] = ears, True
-    return faces, better
+            faces[own] = ears
+    return faces
 
 
-def _cross(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+def _cross(a: Floats, b: Floats) -> Floats:
     return np.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
 
 
-def _cut_ears(places: NDArray[np.floating], normal: NDArray[np.floating], ring: Ints) -> Ints:
-    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    across /= np.linalg.norm(across)
-    plane = np.stack([across, np.cross(normal / np.linalg.norm(normal), across)], axis=1)
-    return ring[np.asarray(triangulate([(places - places[0]) @ plane]), np.int64)]
-
-
-def group_by_corners(faces: Ints, sizes: Ints) -> Ints:
-    """Sort triangles of polygons: of triangles first, of quads by halves, then of the others."""
-    corners, owner = (np.repeat(a, sizes - 2) for a in (sizes, np.arange(len(sizes))))
-    second = (corners == 4) & (owner == np.roll(owner, 1))
-    faces = np.where(second[:, None], faces[:, [1, 2, 0]], faces)
-    return faces[np.lexsort((second, np.minimum(corners, 5)))]
+def flat(points: Floats, normal: Floats) -> Floats:
+    """Project points (n, 3) along a normal: (n, 2)."""
+    one = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    one /= np.linalg.norm(one)
+    seen: Floats = points @ np.stack([one, np.cross(normal, one)], axis=1)
+    return seen

@@ -111,7 +111,7 @@ def test_polygons_are_cut_into_triangles_that_cover_them(radii, seed):
     angle = 2 * np.pi * (np.arange(n) + random.uniform(0, 0.4, n)) / n
     x, y = np.array(radii) * (np.cos(angle), np.sin(angle))
     points = np.stack([x, y, 0 * x], axis=1) @ turn * 10.0 ** random.uniform(-3, 3)
-    faces, _ = cut_polygons(points, np.arange(n), np.array([n]))
+    faces = cut_polygons(points, np.arange(n), np.array([n]))
     a, b, c = points[faces].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     whole = np.linalg.norm(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))

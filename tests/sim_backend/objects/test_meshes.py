@@ -10,7 +10,7 @@ pytest.importorskip("trimesh")
 import trimesh
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.sim_backend.objects import mesh_files
+from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object, make_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
@@ -267,7 +267,7 @@ def test_vertices_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
 
 
 def test_too_many_triangles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_files, "MAX_FACES", 10)
+    monkeypatch.setattr(mesh_formats, "MAX_FACES", 10)
     refuse(save(box((0, 0, 0), (1, 1, 1)), tmp_path / "c.ply"), "12 triangles, more than 10")
 
 

@@ -142,10 +142,10 @@ def test_a_shapenet_folder(shapenet: Path) -> None:
     assert (thing.name, thing.category) == ("chair-a1", "chair")
     tall = np.ptp([c for p in thing.pieces for c in p.bounds], axis=0)
     assert tall[2] == pytest.approx(20 / 40, abs=1e-3)  # its y, 20 mm of 40, is up
-    report = objects.check()
-    assert report.made_by == {"pieces": 2}
-    assert set(report.surface_error) == {"chair/a1", "chair/b2"}
-    assert list(report.skipped) == ["bottle/c3"] and "no triangles" in report.skipped["bottle/c3"]
+    usable = objects.check()
+    assert [thing.made_by for thing in usable.values()] == ["pieces"] * 2
+    assert set(usable) == {"chair/a1", "chair/b2"}
+    assert list(objects.skipped) == ["bottle/c3"] and "no triangles" in objects.skipped["bottle/c3"]
 
 
 def test_a_shapenet_folder_without_its_taxonomy(shapenet: Path) -> None:

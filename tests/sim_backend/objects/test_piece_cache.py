@@ -8,12 +8,13 @@ pytest.importorskip("trimesh")
 
 import trimesh
 
-from tactile_rt.sim_backend.objects.meshes import Pieces, read_pieces, write_pieces
+from tactile_rt.sim_backend.objects.meshes import read_pieces, write_pieces
+from tactile_rt.sim_backend.objects.solids import TactileObject
 
 
 @pytest.fixture
 def pieces():
-    return Pieces((trimesh.creation.box(),), 0.0, "by hand")
+    return TactileObject("box", "box", (trimesh.creation.box(),), 0.0, "by hand")
 
 
 @pytest.mark.parametrize("relative", ["", "some/cache"])
