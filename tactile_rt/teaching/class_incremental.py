@@ -73,15 +73,13 @@ class IncrementalClasses:
         ranked = np.sort(logits, axis=1)
         others = np.exp(ranked[:, :-1] - ranked[:, -1:]).sum(axis=1, keepdims=True)
         odds = np.clip(-np.log(others + 1e-9), -MOST, MOST)
-        scored: Floats = (near - NEARER * new - SURE * self.usual * odds) / (SOFT * self.usual)
-        return scored
+        return np.asarray((near - NEARER * new - SURE * self.usual * odds) / (SOFT * self.usual))
 
 
 def join_features(embeddings: NDArray[np.float32], logits: NDArray[np.float32]) -> Floats:
     """(step, unit and label): the mean of the embeddings so far, and the logits."""
     mean = np.cumsum(embeddings, axis=0) / np.arange(1, len(embeddings) + 1)[:, None]
-    together: Floats = np.concatenate([mean, logits], axis=1, dtype=float)
-    return together
+    return np.concatenate([mean, logits], axis=1, dtype=float)
 
 
 def fit_new_classes(card: ModelCard, features: Floats, labels: Sequence[str]) -> IncrementalClasses:

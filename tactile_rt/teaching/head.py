@@ -63,8 +63,7 @@ class TouchClasses:
         found = np.clip((features - self.mean) / self.scale, -LIMIT, LIMIT)
         away = found[:, :, None] - self.centres
         along = np.einsum("tscf,sfa->tsca", away, self.axes)
-        squared: Floats = np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1)
-        return squared
+        return np.asarray(np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1))
 
 
 @dataclass(frozen=True)

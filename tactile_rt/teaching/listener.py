@@ -141,5 +141,4 @@ def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
         steps = np.diff(levels)
         step = float(steps.min()) if len(steps) else max(1e-6 * float(abs(levels).max()), 1e-9)
         floor[channel] = max(floor[channel], step / np.sqrt(12))
-    found: NDArray[np.float32] = floor.astype(np.float32)
-    return found
+    return floor.astype(np.float32)

@@ -97,8 +97,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
     def right(self, which: str = "top1") -> NDArray[np.bool_]:
         """(sweep,) of `top1`, `top5` or `noisy`."""
-        right: NDArray[np.bool_] = np.array(list(getattr(self, which)), dtype=np.str_) == "1"
-        return right
+        return np.asarray(np.array(list(getattr(self, which)), dtype=np.str_) == "1")
 
 
 def outcome_path(folder: Path, task: Task) -> Path:

@@ -102,8 +102,7 @@ def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
     now, there = np.zeros(1, np.int64), np.ones((1, 1), np.bool_)
     read = Transducer(sensor, (name,)).push(Chunk(now, now, np.zeros((1, 1, 8), np.float32), there))
     assert read is not None
-    found: NDArray[np.float64] = read.values[0, 0].astype(np.float64)
-    return found
+    return np.asarray(read.values[0, 0].astype(np.float64))
 
 
 def _beyond_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
