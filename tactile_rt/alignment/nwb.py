@@ -48,11 +48,7 @@ SILENT_S = 60.0  # without a spike of any unit: not recorded
 
 
 class Reading(NamedTuple):
-    """What a file holds.
-
-    Attributes:
-        response: The change of the rates with contact; None without contacts to tell by.
-    """
+    """What a file holds; of `response` to contact, None without contacts to tell by."""
 
     session: NeuralSession
     notes: list[str]
@@ -61,10 +57,7 @@ class Reading(NamedTuple):
 
 
 def find_nwb(paths: Iterable[Path]) -> list[Path]:
-    """Files named, and those in folders named.
-
-    Of a folder, files with ``ecephys`` in their names if there are any: others have no spikes.
-    """
+    """Find files, and those in folders: with ``ecephys`` in their names, if any has that."""
     found = []
     for path in paths:
         if not (path.is_dir() or path.is_file()):

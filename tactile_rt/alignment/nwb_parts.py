@@ -59,11 +59,7 @@ FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; fewer are single mista
 
 
 def stored(file: Any, name: str) -> NDArray[Any]:
-    """A column as it is stored, of one dimension.
-
-    Raises:
-        ConfigError: it is something else, or larger than anything that belongs here.
-    """
+    """A column as it is stored, of one dimension, and no larger than any that belongs here."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
         raise ConfigError(f"{name} is not a column of values")
@@ -118,9 +114,7 @@ def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
 
 def last_time(clock: Any) -> float | None:
     """Last timestamp of a whisker's angle, s; None where it has no clock."""
-    angle = clock.get("angle") if hasattr(clock, "get") else None
-    if angle is None:
-        return None
+    angle = clock.get("angle", {}) if hasattr(clock, "get") else {}
     if "timestamps" in angle and len(angle["timestamps"]):
         return float(angle["timestamps"][-1])
     if "starting_time" in angle and "data" in angle:

@@ -100,11 +100,7 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
 
 
 def record(source: Source, seconds: float) -> list[Chunk]:
-    """The first so many seconds of a stream, by its own time; at least a chunk.
-
-    Raises:
-        SourceError: nothing comes.
-    """
+    """The first so many seconds of a stream, by its own time; at least a chunk."""
     chunks: list[Chunk] = []
     end = None
     patience = time.monotonic() + seconds + PATIENCE_S

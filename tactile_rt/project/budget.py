@@ -51,11 +51,7 @@ class Budget(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_budget(project: Project) -> Budget | None:
-    """The budget of a project that was begun before; None: it was not.
-
-    Raises:
-        ConfigError: the array or the sweeps have been changed since, or the budget is damaged.
-    """
+    """The budget of a project that was begun before; None: it was not."""
     path, anew = project.build / "budget.json", f"remove {project.build} to begin anew"
     if not path.exists():
         return None

@@ -133,10 +133,7 @@ def check_new_classes(card: ModelCard, labels: Sequence[str]) -> None:
 def leave_one_out_new_classes(
     card: ModelCard, features: Floats, labels: Sequence[str]
 ) -> LeaveOneOut:
-    """Judge every touch by the others alone: is it named, among all classes?
-
-    Args, Raises: as `fit_new_classes`. A class of two touches is fitted with itself.
-    """
+    """Judge every touch by the others alone; a class of two touches is fitted with itself."""
     names = tuple(np.unique(np.asarray(labels)))
     own = np.searchsorted(names, labels)
     away = np.empty((len(own), 1, len(names)))
@@ -145,11 +142,8 @@ def leave_one_out_new_classes(
         others = np.arange(len(own)) != k
         if (own[others] == own[k]).sum() < FEWEST:
             others[k] = True
-        found = fit_new_classes(
-            card,
-            features[others],
-            [name for name, used in zip(labels, others, strict=True) if used],
-        )
+        names_of = [labels[i] for i in np.flatnonzero(others).tolist()]
+        found = fit_new_classes(card, features[others], names_of)
         scores = found.scores(features[k : k + 1])[0]
         order = [found.labels.index(name) for name in names]
         away[k, 0] = -scores[order]

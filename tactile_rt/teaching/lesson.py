@@ -98,9 +98,6 @@ class Lesson:
         Args:
             folder: where to; made if it is not there.
             floor: (channel,) the smallest noise that the contact detector is to assume.
-
-        Raises:
-            ConfigError: there is a lesson already.
         """
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -129,11 +126,7 @@ class Lesson:
 
     @classmethod
     def read(cls, folder: Path) -> "Lesson":
-        """A lesson that was begun before, with all its touches.
-
-        Raises:
-            ConfigError, ModelError, RecordingError: a file of it is not there, or is wrong.
-        """
+        """A lesson that was begun before, with all its touches."""
         path = folder / FEATURES
         if not path.exists():
             raise ConfigError(f"{folder} holds no lesson: there is no {FEATURES}")
@@ -178,11 +171,7 @@ class Lesson:
         return found
 
     def listener(self, spec: ArraySpec) -> Listener:
-        """That finds touches in a stream of an array.
-
-        Raises:
-            SpecMismatch: it is another array than the lesson's.
-        """
+        """That finds touches in a stream of an array."""
         return Listener(self.folder / FEATURES, spec, self.taught.felt)
 
     def next_recording(self) -> Path:
@@ -211,11 +200,7 @@ class Lesson:
         return self.touches.pop()
 
     def check(self, label: str) -> str:
-        """The label itself.
-
-        Raises:
-            ConfigError: no class of this lesson can be named so.
-        """
+        """The label itself."""
         if isinstance(self.taught, ClassIncremental):
             check_new_classes(self.taught.card, (label,))
         return check_label(label)
@@ -249,11 +234,7 @@ class Lesson:
         return progress
 
     def learn(self) -> ModelCard:
-        """Write the model of all classes with enough touches.
-
-        Raises:
-            ConfigError: there is none.
-        """
+        """Write the model of all classes with enough touches."""
         used, names = self._used()
         if not used:
             why = f"nothing to learn from: no class has {FEWEST} touches yet"
@@ -327,11 +308,7 @@ def _check_free(folder: Path) -> None:
 
 
 def check_label(name: str) -> str:
-    """The label itself.
-
-    Raises:
-        ConfigError: it cannot be one.
-    """
+    """The label itself."""
     if why := check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
     if name in ORDERS:

@@ -66,7 +66,6 @@ def _attribute(name: str, value: int | float | str | Sequence[int]) -> bytes:
 
 
 def _name(value: memoryview) -> str:
-    """Of an input or output."""
     return next(str(text, "utf-8") for number, text, _ in split_fields(value) if number == 1)
 
 

@@ -186,5 +186,4 @@ class Teacher:
             self.done = self._planned
 
     def _short(self) -> list[str]:
-        """The wanted classes of which there are too few touches."""
         return [name for name in self.wanted if self.lesson.count(name) < self.each]

@@ -183,7 +183,6 @@ def _calibration(
     temperature: float,
     sample: str,
 ) -> list[Record]:
-    """ECE as shipped, of the logits as they were trained, and at rated noise."""
     at = f"at temperature {temperature:.3g}"
     raw = measures.at_temperature(clean, 1 / temperature)
     cases = (
@@ -207,7 +206,6 @@ def _calibration(
 def _measure_coverage(
     model: Path, test: SweepSet, unknown: SweepSet | None, sample: str
 ) -> list[Record]:
-    """Measure coverage and refusals; nothing of a model without them."""
     records, refusals = [], set(load_model(model)[1].refusals)
     for noise, when in ((0.0, ""), (1.0, " at rated noise")):
         found = measure_coverage(model, test, Disturbance(noise=noise))
@@ -238,7 +236,6 @@ def _measure_coverage(
 
 
 def _measure_open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
-    """Measure, open set, how well a model tells categories that training never saw."""
     there, here = score_known(model, unknown), score_known(model, known)
     estimate = measures.open_set(here, known.sweeps.objects, there, unknown.sweeps.objects)
     how = f"{len(here)} sweeps of known and {len(there)} of withheld kinds"
@@ -247,7 +244,6 @@ def _measure_open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record
 
 
 def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
-    """Indices of the first sweeps of every object."""
     mine = [np.flatnonzero(objects == name)[:sweeps] for name in dict.fromkeys(objects.tolist())]
     return np.concatenate(mine)
 

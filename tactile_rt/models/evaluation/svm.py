@@ -78,11 +78,7 @@ def fit(
 
 
 def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
-    """Fit one machine per penalty and keep the best on the validation sweeps.
-
-    Raises:
-        ConfigError: what there is to learn from is of one category.
-    """
+    """Fit one machine per penalty and keep the best on the validation sweeps."""
     x, usable = window_features(train)
     if len(set(train.sweeps.labels[usable].tolist())) < 2:
         raise ConfigError("a support vector machine needs touches of two categories to learn from")

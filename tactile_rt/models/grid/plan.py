@@ -189,11 +189,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     questions: tuple[Question, ...] = msgspec.field(name="question", default=())
 
     def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
-        """How a task is trained on the sweep set at `data`.
-
-        Raises:
-            ConfigError: an option that there is not, or a value that it cannot have.
-        """
+        """How a task is trained on the sweep set at `data`."""
         cell = task.cell
         assert cell is not None
         options: dict[str, Any] = {

@@ -250,7 +250,6 @@ class Workbench:
         )
 
     def _windows(self, config: TrainingConfig) -> tuple[list[CutWindows], list[CutWindows]]:
-        """The test windows as a configuration begins them, clean and at the rated noise."""
         if config.window not in self._cut:
             test = drawn_as(self.test, {"window": config.window})
             clean, noisy = (
