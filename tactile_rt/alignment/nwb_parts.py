@@ -59,7 +59,7 @@ FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; fewer are single mista
 
 
 def stored(file: Any, name: str) -> NDArray[Any]:
-    """A column as it is stored, of one dimension, and no larger than any that belongs here."""
+    """Read a column as it is stored: of one dimension, and not too large."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
         raise ConfigError(f"{name} is not a column of values")

@@ -133,7 +133,7 @@ def check_new_classes(card: ModelCard, labels: Sequence[str]) -> None:
 def leave_one_out_new_classes(
     card: ModelCard, features: Floats, labels: Sequence[str]
 ) -> LeaveOneOut:
-    """Judge every touch by the others alone; a class of two touches is fitted with itself."""
+    """Judge every touch by the others; one of a class of two by itself, too."""
     names = tuple(np.unique(np.asarray(labels)))
     own = np.searchsorted(names, labels)
     away = np.empty((len(own), 1, len(names)))

@@ -224,7 +224,7 @@ class Lesson:
 
         Of one class alone no touch can be wrong, and none is counted as right.
         """
-        used, names = self._used()
+        used, names = self._select_touches()
         if not used:
             return LessonProgress((), (), ())
         found = self.taught.leave_one_out(self._features(used), names)
@@ -235,7 +235,7 @@ class Lesson:
 
     def learn(self) -> ModelCard:
         """Write the model of all classes with enough touches."""
-        used, names = self._used()
+        used, names = self._select_touches()
         if not used:
             why = f"nothing to learn from: no class has {FEWEST} touches yet"
             raise ConfigError(f"{self.folder}: {why}")
@@ -247,7 +247,7 @@ class Lesson:
             self.folder / MODEL, self._features(used), names, self.folder.resolve().name, told
         )
 
-    def _used(self) -> tuple[list[int], list[str]]:
+    def _select_touches(self) -> tuple[list[int], list[str]]:
         """Return the numbers and labels of the touches of classes with enough of them."""
         enough = self.taught_enough
         used = [k for k, touch in enumerate(self.touches) if touch.label in enough]

@@ -183,7 +183,7 @@ class Stage:
         return Image.fromarray(pixels[::-1])
 
     def _add_forces(self, loads: NDArray[np.float64]) -> None:
-        """Add a dot on every base and the arrow of its force, of (element, 6) loads, N and N m."""
+        """Add a dot and an arrow for each of the loads (element, 6), N, N m."""
         data, scale, extent_mm = self.dressed.data, self.scale, self.camera.extent_mm
         for site, load in zip(self.dressed.sites, loads, strict=True):
             base = data.site_xpos[site]
