@@ -183,7 +183,7 @@ class Stage:
         return Image.fromarray(pixels[::-1])
 
     def _add_forces(self, loads: NDArray[np.float64]) -> None:
-        """Add a dot and an arrow for each of the loads (element, 6), N, N m."""
+        """Draw a dot and an arrow for each load (element, 6), N and N m."""
         data, scale, extent_mm = self.dressed.data, self.scale, self.camera.extent_mm
         for site, load in zip(self.dressed.sites, loads, strict=True):
             base = data.site_xpos[site]
