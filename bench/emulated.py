@@ -23,17 +23,6 @@ from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
 
-__all__ = [
-    "ArrayScript",
-    "EmulatedArray",
-    "LoopedSource",
-    "Played",
-    "bumps",
-    "fault_beat",
-    "noise",
-    "play",
-]
-
 # What a device's own buffer loses beside a restart of its counter nobody could count: while a busy
 # machine keeps the host waiting, nothing shall be lost here.
 FIFO_BYTES = 64 << 20

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self
 
-__all__ = ["Helper"]
-
 PATIENCE_S = 30.0  # beyond what it was asked to take; a helper that needs longer is stuck
 
 

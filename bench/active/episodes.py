@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from bench.active.policies import Policy
 
-__all__ = ["BUDGETS", "STEPS", "Episodes", "feel", "joined"]
-
 Task = tuple[
     Policy, tuple[int, int], int, str
 ]  # instances; seed; object's name, empty: a drawn one

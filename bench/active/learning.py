@@ -16,8 +16,6 @@ from bench.active.episodes import Episodes, feel, joined
 from bench.active.policies import WEIGHTS, Learnt
 from bench.active.recogniser import log_likelihoods, trained
 
-__all__ = ["learn"]
-
 Floats = NDArray[np.float64]
 
 CANDIDATES, BEST, EPISODES, ROUNDS = 12, 4, 24, 5

@@ -6,8 +6,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["WEIGHTS", "Learnt", "Passive", "Policy", "Scripted"]
-
 Floats = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
 

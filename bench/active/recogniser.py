@@ -7,8 +7,6 @@ from torch import nn
 
 from bench.active.episodes import BUDGETS, Episodes
 
-__all__ = ["log_likelihoods", "trained"]
-
 HIDDEN, EPOCHS, BATCH, RATE = 64, 40, 64, 3e-3
 
 

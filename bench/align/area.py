@@ -29,8 +29,6 @@ from tactile_rt.alignment.reliability import (
 from tactile_rt.alignment.statistics import highest, max_statistic
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["plain_loop", "run"]
-
 Floats = NDArray[np.float64]
 # The published factor of the pooled animals: what turned r_xy 0.2835 into 0.3295.
 PUBLISHED_FACTOR = 1.1623

@@ -19,18 +19,6 @@ from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.reliability import filtered_mean, noise_corrected
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = [
-    "PUBLISHED",
-    "by_cka",
-    "by_crossnobis",
-    "by_hsic",
-    "by_linear",
-    "by_rsa",
-    "by_rsa_time",
-    "predicted_by_ridge",
-    "run",
-]
-
 Floats = NDArray[np.float64]
 
 # Per-bootstrap results for raw sensor input, from the paper's published analysis.

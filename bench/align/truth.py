@@ -20,8 +20,6 @@ from tactile_rt.alignment.scoring import Score, layer_rdms, score_rdms
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["run"]
-
 Floats = NDArray[np.float64]
 
 BRAIN = Brain()

@@ -18,8 +18,6 @@ import grimp
 
 from bench.pictures.house import HEAVY, PACKAGE, ROOT, contracts, room_of
 
-__all__ = ["arrows", "measure", "single_importers"]
-
 LIMITS = Path(__file__).with_suffix(".toml")
 DESK = {"sets"}  # kept from torch as well, but for those who train
 

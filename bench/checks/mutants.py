@@ -31,8 +31,6 @@ from rich.console import Console
 
 from tactile_rt.models.evaluation.records import Record, show, write
 
-__all__ = ["Mutant", "mutants_of"]
-
 ROOT = Path(__file__).parents[2]
 TABLE = Path(__file__).with_suffix(".toml")
 BAR = 85.0  # %

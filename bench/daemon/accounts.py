@@ -12,8 +12,6 @@ from bench.emulated import Played
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording.reader import Recording
 
-__all__ = ["Account", "RecordedSamples", "account", "recorded"]
-
 GONE = (Fate.DROPPED, Fate.OVERFLOWED, Fate.UNHEARD)
 HURT = (Fate.CORRUPTED, Fate.TRUNCATED)
 

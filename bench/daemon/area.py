@@ -8,8 +8,6 @@ from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import QUICK_S, WHOLE_S, soak
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["run"]
-
 
 def run(quick: bool) -> list[Record]:
     """Measure; quick: two minutes, else half an hour."""

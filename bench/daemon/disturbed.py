@@ -19,8 +19,6 @@ from bench.daemon.stepped import MAIN, PATH, WallClock
 from bench.emulated import ArrayScript, Played, play
 from bench.processes import Helper
 
-__all__ = ["CONFIGURATION", "DaemonEvent", "DisturbedDaemon"]
-
 LONGEST_S = 3600.0
 SETTLED_S, SETTLED_MOST_S = 1.0, 5.0  # nothing told for so long; but a busy machine tells much
 CONFIGURATION = """version = 1

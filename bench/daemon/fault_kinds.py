@@ -18,8 +18,6 @@ from bench.daemon.overload import slow_down
 from bench.daemon.process import free_port
 from tests.helpers.hostile_models import GREEDY, write_burdened
 
-__all__ = ["CONFIGURATION", "KINDS", "FaultKind", "FaultScene", "may_mount"]
-
 STUCK_AT_S = 0.3
 DISK_MB, SPARE_MB = 96, 24  # of the recordings' file system; that must be free
 STEP_S = 3600.0

@@ -27,8 +27,6 @@ from rich.console import Console
 from bench.daemon.fault_kinds import KINDS, FaultKind, FaultScene, Named, may_mount
 from tactile_rt.models.evaluation.records import Record, show, write
 
-__all__ = ["TIMES", "faults"]
-
 TIMES = 40
 ASK_S = 0.04
 SEEN_S, GONE_S = 1.0, 2.0  # stated

@@ -21,8 +21,6 @@ from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.checking import compare_decoding
 
-__all__ = ["Killed", "kill_nine", "killed_once", "records_of"]
-
 QUICK, WHOLE = 5, 50
 LONGEST_S = 4.0  # from the first sample to the kill
 SAMPLES = 30_000  # at 1 kHz, more than any of it takes

@@ -11,8 +11,6 @@ from bench.daemon.peers import Ping
 from bench.emulated import Played
 from tactile_rt.core.stream import NS_PER_S
 
-__all__ = ["Latencies", "latencies"]
-
 BEFORE_S, AFTER_S = 0.1, 1.0  # a fault counts for what is decided so long around it
 BEGIN_S = 3.0  # until all have begun
 PROMPT_MS = 2.0  # of a ping

@@ -11,8 +11,6 @@ from onnx import helper, numpy_helper
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model
 from tactile_rt.core.stream import ArraySpec
 
-__all__ = ["finger_array", "whisker_array", "write_wide_model"]
-
 MORE = 5  # whiskers beyond those of the shipped model's array
 PITCH_M = 0.002
 AXES = {"samples": 2, "offset": 1, "sigma": 1}  # inputs, and where they have the whiskers

@@ -29,8 +29,6 @@ from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.models.evaluation.records import Record, show
 
-__all__ = ["overload", "slow_down"]
-
 QUICK_S, WHOLE_S = 15.0, 60.0
 HOGS_PER_CORE = 3
 HOG = "while True: pass"

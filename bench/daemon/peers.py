@@ -18,8 +18,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Heard", "Listening", "Ping", "listen"]
-
 WAIT_MS = 200
 PING_S = 0.01
 AGAIN_S, RETRY_S = 0.2, 0.1

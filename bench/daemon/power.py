@@ -30,8 +30,6 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import recover
 
-__all__ = ["can_mount", "power_cuts", "power_noted", "preloaded"]
-
 QUICK, WHOLE = 3, 50
 LONGEST_S = 4.0  # from the first sample to the cut
 LOST_S = 1.5

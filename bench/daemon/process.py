@@ -14,8 +14,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-__all__ = ["DaemonProcess", "Usage", "free_port", "messages_of", "until"]
-
 PATIENCE_S = 60.0
 MAIN = "from tactile_rt.cli import main; main()"
 TICK_S = 1 / os.sysconf("SC_CLK_TCK")

@@ -27,8 +27,6 @@ from tactile_rt.daemon.publishers.ros2 import Ros2Options, Ros2Publisher
 from tactile_rt.models.evaluation.records import Record, show
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["Ages", "free_domain", "measure", "ros2_records"]
-
 ELEMENTS, CHANNELS, RATE_HZ = 35, 6, 1000
 BAR_MS = 2.0
 PATIENCE_S = 60.0

@@ -22,8 +22,6 @@ from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.models.evaluation.records import Record, show, write
 
-__all__ = ["soak_records"]
-
 WARM_S = 300.0  # from then on nothing is excused
 WARM_SHARE = 0.15  # of a shorter run
 STEADY_S = 600.0  # a shorter run cannot tell a leak from warming up

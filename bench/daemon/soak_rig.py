@@ -25,8 +25,6 @@ from bench.emulated import ArrayScript, Played, fault_beat, play
 from bench.processes import Helper
 from tactile_rt.recording.reader import is_finished
 
-__all__ = ["EVERY_S", "QUICK_S", "WHOLE_S", "WIRES", "Soak", "configuration", "soak"]
-
 QUICK_S, WHOLE_S = 20.0, 600.0
 FIRST_FAULT_S, EVERY_S, APART_S = 4.0, 3.0, 0.4  # the two arrays' faults do not fall together
 LOOK_S, ASK_S = 1.0, 10.0

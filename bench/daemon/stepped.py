@@ -8,8 +8,6 @@ from pathlib import Path
 
 from tactile_rt.daemon.clock import Clock
 
-__all__ = ["MAIN", "PATH", "WallClock", "follow"]
-
 PATH = "TACTILE_RT_STEPPED_CLOCK"  # environment variable: the file that says how far it is off
 MAIN = "from bench.daemon.stepped import follow; follow()\nfrom tactile_rt.cli import main; main()"
 

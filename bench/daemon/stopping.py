@@ -23,8 +23,6 @@ from bench.emulated import ArrayScript, play
 from bench.processes import Helper
 from tactile_rt.models.evaluation.records import Record, show
 
-__all__ = ["stopping"]
-
 TIMES, QUICK = 25, 2  # of each way
 STATED_S = 2.0
 STREAM_S = 3600.0

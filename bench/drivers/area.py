@@ -9,8 +9,6 @@ from bench.drivers.unplugging import unplugging
 from bench.drivers.wires import can, readers, serial
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["run"]
-
 PARTS = (serial, readers, can, losses, unplugging, clocks, consumers, recordings, fuzzing)
 
 

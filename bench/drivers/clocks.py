@@ -9,8 +9,6 @@ from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.clocks import DeviceClock
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["clocks"]
-
 RATE_HZ = 1000
 SETTLED_S = 30
 SHORT_S, LONG_S = 60, 600

@@ -13,8 +13,6 @@ from tactile_rt.core.stream import Chunk, Source
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.opening import open_source
 
-__all__ = ["consumers"]
-
 QUICK_S, WHOLE_S = 12.0, 120.0
 SEGMENT_S = 0.25  # that the consumer keeps to one way
 QUEUE = 64  # chunks

@@ -25,8 +25,6 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["HEADERLESS", "Fuzzed", "all_codecs", "fuzz", "fuzzing", "mutate", "wire_of"]
-
 QUICK, WHOLE = 100_000, 10_000_000  # bytes for each codec
 SAMPLES = 40
 TRIALS = 60

@@ -16,8 +16,6 @@ from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["FAULTS", "UNPLUGS", "losses"]
-
 QUICK, WHOLE = 12_000, 600_000  # samples of each run
 SILENCE_S = 0.5
 SPEC = synthetic_spec(10, 6, 1000.0)

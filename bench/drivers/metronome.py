@@ -15,8 +15,6 @@ from tactile_rt.drivers.emulation.transmitter import EmulatedClock
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["Beat", "Sent", "play"]
-
 ROOM = 32_768  # bytes waiting for a host that sets the pace
 LISTEN_S = 0.02  # how often the host's commands are looked for
 DIFFERENT = 64  # samples before values come again

@@ -14,8 +14,6 @@ from tactile_rt.core.stream import Chunk, Source, SourceStats
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
 
-__all__ = ["Came", "read_bare", "read_sources"]
-
 SILENCE_S = 1.5  # after which nothing more comes
 WARM_S = 0.5  # not on the bill: the descriptions, the first fits
 

@@ -20,8 +20,6 @@ from tactile_rt.models.evaluation.records import Record
 from tactile_rt.recording import Recording, StreamWriter, recover
 from tactile_rt.sources.opening import open_source
 
-__all__ = ["recordings"]
-
 SPEEDS = (1, 10, 0)
 QUICK_RUNS, RUNS = 1, 3  # at each speed
 QUICK, WHOLE = 4, 20  # recorders killed

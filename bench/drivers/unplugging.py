@@ -16,8 +16,6 @@ from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["unplugging"]
-
 QUICK, WHOLE = 25, 100  # cycles
 BETWEEN_S = 0.05
 PATIENCE_S = 5.0

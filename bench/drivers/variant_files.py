@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Variant", "all_variants"]
-
 N, HZ, UTC = 40, 100, 1_700_000_000
 EVERY = list(range(N))
 T = np.arange(N) / HZ
@@ -97,6 +95,10 @@ class Variant:
         """Return it with one thing changed."""
         return replace(self, change=change, **changes)
 
+    def put(self, k: int, *new: str) -> tuple[str, ...]:
+        """Return the rows with others in place of row k."""
+        return (*self.rows[:k], *new, *self.rows[k + 1 :])
+
     def told(self, order: Sequence[int]) -> tuple[Any, Any]:
         """Return the samples of some rows."""
         order = sorted(order) if self.timed else list(order)
@@ -121,9 +123,9 @@ def _frame(k: int, x: float, y: float) -> bytes:
     return struct.pack(">hhHH", round(100 * x), round(100 * y), k, 7)
 
 
-def _blank(*rows: int) -> tuple[Any, Any]:
+def _blank(*rows: int, column: int = 0) -> tuple[Any, Any]:
     values = VALUES.copy()
-    values[list(rows), 0] = np.nan
+    values[list(rows), column] = np.nan
     return T, values
 
 
@@ -165,9 +167,20 @@ def change_binary(b: Variant) -> Iterator[Variant]:
     yield b.but("zeros in its middle", data=zeros, right=maybe)
 
 
+def change_text(b: Variant) -> Iterator[Variant]:
+    """Change how the rows of any text are written."""
+    yield from change_bytes(b)
+    yield b.but("byte order mark", before=b"\xef\xbb\xbf")
+    yield b.but("UTF-16", encoding="utf-16")
+    for name, eol in {"CRLF": "\r\n", "CR": "\r", "blank lines": "\n\n", "blanks": " \t\n"}.items():
+        yield b.but(f"{name} at line ends", eol=eol)
+    yield b.but("bytes after its end", after=b"\0\0\xff\xfe\x1a")
+    yield b.but("text after its end", after=b"-- end of log --\n")
+
+
 def change_lines(b: Variant, rng: random.Random) -> Iterator[Variant]:
     """Change rows, their order and the text of any log of lines."""
-    yield from change_bytes(b)
+    yield from change_text(b)
     k, rows = rng.randrange(5, N - 5), tuple(b.rows)
     above, below, less = rows[:k], rows[k + 1 :], _less(b, k)
     mixed = (*EVERY[:k], k + 1, k, *EVERY[k + 2 :])
@@ -175,34 +188,28 @@ def change_lines(b: Variant, rng: random.Random) -> Iterator[Variant]:
     twice = (np.arange(2 * N) / HZ, np.concatenate([VALUES, VALUES]))
     yield b.but("rows swapped", rows=[rows[i] for i in mixed], right=(b.told(mixed),))
     double = b.told([*EVERY[:k], k, *EVERY[k:]])
-    once = [WHOLE] if b.timed else []
-    both = [double] if b.kind == "lines" or not b.timed else []
-    yield b.but("a row doubled", rows=(*above, rows[k], *rows[k:]), right=(*once, *both))
-    yield b.but("a row missing", rows=above + below, right=less)
+    either = (WHOLE, double) if b.kind == "lines" else (WHOLE,)
+    yield b.but("a row doubled", rows=b.put(k, rows[k], rows[k]),
+                right=either if b.timed else (double,))
+    yield b.but("a row missing", rows=b.put(k), right=less)
     yield b.but("first row missing", rows=rows[1:], right=(b.told(EVERY[1:]),))
     yield b.but("ends between rows", rows=above, right=(b.told(EVERY[:k]),))
     yield b.but("ends in a row", rows=(*above, part), right=(b.told(EVERY[:k]),), due=True)
-    yield b.but("a row cut", rows=(*above, part, *below), right=less, due=True)
+    yield b.but("a row cut", rows=b.put(k, part), right=less, due=True)
     yield b.but("two rows in one", rows=(*above, part + rows[k + 1], *rows[k + 2 :]), due=True,
                 right=(b.told(_without(k, k + 1)), *less))
-    yield b.but("NULs for a row", rows=(*above, "\0" * len(rows[k]), *below), right=less, due=True)
+    yield b.but("NULs for a row", rows=b.put(k, "\0" * len(rows[k])), right=less, due=True)
     yield b.but("no line end at the end", data=whole[:-1])
     if "relative" not in b.base:  # which the head alone tells
         yield b.but("begins in a row", rows=(rows[k][-3:], *below), head=(), due=True,
                     right=(None, b.told(EVERY[k + 1 :])))
-    yield b.but("byte order mark", before=b"\xef\xbb\xbf")
-    yield b.but("UTF-16", encoding="utf-16")
     yield b.but("UTF-16 BE", before=b"\xfe\xff", encoding="utf-16-be")
-    for name, eol in {"CRLF": "\r\n", "CR": "\r", "blank lines": "\n\n", "spaces": "  \n"}.items():
-        yield b.but(f"{name} at line ends", eol=eol)
     yield b.but("blank lines above", before=b"\n\n")
-    yield b.but("bytes after its end", after=b"\0\0\xff\xfe\x1a")
-    yield b.but("text after its end", after=b"-- end of log --\n")
     yield b.but("twice in one file", after=whole, right=(twice, None), due=b.timed)
     yield b.but("one row", rows=rows[:1], right=(b.told([0]), None))
     if b.head:
         yield b.but("head alone", rows=(), right=(None,))
-        yield b.but("head again in the middle", rows=(*above, *b.head, *rows[k:]))
+        yield b.but("head again in the middle", rows=b.put(k, *b.head, rows[k]))
     if b.timed and "relative" not in b.base:
         gap, reset = np.where(T < T[k], T, T + 3), np.where(T < T[k], T, T - T[k])
         early, far = np.where(np.arange(N) % 10 == 7, T - 0.025, T), np.where(T == T[k], 9e8, T)
@@ -272,10 +279,10 @@ def change_terminal(b: Variant, rng: random.Random) -> Iterator[Variant]:
     yield from change_lines(b, rng)
     k, rows = rng.randrange(5, N - 5), tuple(b.rows)
     yield b.but("the board starts", before=b"ets Jun  8 2016 00:22:57\nrst:0x1 (POWERON)\nready\n")
-    yield b.but("a line of words", rows=(*rows[:k], "WARNING: brown-out", *rows[k:]))
+    yield b.but("a line of words", rows=b.put(k, "WARNING: brown-out", rows[k]))
     for value in ("nan", "ovf", "-", ""):
         odd = rows[k].replace(f"{VALUES[k, 0]:.4f}", value)
-        yield b.but(f"{value!r} for a number", rows=(*rows[:k], odd, *rows[k + 1 :]),
+        yield b.but(f"{value!r} for a number", rows=b.put(k, odd),
                     right=(_blank(k), *_less(b, k)))
 
 
@@ -293,15 +300,15 @@ def change_bus(b: Variant, rng: random.Random) -> Iterator[Variant]:
     yield b.but("another identifier alone", rows=other, right=(None,))
     if " 8 " in rows[0]:
         short = rows[k].replace(" 8 ", " 4 ", 1)[:-12]
-        yield b.but("a short frame", rows=(*rows[:k], short, *rows[k + 1 :]), due=True,
+        yield b.but("a short frame", rows=b.put(k, short), due=True,
                     right=(b.told(_without(k)),))
         empty = rows[0].replace(" 8 ", " 0 ", 1)[:-24]
-        yield b.but("an empty frame first", rows=(empty, *rows[1:]), due=True,
+        yield b.but("an empty frame first", rows=b.put(0, empty), due=True,
                     right=(b.told(EVERY[1:]),))
     if b.base.startswith("asc"):
         error = f"{rows[k].split()[0]} 1  ErrorFrame"
         if "relative" not in b.base:
-            yield b.but("an error frame", rows=(*rows[:k], error, *rows[k:]))
+            yield b.but("an error frame", rows=b.put(k, error, rows[k]))
         yield b.but("with its end", after=b"End TriggerBlock\n")
 
 
@@ -329,13 +336,9 @@ def make_texts(folder: Path, kind: str) -> Iterator[Variant]:
 
 def make_bags(folder: Path) -> Iterator[Variant]:
     """Yield bags of wrenches and arrays, each with one thing changed."""
-    def lacks(*rows: int) -> tuple[Any, ...]:
-        values = VALUES.copy()
-        values[list(rows), 1] = np.nan
-        return ((T, values), (T[_without(*rows)], VALUES[_without(*rows)]))
-
-    def less(*rows: int) -> tuple[Any, ...]:
-        return (_blank(*rows), (T[_without(*rows)], VALUES[_without(*rows)]))
+    def less(*rows: int, column: int = 0) -> tuple[Any, ...]:
+        kept = _without(*rows)
+        return (_blank(*rows, column=column), (T[kept], VALUES[kept]))
 
     nan = {k: [np.nan, VALUES[k, 1]] for k in (0, 9)}
     changes: dict[str, tuple[Sequence[int], Mapping[int, Any], tuple[Any, ...]]] = {
@@ -348,8 +351,9 @@ def make_bags(folder: Path) -> Iterator[Variant]:
         "no message": ([], {}, (None,)),
         "an empty message first": (EVERY, {0: []}, less(0)[1:]),
         "an empty message": (EVERY, {9: []}, less(9)[1:]),
-        "a short message": (EVERY, {9: [VALUES[9, 0]]}, lacks(9)),
-        "short messages first": (EVERY, {k: [VALUES[k, 0]] for k in range(4)}, lacks(0, 1, 2, 3)),
+        "a short message": (EVERY, {9: [VALUES[9, 0]]}, less(9, column=1)),
+        "short messages first": (EVERY, {k: [VALUES[k, 0]] for k in range(4)},
+                                 less(0, 1, 2, 3, column=1)),
         "a long message": (EVERY, {9: [*VALUES[9], 7.0]}, (WHOLE,)),
     }
     stamped = {"without time": T * 0, "that begin again": np.where(T < 0.2, T, T - 0.2)}
@@ -429,30 +433,26 @@ def change_mesh(b: Variant, rng: random.Random) -> Iterator[Variant]:
             right = (None,) if "cut" in one.change else one.right
             yield replace(one, prefix=False, right=maybe if "after" in one.change else right)
         return
-    yield from change_bytes(b)
+    for one in change_text(b):
+        loose = "after" in one.change or one.change in ("UTF-16", "CR at line ends")
+        yield replace(one, right=maybe if loose else one.right)
     for share in (0.9, 0.7, 0.4):
         end = int(share * len(rows))
         yield b.but(f"cut at {share:.0%}", rows=(*rows[:end], rows[end][:4]), right=(None,))
         if b.base != "obj":  # which tells no counts
             yield b.but(f"cut between rows at {share:.0%}", rows=rows[:end], right=(None,))
-    yield b.but("byte order mark", before=b"\xef\xbb\xbf")
-    yield b.but("UTF-16", encoding="utf-16", right=maybe)
-    for name, eol in {"CRLF": "\r\n", "CR": "\r", "blank lines": "\n\n", "tabs": " \t\n"}.items():
-        yield b.but(f"{name} at line ends", eol=eol, right=maybe if name == "CR" else (BOX,))
-    yield b.but("bytes after its end", after=b"\0\0\xff\xfe\x1a", right=maybe)
-    yield b.but("text after its end", after=b"end of file\n", right=maybe)
     yield b.but("head lost", rows=rows[max(1, len(rows) // 5) :], right=(None,))
     k = next(i for i, r in enumerate(rows) if "0.5" in r and ("float_a" in r or b.base != "dae"))
     for value in ("nan", "1e400", "0,5", "x"):
         odd = rows[k].replace("-0.5", value, 1).replace(f"{value}0000000", value)
-        yield b.but(f"{value} for a number", rows=(*rows[:k], odd, *rows[k + 1 :]), right=(None,))
+        yield b.but(f"{value} for a number", rows=b.put(k, odd), right=(None,))
     for name in ("stl", "obj", "ply", "off", "glb"):
         if not b.name.endswith(name):
             yield b.but(f"named .{name}", name=f"a.{name}", right=maybe)
     if b.base in ("obj", "off"):
         at = [i for i, row in enumerate(rows) if row.startswith(("f ", "3 "))][3]
         far = rows[at].rsplit(" ", 1)[0] + " 99"
-        yield b.but("index too large", rows=(*rows[:at], far, *rows[at + 1 :]), right=(None,))
+        yield b.but("index too large", rows=b.put(at, far), right=(None,))
     if b.base == "obj":
         faces = [[i.split("/")[0] for i in row[2:].split()] for row in rows if row[:2] == "f "]
         points = [row for row in rows if row[:2] == "v "]

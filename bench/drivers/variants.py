@@ -27,8 +27,6 @@ import numpy as np
 
 from bench.drivers.variant_files import Variant, all_variants
 
-__all__ = ["VERDICTS", "Judgement", "sort_variant", "sort_variants"]
-
 VERDICTS = ("right", "told", "silent", "traceback")
 TOLD = re.compile(r"[1-9]\d* (?:corrupt|missing)")
 

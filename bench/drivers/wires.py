@@ -15,8 +15,6 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["can", "readers", "serial"]
-
 READERS: dict[str, float | None] = {"thread": None, "one": 0.0, "gather": 0.001}
 HOW = {
     "thread": "a thread for each device", "one": "one thread for all",

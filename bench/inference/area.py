@@ -18,8 +18,6 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Sour
 from tactile_rt.export.model_steps import Subject, measure_model
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["Pulses", "run"]
-
 RATE_HZ = 1000
 PERIOD_NS = NS_PER_S // RATE_HZ
 QUIET, TOUCH = 500, 1100  # samples: time for release and baseline, then more than one episode

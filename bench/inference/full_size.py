@@ -23,8 +23,6 @@ from tactile_rt.export.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.models.ead import EADConfig, TactileClassifier
 
-__all__ = ["full_size", "full_size_models", "random_model"]
-
 CLASSES = 117  # of the paper
 NETWORKS = (("intersection-ln", "none"), ("intersection-ln-gpt", "gpt"))
 FULL_PRECISIONS: tuple[Precision, ...] = ("fp32", "int8")

@@ -29,8 +29,6 @@ from tactile_rt.models.evaluation.records import Record
 if TYPE_CHECKING:  # a robot has no torch
     from tactile_rt.models.ead import TactileClassifier
 
-__all__ = ["window_speed"]
-
 CLASSES = 117  # of the paper
 ENCODER = "zhuang-intersection-ln"
 BAR = ">= 2.4"  # the plain network's time over the file's

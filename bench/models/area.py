@@ -15,8 +15,6 @@ from tactile_rt.sim_backend.datasets.dataset import describe_set, make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 
-__all__ = ["run"]
-
 QUICK_DRAWS = 4  # sweeps of an object: as many as the most that are fused
 
 

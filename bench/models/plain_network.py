@@ -15,8 +15,6 @@ from torch.nn import functional as F
 from tactile_rt.models.encoders.cells import FORGET_BIAS, IntersectionCell
 from tactile_rt.models.encoders.zhuang import ZhuangEncoder
 
-__all__ = ["PlainEncoder"]
-
 
 class PlainCell(nn.Module):
     """The cell after its node's convolution; see `IntersectionCell` for the equations."""

@@ -20,29 +20,6 @@ from tactile_rt.models.training.config import SCHEDULES, TrainingConfig
 from tactile_rt.models.training.objectives import Autoencoder, Objective, SimCLR, SimSiam
 from tactile_rt.models.training.updates import LARS, build_schedule
 
-__all__ = [
-    "CELL_NAMES",
-    "EPOCHS",
-    "EPSILON",
-    "LOSSES",
-    "PICTURES",
-    "RATE",
-    "SHAPES",
-    "VIEWS",
-    "WARMUP",
-    "cell",
-    "computed",
-    "digest",
-    "features",
-    "fixed",
-    "loss",
-    "moved",
-    "pictures",
-    "rates",
-    "view",
-    "windows",
-]
-
 EPSILON = 1e-5  # of their layer norms: torch's own
 OURS = ("timedecay-ln", "vanilla", "vanilla-ln", "lstm-ln")  # cells that their code has not
 CELL_NAMES = tuple(name for name in CELLS if name not in OURS)

@@ -22,8 +22,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import Cell
 
-__all__ = ["EPSILON", "NETWORKS", "NetworkPair", "in_our_order", "open_code"]
-
 CODE = "tactile_model"
 EPSILON = 1e-5  # torch's own, as in pt_tnn/recurrent_cells/intersection_cell.py
 GRAPH = "model_configs/rnn_fdb_converted_{}.json"

@@ -33,18 +33,6 @@ from bench.models.published import GATES, NORMS
 from tactile_rt.models.published_pictures import Draw
 from tactile_rt.models.training.objectives import Objective
 
-__all__ = [
-    "computed_by_theirs",
-    "drawn_pictures",
-    "drawn_view",
-    "their_cell",
-    "their_loss",
-    "their_moved",
-    "their_pictures",
-    "their_rates",
-    "their_view",
-]
-
 CELLS = {
     "timedecay": "TimeDecayRecurrentCell", "vanilla": "VanillaRNNCell", "ugrnn": "UGRNNCell",
     "intersection": "IntersectionRNNCell", "gru": "GRUCell", "lstm": "LSTMCell",

@@ -15,8 +15,6 @@ from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import CELLS
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["CLASSES", "STEPS", "training_speed", "training_step"]
-
 STEPS, CLASSES = 22, 117
 PEER = "the same network, plain eager conv2d (beside the published code: bench/models/peer.py)"
 

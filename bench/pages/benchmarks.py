@@ -25,8 +25,6 @@ from tactile_rt.cli.bench import AREAS
 from tactile_rt.core.packages import VERSION
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["FOLDER", "HEADLINES", "PAGE", "Measurement", "bar_table", "measure", "read", "written"]
-
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reference" / "benchmarks.md"
 FOLDER = PAGE.with_suffix("")

@@ -12,8 +12,6 @@ import typer
 
 from tactile_rt.cli import load_app
 
-__all__ = ["PAGE", "example", "make_page"]
-
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "cli.md"
 HEAD = """# Commands
 

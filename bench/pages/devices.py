@@ -16,8 +16,6 @@ from typing import Any
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import codec_class
 
-__all__ = ["PAGE", "write_page"]
-
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "devices.md"
 
 

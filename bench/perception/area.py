@@ -31,20 +31,6 @@ from tactile_rt.sets.manifest import SPLITS, WITHHELD
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
 
-__all__ = [
-    "ALL",
-    "ELSEWHERE",
-    "FOLDER",
-    "OBJECTS",
-    "SHARED",
-    "SHARED_WIDE",
-    "WIDE",
-    "BenchmarkResults",
-    "measure",
-    "records_of",
-    "run",
-]
-
 FOLDER = Path("data") / NAME
 OBJECTS, ELSEWHERE, WIDE = "held-out objects", "held-out source", "both, in the wide world"
 SHARED, SHARED_WIDE = "kinds that are also generated", "these kinds, in the wide world"

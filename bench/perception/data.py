@@ -25,8 +25,6 @@ from tactile_rt.models.datasets import SweepSet
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD, SweepManifest
 from tactile_rt.sets.objects import Sweeps
 
-__all__ = ["FILE", "NAME", "SOURCE", "SPLITS", "VERSION", "Data", "Portion", "load", "pack"]
-
 NAME, VERSION = "realtouch", 1
 FILE = Path(__file__).parent / "data" / f"{NAME}-{VERSION}.xz"
 SOURCE = "source"  # known kinds from a source that no other split has anything of

@@ -22,8 +22,6 @@ from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import Choice, Range
 
-__all__ = ["UPRIGHT", "Condition", "false_touches", "measured", "rows"]
-
 RECIPE, FIRST, OBJECTS, DRAWS = "default24", 48, 4, 3
 UPRIGHT = "upright, 40 mm large, 28 to 40 mm/s"
 SHAKEN = "head shaken with 0.5 g, 10 to 100 Hz"

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,16 +29,6 @@ from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import train
 from tactile_rt.sets.objects import Sweeps
 from tactile_rt.sim_backend.datasets import recipes
-
-__all__ = [
-    "GENERATED",
-    "REAL",
-    "Method",
-    "baselines",
-    "digest_of",
-    "of_kinds",
-    "onnx_model",
-]
 
 Floats = NDArray[np.float32]
 REAL, GENERATED, BOTH = "real", "generated", "generated + real"
@@ -181,13 +170,6 @@ def _best(candidates: list[Callable[..., Floats]], validation: SweepSet) -> Call
     return max(candidates, key=lambda one: measures.hits(one(validation, CLEAN), labels).mean())
 
 
-def _softmax(margins: NDArray[Any], usable: NDArray[np.bool_]) -> Floats:
-    raised = np.exp(margins - margins.max(axis=1, keepdims=True))
-    out: Floats = (raised / raised.sum(axis=1, keepdims=True)).astype(np.float32)
-    out[~usable] = np.nan
-    return out
-
-
 def _svm(taught: str, training: SweepSet, validation: SweepSet) -> Method:
     x, usable = window_features(training)
     classes = len(training.manifest.categories)
@@ -197,7 +179,8 @@ def _svm(taught: str, training: SweepSet, validation: SweepSet) -> Method:
 
         def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
             features, found = window_features(sweeps, disturbance)
-            return _softmax(machine.margins(features, classes), found)
+            posteriors = measures.softmax(machine.margins(features, classes)).astype(np.float32)
+            return np.where(found[:, None], posteriors, np.float32(np.nan))
 
         return posteriors
 

@@ -15,8 +15,6 @@ from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE
 
-__all__ = ["PAGE", "figures", "made", "write_page"]
-
 PAGE = Path("docs/reference/realtouch.md")
 BESIDE = "SVM, real"  # shown beside the model files where it knows the kinds
 SPLITS = {

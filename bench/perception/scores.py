@@ -13,8 +13,6 @@ from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.measures import Interval
 
-__all__ = ["COVERAGES", "Figures", "accuracy_by_source", "robustness", "score"]
-
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 COVERAGES = (50, 80, 95)  # percent of the sweeps that are decided, the surest first
 Floats = NDArray[np.float32]
@@ -67,7 +65,7 @@ def score(
     sure = np.nan_to_num(posteriors.max(axis=1), nan=0.0)
     area = NOTHING
     if strange is not None:
-        area = _told_apart(method.score_known(known), objects, *strange)
+        area = measures.open_set(method.score_known(known), objects, *strange)
 
     return Figures(
         top1=measures.accuracy(right, objects),
@@ -106,19 +104,6 @@ def robustness(
         )
         for name, disturbance in conditions.items()
     }
-
-
-def _told_apart(
-    familiar: Floats, objects: NDArray[np.str_], strange: Floats, others: NDArray[np.str_]
-) -> Interval:
-    """AUROC, open set: the scores of known things against those of unknown ones."""
-    both = np.concatenate([familiar, strange])
-
-    def area(at: NDArray[np.int64]) -> float:
-        mine = at < len(familiar)
-        return measures.auroc(both[at[mine]], both[at[~mine]])
-
-    return measures.bootstrap(area, np.concatenate([objects, others]))
 
 
 def _macro(right: NDArray[np.bool_], labels: NDArray[np.int64]) -> float:

@@ -16,8 +16,6 @@ from pathlib import Path
 
 import grimp
 
-__all__ = ["FILE", "draw", "floors", "imports", "reduced"]
-
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docs" / "pictures" / "house.svg"
 PACKAGE = "tactile_rt"

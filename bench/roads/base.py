@@ -6,8 +6,6 @@ from pathlib import Path
 
 from bench.roads.walking import Failed, Road
 
-__all__ = ["LARGEST_MB", "walk_base"]
-
 LARGEST_MB = 180.0
 PASSED = ["birdcage", "grapes", "table", "bottle", "plane", "castle"]  # in the recording that ships
 TABLE = "time,left,right\n" + "".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(300))

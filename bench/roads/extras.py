@@ -6,8 +6,6 @@ from pathlib import Path
 
 from bench.roads.walking import ROOT, Failed, Road
 
-__all__ = ["EXTRAS", "walk_extra"]
-
 LARGEST_MB = 220.0  # of `onboard`
 GYM = """\
 import tactile_rt

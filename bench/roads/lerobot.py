@@ -4,8 +4,6 @@ from pathlib import Path
 
 from bench.roads.walking import ROOT, Road
 
-__all__ = ["RELEASES", "walk_lerobot"]
-
 RELEASES = {"3.11": "0.4.4", "3.12": "0.6.1", "3.13": "0.6.1"}
 SCRIPTS = ("lerobot-record", "lerobot-train", "lerobot-teleoperate", "lerobot-replay")
 LOOK = """\

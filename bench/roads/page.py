@@ -9,8 +9,6 @@ from pathlib import Path
 
 from bench.roads.walking import Failed, Road
 
-__all__ = ["walk_page"]
-
 WAIT_S = 60.0
 RIGHT = {"birdcage", "grapes", "table", "bottle", "castle"}
 

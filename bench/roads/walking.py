@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["ROOT", "Failed", "Road", "build_wheel", "find_python", "new_road"]
-
 ROOT = Path(__file__).parents[2]
 STEP_S = 900.0
 

@@ -8,8 +8,6 @@ import numpy as np
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.sim_backend import environments
 
-__all__ = ["active"]
-
 EPISODES, STEPS, STEP_S = 24, 40, 0.05
 # amplitude, offset, velocity: whisk by 19 degrees and go past the object
 WHISKING = (0.5, 0.0, 0.0, 0.5, 0.0)

@@ -19,8 +19,6 @@ from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile
 
-__all__ = ["BULLET_CPU_S", "SWEEPS", "cost", "run", "simulate"]
-
 Floats = NDArray[np.float64]
 
 BULLET_CPU_S = 156.0  # per simulated second at 1 kHz x 100 sub-steps, the faster of two objects

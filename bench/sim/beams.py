@@ -24,8 +24,6 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 
-__all__ = ["GRAVITY", "ORIGIN", "Beam", "BeamErrors", "beams", "flat", "measure", "ring"]
-
 Floats = NDArray[np.float64]
 
 ARRAYS = Path(__file__).parents[2] / "docs" / "arrays"

@@ -16,8 +16,6 @@ from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, draw_simulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, array_spec
 
-__all__ = ["Difference", "catalogue", "difference", "drawn"]
-
 Floats = NDArray[np.float64]
 
 SEED = 20

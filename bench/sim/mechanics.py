@@ -17,8 +17,6 @@ from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import MOUNT, PROFILES, Profile
 
-__all__ = ["HEARD_HZ", "drift", "mechanics"]
-
 SHORT_MIDDLE_LONG = ("E5", "C2", "B0")
 LET_GO = ("B0", "C2")
 HEARD_HZ = 400.0  # resonances above are too near the Nyquist frequency of a 1 kHz output

@@ -31,8 +31,6 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 
-__all__ = ["PEG_RADIUS_MM", "Press", "Pressed", "press", "press_states", "presses"]
-
 Floats = NDArray[np.float64]
 
 PEG_RADIUS_MM = 1.0

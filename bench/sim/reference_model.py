@@ -13,8 +13,6 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-__all__ = ["PROTOTYPE_CPU_S", "reference_cost"]
-
 PROTOTYPE_CPU_S = 1.97  # per simulated second, when these settings were chosen, on that machine
 START_MM, STEP_MM, STEPS_PER_MS = (23.30738888, -2.72380819, -2.0), (0.0, -0.0068, 0.0), 5
 SWEEP_MS = 1564

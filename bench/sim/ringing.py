@@ -12,8 +12,6 @@ from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.rods.world import RodWorld
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile
 
-__all__ = ["release_error", "rod_ring"]
-
 Floats = NDArray[np.float64]
 
 SMALL = 1e-3  # rad that all joints together are bent by: linear

@@ -173,8 +173,9 @@ def _spikes(
 def _drawn(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
     """Poisson spikes at given rates in windows, (window,) each."""
     number = rng.poisson(rate * length)
-    spikes: Floats = np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
-    return spikes
+    return np.asarray(
+        np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
+    )
 
 
 # NWB 2, as far as its readers need it.

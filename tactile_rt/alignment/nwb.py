@@ -22,25 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.alignment import nwb_parts as parts
 from tactile_rt.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.alignment.neural import NeuralSession
-from tactile_rt.alignment.nwb_parts import (
-    TRIALS,
-    animal_name,
-    contact_times,
-    flags,
-    inhibitory_units,
-    mark_overlaps,
-    name_rows,
-    numbers,
-    spike_times,
-    starting_time,
-    task_of,
-    text,
-    trial_columns,
-    unit_column,
-    usable_units,
-)
 from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError, name_some
@@ -54,6 +38,7 @@ if TYPE_CHECKING:
 __all__ = ["BIN_S", "WINDOWS", "Reading", "find_nwb", "read_nwb", "read_session"]
 
 Floats = NDArray[np.float64]
+Progress = Callable[[float], None]
 
 BIN_S = 0.045
 COURSE_BINS = 22  # as many as the steps of a model that is compared
@@ -63,11 +48,7 @@ SILENT_S = 60.0  # without a spike of any unit: not recorded
 
 
 class Reading(NamedTuple):
-    """What a file holds.
-
-    Attributes:
-        response: The change of the rates with contact; None without contacts to tell by.
-    """
+    """What a file holds; of `response` to contact, None without contacts to tell by."""
 
     session: NeuralSession
     notes: list[str]
@@ -76,29 +57,22 @@ class Reading(NamedTuple):
 
 
 def find_nwb(paths: Iterable[Path]) -> list[Path]:
-    """Files named, and those in folders named.
-
-    Of a folder, files with ``ecephys`` in their names if there are any: others have no spikes.
-    """
+    """Find files, and those in folders: with ``ecephys`` in their names, if any has that."""
     found = []
     for path in paths:
-        if path.is_dir():
-            files = sorted(path.rglob("*.nwb"))
-            files = [f for f in files if "ecephys" in f.name] or files
-            if not files:
-                raise ConfigError(f"no .nwb file in {path}")
-            found += files
-        elif path.is_file():
-            found.append(path)
-        else:
+        if not (path.is_dir() or path.is_file()):
             raise ConfigError(f"no file or folder {path}")
+        files = sorted(path.rglob("*.nwb")) if path.is_dir() else [path]
+        if not files:
+            raise ConfigError(f"no .nwb file in {path}")
+        found += [f for f in files if "ecephys" in f.name] or files
     return found
 
 
 def read_nwb(
     files: Iterable[Path],
     window: str = "contact",
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = lambda share: None,
     clock: str = "session",
     selection: Selection | None = None,
 ) -> tuple[list[Reading], list[str]]:
@@ -144,7 +118,7 @@ def read_nwb(
 def read_session(
     path: Path,
     window: str = "contact",
-    progress: Callable[[float], None] = lambda share: None,
+    progress: Progress = lambda share: None,
     clock: str = "session",
     selection: Selection | None = None,
 ) -> Reading:
@@ -173,93 +147,83 @@ def _h5py() -> Any:
 
 
 def _session(
-    file: "h5py.File",
-    name: str,
-    window: str,
-    progress: Callable[[float], None],
-    clock: str,
-    selection: Selection,
+    file: "h5py.File", name: str, window: str, progress: Progress, clock: str, selection: Selection
 ) -> Reading:
     notes: list[str] = []
-    trials = trial_columns(file)
-    shapes, places = text(trials["stimulus"]), text(trials["servo_position"])
-    ignored = flags(trials["ignore_trial"], "ignore_trial")
-    start, stop = (numbers(trials[c], c) for c in ("start_time", "choice_time"))
-    kept = (ignored != 1) & (text(trials["outcome"]) == "correct") & np.isin(shapes, SHAPES)
-    task = task_of(file, shapes[ignored == 0])
+    trials = parts.trial_columns(file)
+    shapes, places = parts.text(trials["stimulus"]), parts.text(trials["servo_position"])
+    ignored = parts.flags(trials["ignore_trial"], "ignore_trial")
+    begin, stop = (parts.numbers(trials[c], c) for c in ("start_time", "choice_time"))
+    kept = (ignored != 1) & (parts.text(trials["outcome"]) == "correct") & np.isin(shapes, SHAPES)
+    task = parts.task_of(file, shapes[ignored == 0])
 
     def drop(bad: NDArray[np.bool_], why: str) -> None:
         """Leave bad trials out, and say which."""
         nonlocal kept
         rows = np.flatnonzero(bad & kept)
         if rows.size:
-            few, whole = name_rows(rows.tolist()), kept.sum()
+            few, whole = parts.name_rows(rows.tolist()), kept.sum()
             notes.append(f"{rows.size} of {whole} correct trials left out ({few}): {why}")
         kept = kept & ~bad
+        if not kept.any():
+            left = f"no trial is left in {parts.TRIALS}: correct, not ignored, convex or concave"
+            raise ConfigError(name_some([left, *notes], 2, "; "))
 
     drop(ignored == -1, "ignore_trial is neither true nor false")
     drop(~np.isin(places, DISTANCES), f"servo_position is not one of {', '.join(DISTANCES)}")
     with np.errstate(invalid="ignore", over="ignore"):
-        lasts = stop - start
-        good = (lasts > 0) & (lasts < LONGEST_TRIAL_S) & (np.abs(start) < LONGEST_SESSION_S)
+        lasts = stop - begin
+        good = (lasts > 0) & (lasts < LONGEST_TRIAL_S) & (np.abs(begin) < LONGEST_SESSION_S)
     drop(~good, f"choice_time is not after start_time, by {LONGEST_TRIAL_S:g} s at most")
     twice = np.zeros_like(kept)
-    twice[kept] = mark_overlaps(start[kept], stop[kept])
+    twice[kept] = parts.mark_overlaps(begin[kept], stop[kept])
     drop(twice, "start_time goes back, or trials overlap")
-    units = spike_times(file, notes)
-    origin = starting_time(file)
+    units = parts.spike_times(file, notes)
+    origin = parts.starting_time(file)
     if clock == "recording" and origin is None:
         raise ConfigError(
             "acquisition has no electrical recording with a starting_time, which the published "
             "analysis counts spike times from"
         )
     shift = origin or 0.0 if clock == "recording" else 0.0
-    contacts = None
     try:
-        contacts = contact_times(file, notes)
+        contacts = parts.contact_times(file, notes)
     except ConfigError:
         if window == "contact":
             raise
-    if contacts is not None and window == "contact":
-        start = _first_contacts(contacts, start, stop)
+        contacts = np.empty(0)
+    start = begin
+    if window == "contact":
+        start = _first_contacts(contacts, begin, stop)
         drop(~np.isfinite(start), "no contact before the choice")
-    _check_left(kept, notes)
-    units, usable = usable_units(units, trials["start_time"][kept].min(), stop[kept].max(), notes)
+    first, last = begin[kept].min(), stop[kept].max()
+    units, usable = parts.usable_units(units, first, last, notes)
     heard = [times for times, good in zip(units, usable, strict=True) if good]
     if not heard:
         raise ConfigError(name_some(["no unit can be used", *notes[::-1]], 2, "; "))
     near = [start - SILENT_S, stop + SILENT_S]
     before = np.searchsorted(np.sort(np.concatenate(heard)), near)
     drop(before[0] == before[1], f"no unit has a spike within {SILENT_S:g} s")
-    _check_left(kept, notes)
     rows = np.flatnonzero(kept)
-    response = None
-    if contacts is not None:
-        response = contact_response(name, heard, contacts, shift, origin or 0.0)
-    depth = unit_column(file, "depth", len(units), notes)
-    inhibitory = inhibitory_units(file, len(units), notes)
+    response = contact_response(name, heard, contacts, shift, origin or 0.0)
+    depth = parts.unit_column(file, "depth", len(units), notes)
+    inhibitory = parts.unit_column(file, "inhibitory", len(units), notes, (0, 1))
     chosen = selection.units(depth, inhibitory, len(units)) & usable
     spikes = [times - shift for times, wanted in zip(units, chosen, strict=True) if wanted]
     rates, course = _rates(spikes, start[rows], stop[rows], progress)
     if rates.size and not rates.any():
         raise ConfigError(f"none of {len(spikes)} units has a spike in one of {len(rows)} trials")
     session = NeuralSession(
-        animal=animal_name(file, name),
+        animal=parts.animal_name(file, name),
         name=name,
         rates=rates,
         stimulus=np.array([stimulus_index(shapes[r], places[r]) for r in rows], dtype=np.int64),
         course=course,
         depth=None if depth is None else depth[chosen],
-        inhibitory=None if inhibitory is None else inhibitory[chosen],
-        begin=numbers(trials["start_time"], "start_time")[rows],
+        inhibitory=None if inhibitory is None else inhibitory[chosen] == 1,
+        begin=begin[rows],
     )
     return Reading(session, [f"session {name}: {note}" for note in notes], task, response)
-
-
-def _check_left(kept: NDArray[np.bool_], notes: list[str]) -> None:
-    if not kept.any():
-        left = f"no trial is left in {TRIALS}: correct, not ignored, convex or concave"
-        raise ConfigError(name_some([left, *notes], 2, "; "))
 
 
 def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:
@@ -270,10 +234,7 @@ def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:
 
 
 def _rates(
-    spikes: list[Floats],
-    start: Floats,
-    stop: Floats,
-    progress: Callable[[float], None],
+    spikes: list[Floats], start: Floats, stop: Floats, progress: Progress
 ) -> tuple[Floats, Floats]:
     """Spikes per second in [start, stop), (trial, unit), and by bin, (trial, bin, unit)."""
     bins = np.array(

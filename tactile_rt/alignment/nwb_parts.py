@@ -4,6 +4,7 @@ What spoils a session raises a `ConfigError` that names the place in the file; t
 who reads it. What spoils a trial, a contact or a spike alone is left out, and a note says so.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -22,21 +23,18 @@ __all__ = [
     "CONTACTS",
     "EXPERIMENT",
     "LARGEST",
-    "RECORDING",
     "SUBJECT",
     "TRIALS",
     "WHISKER",
     "animal_name",
     "contact_times",
     "flags",
-    "inhibitory_units",
     "last_time",
     "mark_overlaps",
     "name_rows",
     "numbers",
     "spike_times",
     "starting_time",
-    "stored",
     "task_of",
     "text",
     "trial_columns",
@@ -61,18 +59,13 @@ FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; fewer are single mista
 
 
 def stored(file: Any, name: str) -> NDArray[Any]:
-    """A column as it is stored, of one dimension.
-
-    Raises:
-        ConfigError: it is something else, or larger than anything that belongs here.
-    """
+    """Read a column as it is stored: of one dimension, and not too large."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
         raise ConfigError(f"{name} is not a column of values")
     if data.size * max(data.dtype.itemsize, 1) > LARGEST:
         raise ConfigError(f"{name} has {data.size} values, more than a session can have")
-    values: NDArray[Any] = data[()]
-    return values
+    return np.asarray(data[()])
 
 
 def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
@@ -82,11 +75,8 @@ def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
     table = file[TRIALS]
     missing = [name for name in COLUMNS if name not in table]
     if missing:
-        there = ", ".join(sorted(table))
-        raise ConfigError(
-            f"{TRIALS} lacks the column{'s' * (len(missing) > 1)} {name_some(missing)} "
-            f"(it has {there})"
-        )
+        lacks = f"lacks the column{'s' * (len(missing) > 1)} {name_some(missing)}"
+        raise ConfigError(f"{TRIALS} {lacks} (it has {', '.join(sorted(table))})")
     columns = {name: stored(table, name) for name in COLUMNS}
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -96,14 +86,12 @@ def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
 
 def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
     """Start times of all contacts, sorted, s; what was left out is said in `notes`."""
-    modules = [file["processing"][name] for name in file.get("processing", {})]
-    found = {name: module[name] for module in modules for name in module}
-    clocks = {name: last_time(group) for name, group in found.items() if name.startswith(WHISKER)}
+    found = {k: v for module in file.get("processing", {}).values() for k, v in module.items()}
+    clocks = {name: last_time(found[name]) for name in found if name.startswith(WHISKER)}
     last = {name: end for name, end in clocks.items() if end is not None}
     times = []
-    for name, table in found.items():
-        if not name.startswith(CONTACTS):
-            continue
+    for name in (name for name in found if name.startswith(CONTACTS)):
+        table = found[name]
         if "start_time" not in table:
             raise ConfigError(f"{table.name} lacks the column start_time")
         starts = numbers(stored(table, "start_time"), f"{name} start_time")
@@ -126,9 +114,7 @@ def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
 
 def last_time(clock: Any) -> float | None:
     """Last timestamp of a whisker's angle, s; None where it has no clock."""
-    angle = clock.get("angle") if hasattr(clock, "get") else None
-    if angle is None:
-        return None
+    angle = clock.get("angle", {}) if hasattr(clock, "get") else {}
     if "timestamps" in angle and len(angle["timestamps"]):
         return float(angle["timestamps"][-1])
     if "starting_time" in angle and "data" in angle:
@@ -170,48 +156,48 @@ def usable_units(
         begin, end: When the first trial begins and the last one ends, in s.
         notes: Receives what is left out, and why.
     """
-    far = max(FAR_S, end - begin)
-    kept, seen, faults = [], dict[bytes, int](), dict[str, list[int]]()
+    far, usable = max(FAR_S, end - begin), np.ones(len(units), dtype=np.bool_)
+    kept, seen, faults = [], dict[bytes, int](), defaultdict[str, list[int]](list)
     strange, doubled = list[int](), list[int]()
     for k, given in enumerate(units):
         times = np.sort(given)
         away = (times < begin - far) | (times > end + far)
-        odd, again = away | (times < 0), np.diff(times, prepend=-np.inf) == 0
+        early, late = (times < begin).all(), (times > end).all()
+        back, again = np.maximum.accumulate(given) - given, np.diff(times, prepend=-np.inf) == 0
         first = seen.setdefault(times.tobytes(), k)
-        fault = ""
-        if not times.size:
-            fault = "no spikes"
-        elif (np.maximum.accumulate(given) - given).max() > BACK_S:
-            fault = "their spike times go back, as of a clock that began anew"
-        elif times[-1] < begin:
-            fault = f"their spikes end before the first trial begins, at {begin:.3f} s"
-        elif times[0] > end or away.mean() > FAR_SHARE:
-            fault = "their spikes lie outside the trials (another clock, or ms for s?)"
-        elif first < k and len(times) > 2:
-            fault = f"the spikes of unit {first} again"
-        elif again.mean() > SAME_SHARE:
-            doubled += [k] * int(again.sum())
-            times = times[~again]
-        if fault:
-            faults.setdefault(fault, []).append(k)
+        found = {
+            "no spikes": not times.size,
+            "their spike times go back, as of a clock that began anew": (back > BACK_S).any(),
+            f"their spikes end before the first trial begins, at {begin:.3f} s": early,
+            "their spikes lie outside the trials (another clock, or ms for s?)": (
+                late or away.sum() > FAR_SHARE * len(times)
+            ),
+            f"the spikes of unit {first} again": first < k and len(times) > 2,
+        }
+        usable[k] = not any(found.values())
+        if not usable[k]:
+            faults[next(fault for fault, holds in found.items() if holds)].append(k)
         else:
-            strange += [k] * int(odd.sum())
+            strange += [k] * int((away | (times < 0)).sum())
+            if again.mean() > SAME_SHARE:
+                doubled += [k] * int(again.sum())
+                times = times[~again]
         kept.append(times)
     told = {"counted once, stored twice": doubled, "far from the trials, or before 0 s": strange}
     notes += [f"{len(r)} spikes {what} (unit {name_rows(r)})" for what, r in told.items() if r]
     for fault, rows in faults.items():
         notes.append(f"{len(rows)} of {len(units)} units left out ({name_rows(rows)}): {fault}")
-    return kept, ~np.isin(np.arange(len(units)), [k for rows in faults.values() for k in rows])
+    return kept, usable
 
 
 def mark_overlaps(start: Floats, stop: Floats) -> NDArray[np.bool_]:
     """Mark trials of another clock, stored twice, or running into the next one."""
     bad = np.zeros(len(start), dtype=np.bool_)
     for again in range(2):
-        order = np.lexsort((stop, start, bad))[: int((~bad).sum())]
+        order = np.lexsort((stop, start, bad))[: (~bad).sum()]
         one, two = order[:-1], order[1:]
-        same = start[one] == start[two]
-        bad[two[same & ((stop[one] == stop[two]) | bool(again))]] = True
+        same = (start[one] == start[two]) & (bool(again) | (stop[one] == stop[two]))
+        bad[two[same]] = True
         runs = stop[one] > start[two]
         if again:
             bad[one[runs]] = True
@@ -229,30 +215,22 @@ def name_rows(rows: Sequence[int]) -> str:
     return ", ".join(map(str, rows[:NAMED])) + (", ..." if len(rows) > NAMED else "")
 
 
-def unit_column(file: "h5py.File", name: str, units: int, notes: list[str]) -> Floats | None:
-    """A column of the units as numbers, (unit,); None if there is none that can be used."""
-    if "units" not in file or name not in file["units"]:
+def unit_column(
+    file: "h5py.File", name: str, units: int, notes: list[str], among: Sequence[float] = ()
+) -> Floats | None:
+    """Read a column of the units as numbers, (unit,), of `among` if any; None if it is unusable."""
+    if name not in file.get("units", {}):
         return None
     values = stored(file["units"], name)
     if len(values) != units or values.dtype.kind not in "fiub":
-        notes.append(f"column units/{name} left out: it is not a number for each of {units} units")
-        return None
-    return values.astype(np.float64)
-
-
-def inhibitory_units(file: "h5py.File", units: int, notes: list[str]) -> NDArray[np.bool_] | None:
-    """Whether each unit is a putative inhibitory neuron, (unit,); None if that cannot be told."""
-    values = unit_column(file, "inhibitory", units, notes)
-    if values is None:
-        return None
-    odd = np.flatnonzero(~np.isin(values, (0, 1)))
-    if odd.size:
-        notes.append(
-            f"column units/inhibitory left out: {odd.size} of {units} are neither 0 nor 1, unit "
-            f"{odd[0]} is {values[odd[0]]:g}"
-        )
-        return None
-    return np.asarray(values == 1)
+        why = f"it is not a number for each of {units} units"
+    elif among and (odd := np.flatnonzero(~np.isin(values, among))).size:
+        known = " nor ".join(map(str, among))
+        why = f"{odd.size} of {units} are neither {known}, unit {odd[0]} is {values[odd[0]]:g}"
+    else:
+        return values.astype(np.float64)
+    notes.append(f"column units/{name} left out: {why}")
+    return None
 
 
 def starting_time(file: "h5py.File") -> float | None:
@@ -270,18 +248,21 @@ def starting_time(file: "h5py.File") -> float | None:
 def animal_name(file: "h5py.File", stem: str) -> str:
     """The subject; without one, the first part of the file's name, as published."""
     if SUBJECT in file:
-        return str(text(np.atleast_1d(file[SUBJECT][()]))[0])
+        return _text_of(file, SUBJECT)
     return stem.partition("_")[0].removeprefix("sub-")
 
 
 def task_of(file: "h5py.File", shown: NDArray[np.str_]) -> str:
     """The mouse's task: what the file says, or whether trials without a shape were part of it."""
     if EXPERIMENT in file:
-        said = str(text(np.atleast_1d(file[EXPERIMENT][()]))[0])
-        named = [task for task in TASKS if task in said]
+        named = [task for task in TASKS if task in _text_of(file, EXPERIMENT)]
         if len(named) == 1:
             return named[0]
     return TASKS[1] if (shown == "nothing").any() else TASKS[0]
+
+
+def _text_of(file: "h5py.File", name: str) -> str:
+    return str(text(np.atleast_1d(file[name][()]))[0])
 
 
 def text(column: NDArray[Any]) -> NDArray[np.str_]:
@@ -301,5 +282,4 @@ def numbers(values: NDArray[Any], what: str) -> Floats:
     """Times in seconds; `what` names them if they are something else."""
     if values.dtype.kind not in "fiu":
         raise ConfigError(f"{what} is {values.dtype}, not times in seconds")
-    times: Floats = values.astype(np.float64)
-    return times
+    return values.astype(np.float64)

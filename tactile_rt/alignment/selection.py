@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ class Selection:
         return not self.sessions or any(fnmatchcase(session, f"*{p}*") for p in self.sessions)
 
     def units(
-        self, depth: NDArray[np.float64] | None, inhibitory: NDArray[np.bool_] | None, number: int
+        self, depth: NDArray[np.float64] | None, inhibitory: NDArray[Any] | None, number: int
     ) -> NDArray[np.bool_]:
         """Which of a session's units are kept, (unit,).
 

@@ -46,7 +46,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     gain: tuple[float, ...] = ()
     tare: dict[str, Row] = {}
     noise: dict[str, Row] = {}
-    matrix: dict[str, tuple[Row, ...]] = {}
+    matrices: dict[str, tuple[Row, ...]] = msgspec.field(name="matrix", default_factory=dict)
     mapping: dict[str, str] = {}
     mirror: Mirror | None = None
 
@@ -111,21 +111,12 @@ def _calibration(nodes: SettingNode) -> Calibration:
             f"{nodes.where}: is a calibration of version {found!r}; this release reads {VERSION}"
         )
     file: _File = convert(nodes, _File)
+    raw, out = msgspec.structs.asdict(file.raw), file.output
+    parts = ("history", "gain", "tare", "noise", "matrices", "mapping", "mirror")
+    rest = {name: getattr(file, name) for name in parts}
     try:
         return Calibration(
-            device=file.device,
-            elements=file.raw.elements,
-            channels=file.raw.channels,
-            units=file.raw.units,
-            output_channels=file.output.channels,
-            output_units=file.output.units,
-            gain=file.gain,
-            tare=file.tare,
-            noise=file.noise,
-            matrices=file.matrix,
-            mapping=file.mapping,
-            mirror=file.mirror,
-            history=file.history,
+            file.device, **raw, output_channels=out.channels, output_units=out.units, **rest
         )
     except ConfigError as error:  # how its parts fit together
         raise ConfigError(f"{nodes.where}: {error}") from None

@@ -22,6 +22,8 @@ from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, concat
 
 __all__ = ["Tare", "record", "tare"]
 
+Floats = NDArray[np.float64]
+
 BLOCKS = 8
 LEAST_SAMPLES = 8 * BLOCKS  # a block's median must be surer than the limits below
 TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
@@ -98,11 +100,7 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
 
 
 def record(source: Source, seconds: float) -> list[Chunk]:
-    """The first so many seconds of a stream, by its own time; at least a chunk.
-
-    Raises:
-        SourceError: nothing comes.
-    """
+    """The first so many seconds of a stream, by its own time; at least a chunk."""
     chunks: list[Chunk] = []
     end = None
     patience = time.monotonic() + seconds + PATIENCE_S
@@ -134,20 +132,12 @@ def _rest(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     return np.median(values, axis=0), noise
 
 
-def _trouble(
-    values: NDArray[np.float64],
-    offset: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    t_s: NDArray[np.float64],
-    spec: ArraySpec,
-) -> str:
+def _trouble(values: Floats, offset: Floats, noise: Floats, t_s: Floats, spec: ArraySpec) -> str:
     """What kept an element from rest, if anything did; of its worst channel."""
     scale = np.where(noise > 0, noise, 1.0)  # where there is none, nothing has changed either
     medians = np.stack([np.median(b, axis=0) for b in _blocks(values)])
-    quarters = (
-        np.median(values[: len(values) // 4], axis=0),
-        np.median(values[-(len(values) // 4) :], axis=0),
-    )
+    quarter = len(values) // 4
+    quarters = [np.median(part, axis=0) for part in (values[:quarter], values[-quarter:])]
     away = np.abs(medians - offset) / scale
     drift = np.abs(quarters[1] - quarters[0]) / scale
     beyond = (np.abs(values - offset) > TAP * scale).astype(np.int64)

@@ -51,24 +51,18 @@ class Budget(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_budget(project: Project) -> Budget | None:
-    """The budget of a project that was begun before; None: it was not.
-
-    Raises:
-        ConfigError: the array or the sweeps have been changed since, or the budget is damaged.
-    """
-    path = project.build / "budget.json"
+    """The budget of a project that was begun before; None: it was not."""
+    path, anew = project.build / "budget.json", f"remove {project.build} to begin anew"
     if not path.exists():
         return None
     try:
         budget = msgspec.json.decode(path.read_bytes(), type=Budget)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise ConfigError(
-            f"{path} is damaged ({error}): remove {project.build} to begin anew"
-        ) from None
+        raise ConfigError(f"{path} is damaged ({error}): {anew}") from None
     if budget.described != described(project):
         raise ConfigError(
             f"array.toml or sweeps.toml of {project.folder} has been changed since {project.build} "
-            f"was begun: remove {project.build} to begin anew"
+            f"was begun: {anew}"
         )
     return budget
 
@@ -110,12 +104,8 @@ def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
     """The recipe with the budget's numbers of objects and sweeps."""
     objects = recipe.objects
     if budget.test:
-        objects = msgspec.structs.replace(
-            objects,
-            per_category=budget.per_category,
-            validation=budget.validation,
-            test=budget.test,
-        )
+        counts = {k: getattr(budget, k) for k in ("per_category", "validation", "test")}
+        objects = msgspec.structs.replace(objects, **counts)
     return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=budget.draws))
 
 

@@ -151,11 +151,7 @@ class Project:
         return {name: f"{value:g}" for name, value in largest.items()}
 
     def line(self) -> DeviceLine:
-        """The line and the codec of the first source of robot.toml.
-
-        Raises:
-            ConfigError: robot.toml has a mistake, or its source is no device.
-        """
+        """The line and the codec of the first source of robot.toml."""
         file = self.folder / "robot.toml"
         url = load_config(file).config.source[0].url
         scheme, target, fields = split_url(url)
@@ -253,7 +249,6 @@ def _wandering(animals: tuple[WhiskerArray, ...]) -> float:
 
 
 def _described(array: str, folder: Path) -> str:
-    """The text of array.toml in a project's folder."""
     if array in ROBOTS:
         return robot_text(array)
     path = Path(array)

@@ -7,7 +7,7 @@ Each part is made once: what is there is not made again, and what was interrupte
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -112,17 +112,14 @@ def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tel
                 tell(MakeProgress("sweeping", done, of, end - time.monotonic()))
             if done > max(there, fewest) and time.monotonic() > until:
                 break
-    if left:
-        _leave_out(folder, left)
+    if left:  # for which there was no time
+        for name in left:
+            (folder / f"{name}.part").unlink(missing_ok=True)
+        write_skipped(
+            folder, read_skipped(folder) | dict.fromkeys(left, "there was no time for it")
+        )
+        write_sums(folder)
     return folder
-
-
-def _leave_out(folder: Path, names: Sequence[str]) -> None:
-    """Go on without objects for which there was no time."""
-    for name in names:
-        (folder / f"{name}.part").unlink(missing_ok=True)
-    write_skipped(folder, read_skipped(folder) | dict.fromkeys(names, "there was no time for it"))
-    write_sums(folder)
 
 
 def _train(
@@ -158,12 +155,8 @@ def _time_of_an_update(project: Project, config: TrainingConfig, splits: Splits)
     """The time that one takes with its share of the validation after every epoch, s."""
     at: list[float] = []
     with TemporaryDirectory(dir=project.build) as folder:
-        train(
-            replace(config, updates=PILOT),
-            Path(folder),
-            lambda _: at.append(time.monotonic()),
-            splits=splits,
-        )
+        pilot = replace(config, updates=PILOT)
+        train(pilot, Path(folder), lambda _: at.append(time.monotonic()), splits=splits)
     *updates, validated = at
     per_epoch = max(1, len(splits[0].sweeps) // config.batch)
     return float(np.median(np.diff(updates))) + (validated - updates[-1]) / per_epoch

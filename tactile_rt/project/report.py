@@ -8,7 +8,6 @@ from pathlib import Path
 from string import Template
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import load_model
@@ -20,7 +19,7 @@ from tactile_rt.models.evaluation.records import Record
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.project.folder import Project
 
-__all__ = ["confused", "draw_over_time", "write_report"]
+__all__ = ["confused", "write_report"]
 
 HEADLINES = {
     "top-1": "right on objects it never met, no sensor noise",
@@ -35,18 +34,14 @@ CONFUSED = 0.05  # share of a kind's sweeps that are taken for another: more is 
 
 
 def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> Path:
-    """Write ``report/report.html`` and the pictures on it."""
+    """Write ``report/report.html`` beside the pictures of `evaluate_model`, and its confusions."""
     session, card = load_model(project.model)
     test = SweepSet.read(sweeps, "test")
     run = stepped(session, card)
     labels, objects = test.sweeps.labels, test.sweeps.objects
-    curves = {
-        "no sensor noise": measures.predict(test, run),
-        "rated noise": measures.predict(test, run, 1.0),
-    }
     step_ms = card.period_ns * card.substeps * 1e-6
-    draw_over_time(curves, labels, objects, step_ms, project.report / "over_time.png")
-    table = measures.confusion(curves["rated noise"][:, -1], labels, len(card.classes))
+    noisy = measures.predict(test, run, 1.0)
+    table = measures.confusion(noisy[:, -1], labels, len(card.classes))
     draw_confusion(table, card.classes, project.report / "confusion.png")
     found = {r.name.removeprefix("models."): r for r in records}
     robust = [r for name, r in found.items() if name.startswith("top-1, ")]
@@ -64,7 +59,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
         headlines=_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
         robust=_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
         confused=_confusions(confused(table, card.classes)),
-        over_time=_picture(project.report / "over_time.png"),
+        over_time=_picture(project.report / "accuracy_over_time.png"),
         confusion=_picture(project.report / "confusion.png"),
     )
     path = project.report / "report.html"
@@ -87,44 +82,6 @@ def confused(
         if i != j
     ]
     return sorted(pairs, key=lambda pair: -pair[2])
-
-
-def draw_over_time(
-    curves: dict[str, NDArray[np.float32]],
-    labels: NDArray[np.int64],
-    objects: NDArray[np.str_],
-    step_ms: float,
-    path: Path,
-) -> None:
-    """Draw top-1 against the time since the first touch, with 95 % intervals by object.
-
-    Args:
-        curves: (sweep, step, class) posteriors by name.
-        labels: (sweep,).
-        objects: (sweep,) names.
-        step_ms: the time that a step takes, ms.
-    """
-    figure = Figure(figsize=(7.2, 3.8), layout="constrained")
-    axes = figure.subplots()
-    for name, posteriors in curves.items():
-        steps = posteriors.shape[1]
-        found = [
-            measures.accuracy(measures.hits(posteriors[:, k], labels), objects)
-            for k in range(steps)
-        ]
-        at = step_ms * np.arange(1, steps + 1)
-        (line,) = axes.plot(at, [100 * f.value for f in found], marker="o", ms=3, label=name)
-        low, high = [100 * f.low for f in found], [100 * f.high for f in found]
-        axes.fill_between(at, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
-    chance = 100 / next(iter(curves.values())).shape[2]
-    axes.axhline(chance, color="0.4", linestyle=":", label="chance")
-    axes.set_xlabel("time since the first touch (ms)")
-    axes.set_ylabel("right on unseen objects (%)")
-    axes.set_ylim(0, 101)
-    axes.set_xlim(0, None)
-    axes.grid(alpha=0.3)
-    axes.legend(loc="lower right")
-    figure.savefig(path, dpi=110)
 
 
 def _rows(records: Sequence[tuple[Record, str]]) -> str:

@@ -73,15 +73,13 @@ class IncrementalClasses:
         ranked = np.sort(logits, axis=1)
         others = np.exp(ranked[:, :-1] - ranked[:, -1:]).sum(axis=1, keepdims=True)
         odds = np.clip(-np.log(others + 1e-9), -MOST, MOST)
-        scored: Floats = (near - NEARER * new - SURE * self.usual * odds) / (SOFT * self.usual)
-        return scored
+        return np.asarray((near - NEARER * new - SURE * self.usual * odds) / (SOFT * self.usual))
 
 
 def join_features(embeddings: NDArray[np.float32], logits: NDArray[np.float32]) -> Floats:
     """(step, unit and label): the mean of the embeddings so far, and the logits."""
     mean = np.cumsum(embeddings, axis=0) / np.arange(1, len(embeddings) + 1)[:, None]
-    together: Floats = np.concatenate([mean, logits], axis=1, dtype=float)
-    return together
+    return np.concatenate([mean, logits], axis=1, dtype=float)
 
 
 def fit_new_classes(card: ModelCard, features: Floats, labels: Sequence[str]) -> IncrementalClasses:
@@ -135,10 +133,7 @@ def check_new_classes(card: ModelCard, labels: Sequence[str]) -> None:
 def leave_one_out_new_classes(
     card: ModelCard, features: Floats, labels: Sequence[str]
 ) -> LeaveOneOut:
-    """Judge every touch by the others alone: is it named, among all classes?
-
-    Args, Raises: as `fit_new_classes`. A class of two touches is fitted with itself.
-    """
+    """Judge every touch by the others; one of a class of two by itself, too."""
     names = tuple(np.unique(np.asarray(labels)))
     own = np.searchsorted(names, labels)
     away = np.empty((len(own), 1, len(names)))
@@ -147,11 +142,8 @@ def leave_one_out_new_classes(
         others = np.arange(len(own)) != k
         if (own[others] == own[k]).sum() < FEWEST:
             others[k] = True
-        found = fit_new_classes(
-            card,
-            features[others],
-            [name for name, used in zip(labels, others, strict=True) if used],
-        )
+        names_of = [labels[i] for i in np.flatnonzero(others).tolist()]
+        found = fit_new_classes(card, features[others], names_of)
         scores = found.scores(features[k : k + 1])[0]
         order = [found.labels.index(name) for name in names]
         away[k, 0] = -scores[order]

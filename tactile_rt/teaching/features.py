@@ -75,8 +75,7 @@ class FeatureNetwork:
         places = places - (places.max(axis=0) + places.min(axis=0)) / 2
         extent = np.abs(places).max()
         lies = np.ptp(places, axis=0) > 0.05 * extent
-        axes: Floats = (places[:, lies] / max(extent, 1e-12)).astype(np.float32)
-        return axes
+        return np.asarray((places[:, lies] / max(extent, 1e-12)).astype(np.float32))
 
     @classmethod
     def _signals(cls, spec: ArraySpec, unit: str) -> int:

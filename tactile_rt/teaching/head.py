@@ -63,8 +63,7 @@ class TouchClasses:
         found = np.clip((features - self.mean) / self.scale, -LIMIT, LIMIT)
         away = found[:, :, None] - self.centres
         along = np.einsum("tscf,sfa->tsca", away, self.axes)
-        squared: Floats = np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1)
-        return squared
+        return np.asarray(np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1))
 
 
 @dataclass(frozen=True)
@@ -90,9 +89,6 @@ def fit_classes(
         labels: (touch,) the class of each.
         kinds: which features are of one kind, and so of one scale.
         told: what `leave_one_out` said of these touches; None: it is asked.
-
-    Raises:
-        ConfigError: a class with fewer than two touches.
     """
     check_enough(labels)
     told = told or leave_one_out(features, labels, kinds)
@@ -116,9 +112,6 @@ def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice
         features: (touch, step, feature) of all touches.
         labels: (touch,) the class of each; at least two touches of each class.
         kinds: as `fit_classes` takes them.
-
-    Raises:
-        ConfigError: a class with fewer than two touches.
     """
     check_enough(labels)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)

@@ -98,9 +98,6 @@ class Lesson:
         Args:
             folder: where to; made if it is not there.
             floor: (channel,) the smallest noise that the contact detector is to assume.
-
-        Raises:
-            ConfigError: there is a lesson already.
         """
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -129,21 +126,14 @@ class Lesson:
 
     @classmethod
     def read(cls, folder: Path) -> "Lesson":
-        """A lesson that was begun before, with all its touches.
-
-        Raises:
-            ConfigError, ModelError, RecordingError: a file of it is not there, or is wrong.
-        """
+        """A lesson that was begun before, with all its touches."""
         path = folder / FEATURES
         if not path.exists():
             raise ConfigError(f"{folder} holds no lesson: there is no {FEATURES}")
         card = load_model(path)[1]
-        lesson = cls(
-            folder,
-            FewShot(card.array, np.array(card.floor, dtype=np.float32))
-            if card.labels == (TOUCH,)
-            else ClassIncremental(path),
-        )
+        few = card.labels == (TOUCH,)
+        floor = np.array(card.floor, dtype=np.float32)
+        lesson = cls(folder, FewShot(card.array, floor) if few else ClassIncremental(path))
         if (folder / LABELS).exists():
             lesson._read_touches()
         return lesson
@@ -162,9 +152,8 @@ class Lesson:
                 continue
             felt = self._felt(path)
             for interval in intervals:
-                inside = [
-                    features for at_s, features in felt if interval.start_s <= at_s < interval.end_s
-                ]
+                begin, end = interval.start_s, interval.end_s
+                inside = [features for at_s, features in felt if begin <= at_s < end]
                 if not inside:
                     self.lost += 1
                     continue
@@ -182,11 +171,7 @@ class Lesson:
         return found
 
     def listener(self, spec: ArraySpec) -> Listener:
-        """That finds touches in a stream of an array.
-
-        Raises:
-            SpecMismatch: it is another array than the lesson's.
-        """
+        """That finds touches in a stream of an array."""
         return Listener(self.folder / FEATURES, spec, self.taught.felt)
 
     def next_recording(self) -> Path:
@@ -215,11 +200,7 @@ class Lesson:
         return self.touches.pop()
 
     def check(self, label: str) -> str:
-        """The label itself.
-
-        Raises:
-            ConfigError: no class of this lesson can be named so.
-        """
+        """The label itself."""
         if isinstance(self.taught, ClassIncremental):
             check_new_classes(self.taught.card, (label,))
         return check_label(label)
@@ -243,10 +224,9 @@ class Lesson:
 
         Of one class alone no touch can be wrong, and none is counted as right.
         """
-        used = [k for k, t in enumerate(self.touches) if t.label in self.taught_enough]
+        used, names = self._select_touches()
         if not used:
             return LessonProgress((), (), ())
-        names = [self.touches[k].label for k in used]
         found = self.taught.leave_one_out(self._features(used), names)
         progress = _progress(used, names, found)
         if isinstance(self.taught, FewShot) and len(set(names)) < 2:
@@ -254,17 +234,11 @@ class Lesson:
         return progress
 
     def learn(self) -> ModelCard:
-        """Write the model of all classes with enough touches.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        used = [k for k, t in enumerate(self.touches) if t.label in self.taught_enough]
+        """Write the model of all classes with enough touches."""
+        used, names = self._select_touches()
         if not used:
-            raise ConfigError(
-                f"{self.folder}: nothing to learn from: no class has {FEWEST} touches yet"
-            )
-        names = [self.touches[k].label for k in used]
+            why = f"nothing to learn from: no class has {FEWEST} touches yet"
+            raise ConfigError(f"{self.folder}: {why}")
         told = {
             "taught": {name: names.count(name) for name in dict.fromkeys(names)},
             "labels_sha256": hash_of(self.folder / LABELS),
@@ -272,6 +246,12 @@ class Lesson:
         return self.taught.learn(
             self.folder / MODEL, self._features(used), names, self.folder.resolve().name, told
         )
+
+    def _select_touches(self) -> tuple[list[int], list[str]]:
+        """Return the numbers and labels of the touches of classes with enough of them."""
+        enough = self.taught_enough
+        used = [k for k, touch in enumerate(self.touches) if touch.label in enough]
+        return used, [self.touches[k].label for k in used]
 
     def _features(self, used: Sequence[int]) -> Floats:
         return np.stack([self.touches[k].features for k in used]).astype(float)
@@ -310,11 +290,8 @@ def _progress(used: Sequence[int], names: Sequence[str], found: LeaveOneOut) -> 
         others = mine[(own == own[k]) & (np.arange(len(own)) != k)]
         if mine[k] > ODD * np.median(others) and len(others) > FEWEST:
             odd.append((used[k] + 1, str(classes[nearest[k]])))
-    wrong = [
-        (str(classes[own[k]]), str(classes[nearest[k]]))
-        for k in range(len(own))
-        if nearest[k] != own[k]
-    ]
+    both = zip(classes[own].tolist(), classes[nearest].tolist(), strict=True)
+    wrong = [pair for pair in both if pair[0] != pair[1]]
     pairs = sorted(dict.fromkeys(wrong), key=lambda pair: -wrong.count(pair))
     told = tuple(
         (name, names.count(name), int(found.right[own == np.searchsorted(classes, name)].sum()))
@@ -331,11 +308,7 @@ def _check_free(folder: Path) -> None:
 
 
 def check_label(name: str) -> str:
-    """The label itself.
-
-    Raises:
-        ConfigError: it cannot be one.
-    """
+    """The label itself."""
     if why := check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
     if name in ORDERS:

@@ -124,9 +124,6 @@ def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
 
     A share of the noise of the median element; of a channel that never changes, the smallest
     difference between its readings, or a millionth of the largest.
-
-    Raises:
-        RecordingError: there is nothing, or nothing valid.
     """
     values = np.concatenate([c.values for c in chunks]) if chunks else np.empty((0, 0, 0))
     valid = np.concatenate([c.valid for c in chunks]) if chunks else np.empty((0, 0))
@@ -141,5 +138,4 @@ def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
         steps = np.diff(levels)
         step = float(steps.min()) if len(steps) else max(1e-6 * float(abs(levels).max()), 1e-9)
         floor[channel] = max(floor[channel], step / np.sqrt(12))
-    found: NDArray[np.float32] = floor.astype(np.float32)
-    return found
+    return floor.astype(np.float32)

@@ -133,7 +133,8 @@ def write_features(path: Path, taught: FewShot) -> ModelCard:
     """Write the model of one class, of which the embedding are the features of a touch."""
     graph, network = OnnxGraph(), taught.network
     features, after = network.build(graph)
-    graph.output("logits", graph("Slice", features, *_first(graph, 1)), ["batch", 1])
+    first = graph("Slice", features, graph.integers(0), graph.integers(1), graph.integers(1))
+    graph.output("logits", first, ["batch", 1])
     return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
 
 
@@ -177,17 +178,8 @@ def _head(g: OnnxGraph, features: str, count: str, timing: Timing, classes: Touc
     return g("Mul", distances, g.constant(-0.5))
 
 
-def _first(g: OnnxGraph, size: int) -> tuple[str, str, str]:
-    return g.integers(0), g.integers(size), g.integers(1)
-
-
 def _write(
-    path: Path,
-    taught: FewShot,
-    graph: OnnxGraph,
-    features: str,
-    after: dict[str, str],
-    told: dict[str, Any],
+    path: Path, taught: FewShot, graph: OnnxGraph, features: str, after: dict[str, str], told: Any
 ) -> ModelCard:
     network, timing = taught.network, taught.timing
     graph.output("embedding", features, ["batch", network.size])

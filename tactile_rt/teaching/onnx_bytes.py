@@ -66,7 +66,6 @@ def _attribute(name: str, value: int | float | str | Sequence[int]) -> bytes:
 
 
 def _name(value: memoryview) -> str:
-    """Of an input or output."""
     return next(str(text, "utf-8") for number, text, _ in split_fields(value) if number == 1)
 
 
@@ -140,32 +139,15 @@ class OnnxGraph:
         """The file."""
         graph = b"".join(self.parts) + _bytes(2, name)
         pairs = (_bytes(14, _bytes(1, key) + _bytes(2, text)) for key, text in metadata.items())
-        return b"".join(
-            (
-                _number(1, IR_VERSION),
-                _bytes(2, PRODUCER),
-                _bytes(7, graph),
-                *self.opsets,
-                *pairs,
-            )
-        )
+        head = (_number(1, IR_VERSION), _bytes(2, PRODUCER), _bytes(7, graph))
+        return b"".join((*head, *self.opsets, *pairs))
 
     def _node(
-        self,
-        operator: str,
-        inputs: Sequence[str],
-        outputs: Sequence[str],
-        attributes: Mapping[str, Any],
+        self, operator: str, inputs: Sequence[str], outputs: Sequence[str], attributes: Any
     ) -> None:
-        node = b"".join(
-            (
-                *(_bytes(1, name) for name in inputs),
-                *(_bytes(2, name) for name in outputs),
-                _bytes(4, operator),
-                *(_bytes(5, _attribute(*pair)) for pair in attributes.items()),
-            )
-        )
-        self.parts.append(_bytes(1, node))
+        values = [_bytes(1, name) for name in inputs] + [_bytes(2, name) for name in outputs]
+        more = (_bytes(5, _attribute(*pair)) for pair in attributes.items())
+        self.parts.append(_bytes(1, b"".join((*values, _bytes(4, operator), *more))))
 
     def _new(self, what: str) -> str:
         self._names += 1

@@ -83,17 +83,8 @@ class Teacher:
         span_s: tuple[float, float],
     ) -> str:
         """Take a touch that was begun under a label; what to say of it."""
-        return self.note(self._take(label, features, recording, span_s))
-
-    def _take(
-        self,
-        label: str,
-        features: NDArray[np.float32],
-        recording: str,
-        span_s: tuple[float, float],
-    ) -> str:
         if not label:
-            return "touched, but what? say so first: nothing was learnt"
+            return self.note("touched, but what? say so first: nothing was learnt")
         self.lesson.add(label, features, recording, span_s)
         said = [f"{len(self.lesson.touches):3d}  {label} {self.lesson.count(label)}"]
         before = set(self.progress.odd)
@@ -110,7 +101,7 @@ class Teacher:
             self._go_on()
         if self.done or changed:
             said.append(self.prompt())
-        return "\n".join([", ".join(filter(None, said[:2])), *said[2:]])
+        return self.note("\n".join([", ".join(filter(None, said[:2])), *said[2:]]))
 
     def prompt(self) -> str:
         """What to do now."""
@@ -195,5 +186,4 @@ class Teacher:
             self.done = self._planned
 
     def _short(self) -> list[str]:
-        """The wanted classes of which there are too few touches."""
         return [name for name in self.wanted if self.lesson.count(name) < self.each]

@@ -230,7 +230,7 @@ def test_a_scale_fits_the_forces_but_not_a_rare_snap():
 
 def arrow_in(force_map, element):
     """(2,) where the arrow of an element points, rightward and upward, as drawn."""
-    tail, tip = np.array(force_map._arrows[element]._posA_posB)
+    tail, tip = np.array(force_map._cells[element][1]._posA_posB)
     return (tip - tail) / np.linalg.norm(tip - tail) * (1, -1)  # rows are counted downward
 
 

@@ -92,8 +92,7 @@ def score_known(path: Path, test: SweepSet) -> NDArray[np.float32]:
         sure = 1 - last[:, card.labels.index(UNKNOWN)]
     else:
         sure = last[:, : len(card.classes)].max(axis=1)
-    found: NDArray[np.float32] = np.nan_to_num(sure, nan=0.0)
-    return found
+    return np.nan_to_num(sure, nan=0.0)
 
 
 def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:

@@ -28,7 +28,6 @@ __all__ = [
     "Interval",
     "Step",
     "accuracy",
-    "accuracy_over_time",
     "among",
     "at_temperature",
     "auroc",
@@ -39,10 +38,12 @@ __all__ = [
     "expected_calibration_error",
     "fused_accuracy",
     "hits",
+    "open_set",
     "posteriors",
     "predict",
     "run_on",
     "run_over",
+    "softmax",
 ]
 
 # samples (batch, step, sub-step, element, channel), offset and sigma (batch, element, channel), SI
@@ -110,8 +111,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
     """
     logits, found = run_over(cut, run)
     with np.errstate(invalid="ignore"):
-        raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
-        posterior: NDArray[np.float32] = raised / raised.sum(axis=-1, keepdims=True)
+        posterior = softmax(logits)
     posterior[~found] = np.nan
     return posterior
 
@@ -144,16 +144,19 @@ def at_temperature(posteriors: NDArray[np.float32], temperature: float) -> NDArr
     """(..., class) posteriors as they would be with their logits divided by a temperature."""
     with np.errstate(divide="ignore"):
         logits = np.log(posteriors) / np.float32(temperature)
-    scaled = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    out: NDArray[np.float32] = scaled / scaled.sum(axis=-1, keepdims=True)
-    return out
+    return softmax(logits)
+
+
+def softmax(logits: NDArray[Any]) -> NDArray[np.float32]:
+    """Turn (..., class) logits into posteriors."""
+    raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return np.asarray(raised / raised.sum(axis=-1, keepdims=True))
 
 
 def among(posteriors: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
     """(..., class) posteriors of the first so many labels alone, had it to be one of them."""
     own = posteriors[..., :classes]
-    out: NDArray[np.float32] = own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30)
-    return out
+    return np.asarray(own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30))
 
 
 def hits(
@@ -162,8 +165,7 @@ def hits(
     """(sweep,) whether the label is among the `top` most probable of (sweep, class) posteriors."""
     decided = ~np.isnan(posteriors).any(axis=1)
     order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
-    correct: NDArray[np.bool_] = decided & (order == labels[:, None]).any(axis=1)
-    return correct
+    return np.asarray(decided & (order == labels[:, None]).any(axis=1))
 
 
 def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
@@ -183,11 +185,20 @@ def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
     return float((below + ties).mean() / (2 * len(low)))
 
 
-def accuracy_over_time(
-    posteriors: NDArray[np.float32], labels: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """(step,) top-1 accuracy if one decided at that step."""
-    return np.array([hits(posteriors[:, t], labels).mean() for t in range(posteriors.shape[1])])
+def open_set(
+    known: NDArray[np.float32],
+    objects: NDArray[np.str_],
+    unknown: NDArray[np.float32],
+    others: NDArray[np.str_],
+) -> Interval:
+    """Measure the AUROC, open set, of scores (sweep,) of known things against unknown ones."""
+    scores = np.concatenate([known, unknown])
+
+    def area(at: NDArray[np.int64]) -> float:
+        mine = at < len(known)
+        return auroc(scores[at[mine]], scores[at[~mine]])
+
+    return bootstrap(area, np.concatenate([objects, others]))
 
 
 def deciding_step(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -306,7 +317,6 @@ def run_on(model: TactileClassifier) -> Step:
         device = model.inputs.clip.device
         with torch.inference_mode():
             logits = model(*(torch.from_numpy(a).to(device) for a in (samples, offset, sigma)))
-        out: NDArray[np.float32] = logits.float().cpu().numpy()
-        return out
+        return np.asarray(logits.float().cpu().numpy())
 
     return run

@@ -19,12 +19,8 @@ from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults, score_known
-from tactile_rt.models.evaluation.records import Record
-from tactile_rt.models.evaluation.robustness import (
-    measure_robustness,
-    rated_amount,
-    robustness_records,
-)
+from tactile_rt.models.evaluation.records import Record, record_share
+from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.sets.manifest import WITHHELD
 
@@ -70,18 +66,22 @@ def evaluate_model(
     sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
 
     clean = measures.predict(test, run)
-    over_time = measures.accuracy_over_time(clean, labels)
     # of objects of the kind that it was trained on
     bars = {} if _from_elsewhere(test, card) else BARS.get(len(card.classes), {})
+
+    def top(name: str, posteriors: NDArray[np.float32], how: str = sample, top: int = 1) -> Record:
+        right = measures.hits(posteriors, labels, top)
+        return record_share(name, measures.accuracy(right, objects), bars.get(name, ""), how)
+
     records = [
-        _accuracy("top-1", clean[:, -1], labels, objects, bars.get("top-1", ""), sample),
-        _accuracy("top-5", clean[:, -1], labels, objects, bars.get("top-5", ""), sample, top=5),
-        _accuracy("top-1 at step 14 of 22", clean[:, 13], labels, objects, "", sample),
+        top("top-1", clean[:, -1]),
+        top("top-5", clean[:, -1], top=5),
+        top("top-1 at step 14 of 22", clean[:, 13]),
     ]
     for sweeps, count, bar in ((2, "two", bars.get("fused", "")), (4, "four", "")):
         if np.unique(objects, return_counts=True)[1].max() >= sweeps:  # enough of one object
             fused = measures.fused_accuracy(clean[:, -1], labels, objects, sweeps)
-            records.append(_record(f"{count} sweeps fused", fused, bar, sample))
+            records.append(record_share(f"{count} sweeps fused", fused, bar, sample))
     settled = measures.deciding_step(clean, labels)
     step_ms = card.period_ns * card.substeps * 1e-6
     if settled.any():
@@ -94,22 +94,17 @@ def evaluate_model(
     recorded = test.manifest.recorded
     added = f"white noise {rated} added to every {period_ms:g} ms sample"
     how = f"{sample}; {'none added to that of the recordings' if recorded else added}, "
-    how += "undetected sweeps count as "
-    records.append(
-        _accuracy("top-1 at rated noise", noisy[:, -1], labels, objects, "", how + "wrong")
-    )
+    how += "undetected sweeps count as wrong"
+    records.append(top("top-1 at rated noise", noisy[:, -1], how))
     lost, bar = records[0].value - records[-1].value, bars.get("noise", "")
-    name = "models.points lost at rated noise"
-    records.append(Record(name, lost, "points", bar, how=how + "wrong"))
+    records.append(Record("models.points lost at rated noise", lost, "points", bar, how=how))
     if test.manifest.sensor is None and not recorded:
         # The same noise on samples of 1 kHz: the resampler's Hann kernel leaves 0.29.
         raw = measures.predict(test, run, float(np.sqrt(1.5 / 18)))
         how = f"{sample}; white noise {rated} on every 1 kHz sample, through the resampler"
-        name = "top-1 at rated noise of 1 kHz samples"
-        records.append(_accuracy(name, raw[:, -1], labels, objects, "", how))
+        records.append(top("top-1 at rated noise of 1 kHz samples", raw[:, -1], how))
     few = _first_of_each(test, ROBUSTNESS_SWEEPS)
-    robustness = measure_robustness(few, run, clean[_firsts(objects, ROBUSTNESS_SWEEPS), -1])
-    records += robustness_records(robustness, f"{len(few.sweeps)} of the sweeps")
+    records += measure_robustness(few, run, clean[_firsts(objects, ROBUSTNESS_SWEEPS), -1])
     records += _calibration(clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample)
     undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
     records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
@@ -124,15 +119,15 @@ def evaluate_model(
         right = measures.hits(clean[:, -1], labels)
         records += _compare_svm(data, card, test, right)
     if pictures is not None:
-        from tactile_rt.models.evaluation.pictures import draw_accuracy_over_time, draw_confusion
+        from tactile_rt.models.evaluation.pictures import draw_confusion, draw_over_time
 
         table = measures.confusion(clean[:, -1], labels, len(card.classes))
         draw_confusion(table, card.classes, pictures / "confusion.png")
         curves = {
-            "as recorded" if recorded else "no sensor noise": over_time,
-            f"rated noise ({rated} per sample)": measures.accuracy_over_time(noisy, labels),
+            "as recorded" if recorded else "no sensor noise": clean,
+            f"rated noise ({rated} per sample)": noisy,
         }
-        draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
+        draw_over_time(curves, labels, objects, step_ms, pictures / "accuracy_over_time.png")
     return records
 
 
@@ -180,27 +175,6 @@ def _from_elsewhere(test: SweepSet, card: ModelCard) -> bool:
     return source is not None and test.manifest.recipe.get("objects", {}).get("from") != source
 
 
-def _accuracy(
-    name: str,
-    posteriors: NDArray[np.float32],
-    labels: NDArray[np.int64],
-    objects: NDArray[np.str_],
-    bar: str,
-    how: str,
-    top: int = 1,
-) -> Record:
-    correct = measures.hits(posteriors, labels, top)
-    return _record(name, measures.accuracy(correct, objects), bar, how)
-
-
-def _record(
-    name: str, estimate: measures.Interval, bar: str, how: str, unit: str = "%", beside: str = ""
-) -> Record:
-    """Give a share as a figure in percent, with its interval."""
-    interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
-    return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
-
-
 def _calibration(
     clean: NDArray[np.float32],
     noisy: NDArray[np.float32],
@@ -209,16 +183,12 @@ def _calibration(
     temperature: float,
     sample: str,
 ) -> list[Record]:
-    """ECE as shipped, of the logits as they were trained, and at rated noise."""
+    at = f"at temperature {temperature:.3g}"
+    raw = measures.at_temperature(clean, 1 / temperature)
     cases = (
-        ("calibration error", clean, ECE_BAR, f"at temperature {temperature:.3g}"),
-        (
-            "calibration error without temperature scaling",
-            measures.at_temperature(clean, 1 / temperature),
-            "",
-            "logits as they were trained",
-        ),
-        ("calibration error at rated noise", noisy, "", f"at temperature {temperature:.3g}"),
+        ("", clean, ECE_BAR, at),
+        (" without temperature scaling", raw, "", "logits as they were trained"),
+        (" at rated noise", noisy, "", at),
     )
     records = []
     for name, posteriors, bar, how in cases:
@@ -227,14 +197,15 @@ def _calibration(
             return measures.expected_calibration_error(p[at], labels[at])
 
         estimate = measures.bootstrap(ece, objects)
-        records.append(_record(name, estimate, bar, f"15 bins, {how}; {sample}"))
+        records.append(
+            record_share(f"calibration error{name}", estimate, bar, f"15 bins, {how}; {sample}")
+        )
     return records
 
 
 def _measure_coverage(
     model: Path, test: SweepSet, unknown: SweepSet | None, sample: str
 ) -> list[Record]:
-    """Measure coverage and refusals; nothing of a model without them."""
     records, refusals = [], set(load_model(model)[1].refusals)
     for noise, when in ((0.0, ""), (1.0, " at rated noise")):
         found = measure_coverage(model, test, Disturbance(noise=noise))
@@ -243,41 +214,36 @@ def _measure_coverage(
         if found.nominal == found.nominal:
             how = f"nominal: {100 * found.nominal:g} %; {sample}"
             name = f"coverage of the prediction sets{when}"
-            records.append(_record(name, found.covered, "", how))
+            records.append(record_share(name, found.covered, "", how))
             size = found.size
             interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
             name = f"models.prediction set at the last step{when}"
             records.append(Record(name, size.value, "", "", interval, sample))
         if UNKNOWN in refusals:
-            records.append(_record(f"known things called unknown{when}", found.unknown, "", sample))
+            records.append(
+                record_share(f"known things called unknown{when}", found.unknown, "", sample)
+            )
         if refusals - {UNKNOWN}:
-            records.append(_record(f"sound loads called faulty{when}", found.faulty, "", sample))
+            records.append(
+                record_share(f"sound loads called faulty{when}", found.faulty, "", sample)
+            )
     if unknown is not None and (found := measure_coverage(model, unknown)):
         how = f"{len(unknown.sweeps)} sweeps of withheld kinds"
-        records.append(_record("unknown things called unknown", found.unknown, "", how))
+        records.append(record_share("unknown things called unknown", found.unknown, "", how))
     for name, share in named_faults(model, test):
-        records.append(_record(f"{name}, named as a fault", share, "", sample))
+        records.append(record_share(f"{name}, named as a fault", share, "", sample))
     return records
 
 
 def _measure_open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
-    """Measure, open set, how well a model tells categories that training never saw."""
     there, here = score_known(model, unknown), score_known(model, known)
-    scores = np.concatenate([here, there])
-
-    def area(at: NDArray[np.int64]) -> float:
-        mine = at < len(here)
-        return measures.auroc(scores[at[mine]], scores[at[~mine]])
-
-    names = np.concatenate([known.sweeps.objects, unknown.sweeps.objects])
-    estimate = measures.bootstrap(area, names)
+    estimate = measures.open_set(here, known.sweeps.objects, there, unknown.sweeps.objects)
     how = f"{len(here)} sweeps of known and {len(there)} of withheld kinds"
     name = "open set, known against withheld categories"
-    return _record(name, estimate, "", how, "% AUROC", "; 50: chance")
+    return record_share(name, estimate, "", how, "% AUROC", "; 50: chance")
 
 
 def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
-    """Indices of the first sweeps of every object."""
     mine = [np.flatnonzero(objects == name)[:sweeps] for name in dict.fromkeys(objects.tolist())]
     return np.concatenate(mine)
 
@@ -302,6 +268,6 @@ def _compare_svm(
     above = measures.accuracy(network.astype(np.float64) - right, objects)
     same = "; the same test sweeps"
     return [
-        _record("RBF SVM top-1", own, "", svm.how, beside=same),
-        _record("points above the SVM", above, ">= 3", svm.how, "points", same),
+        record_share("RBF SVM top-1", own, "", svm.how, beside=same),
+        record_share("points above the SVM", above, ">= 3", svm.how, "points", same),
     ]

@@ -6,7 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-__all__ = ["draw_accuracy_over_time", "draw_confusion"]
+from tactile_rt.models.evaluation import measures
+
+__all__ = ["draw_confusion", "draw_over_time"]
 
 
 def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path) -> None:
@@ -39,17 +41,39 @@ def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path
     figure.savefig(path, dpi=110)
 
 
-def draw_accuracy_over_time(
-    curves: dict[str, NDArray[np.float64]], step_s: float, path: Path
+def draw_over_time(
+    curves: dict[str, NDArray[np.float32]],
+    labels: NDArray[np.int64],
+    objects: NDArray[np.str_],
+    step_ms: float,
+    path: Path,
 ) -> None:
-    """Draw top-1 accuracy (step,) of each curve against the time since contact onset."""
-    figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+    """Draw top-1 against the time since the first touch, with 95 % intervals by object.
+
+    Args:
+        curves: (sweep, step, class) posteriors by name.
+        labels: (sweep,).
+        objects: (sweep,) names.
+        step_ms: the time that a step takes, ms.
+    """
+    figure = Figure(figsize=(7.2, 3.8), layout="constrained")
     axes = figure.subplots()
-    for name, curve in curves.items():
-        axes.plot(1e3 * step_s * np.arange(1, len(curve) + 1), 100 * curve, marker="o", label=name)
-    axes.set_xlabel("time since contact onset (ms)")
-    axes.set_ylabel("top-1 accuracy on unseen objects (%)")
-    axes.set_ylim(0, 100)
+    for name, posteriors in curves.items():
+        steps = posteriors.shape[1]
+        found = [
+            measures.accuracy(measures.hits(posteriors[:, k], labels), objects)
+            for k in range(steps)
+        ]
+        at = step_ms * np.arange(1, steps + 1)
+        (line,) = axes.plot(at, [100 * f.value for f in found], marker="o", ms=3, label=name)
+        low, high = [100 * f.low for f in found], [100 * f.high for f in found]
+        axes.fill_between(at, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    chance = 100 / next(iter(curves.values())).shape[2]
+    axes.axhline(chance, color="0.4", linestyle=":", label="chance")
+    axes.set_xlabel("time since the first touch (ms)")
+    axes.set_ylabel("right on unseen objects (%)")
+    axes.set_ylim(0, 101)
+    axes.set_xlim(0, None)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
     figure.savefig(path, dpi=110)

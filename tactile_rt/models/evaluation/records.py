@@ -4,13 +4,16 @@ import json
 import operator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["Record", "as_dicts", "as_table", "show", "write"]
+if TYPE_CHECKING:
+    from tactile_rt.models.evaluation.measures import Interval
+
+__all__ = ["Record", "as_dicts", "as_table", "record_share", "show", "write"]
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
@@ -39,6 +42,14 @@ class Record:
             return None
         sign, _, limit = self.bar.partition(" ")
         return bool(COMPARISONS[sign](self.value, float(limit)))
+
+
+def record_share(
+    name: str, estimate: "Interval", bar: str, how: str, unit: str = "%", beside: str = ""
+) -> Record:
+    """Give a share as a figure of a model in percent, with its interval."""
+    interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
+    return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
 
 
 def as_table(records: list[Record]) -> Table:

@@ -1,17 +1,14 @@
 """A model with a sensor that is not what it was trained on: noisy, drifting, wrong, half dead."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.records import Record
+from tactile_rt.models.evaluation.records import Record, record_share
 
-__all__ = ["Robustness", "conditions", "measure_robustness", "rated_amount", "robustness_records"]
-
+__all__ = ["conditions", "measure_robustness", "rated_amount"]
 
 REST = 80  # samples: 0.7 s of a mouse's, which a baseline can be taken from
 
@@ -51,46 +48,22 @@ def conditions(data: SweepSet) -> dict[str, Disturbance]:
     return found
 
 
-@dataclass(frozen=True)
-class Robustness:
-    """Accuracy under one condition, and the points that it costs on the same sweeps."""
-
-    name: str
-    accuracy: measures.Interval
-    lost: measures.Interval
-
-
 def measure_robustness(
     test: SweepSet, run: measures.Step, clean: NDArray[np.float32]
-) -> list[Robustness]:
-    """Accuracy under every condition, the first without any.
+) -> list[Record]:
+    """Measure accuracy under every condition, and the points lost on the same sweeps.
 
     Args:
         clean: (sweep, class) final posteriors of the same sweeps, undisturbed.
     """
     labels, objects = test.sweeps.labels, test.sweeps.objects
-    base = measures.hits(clean, labels)
-    nothing = measures.Interval(0.0, 0.0, 0.0)
-    found = [Robustness("an ideal sensor", measures.accuracy(base, objects), nothing)]
+    base = measures.hits(clean, labels).astype(np.float64)
+    records = []
     for name, disturbance in conditions(test).items():
         there = measures.predict(test, run, disturbance=disturbance)[:, -1]
         right = measures.hits(there, labels)
-        lost = measures.accuracy(base.astype(np.float64) - right, objects)
-        found.append(Robustness(name, measures.accuracy(right, objects), lost))
-    return found
-
-
-def robustness_records(found: list[Robustness], how: str) -> list[Record]:
-    """One figure per condition."""
-    return [
-        Record(
-            f"models.top-1, {r.name}",
-            100 * r.accuracy.value,
-            "%",
-            "",
-            f"95 % interval {100 * r.accuracy.low:.1f} to {100 * r.accuracy.high:.1f}, by object",
-            f"{100 * r.lost.value:.1f} points lost ({100 * r.lost.low:.1f} to "
-            f"{100 * r.lost.high:.1f}); {how}",
-        )
-        for r in found[1:]
-    ]
+        lost = measures.accuracy(base - right, objects)
+        how = f"{100 * lost.value:.1f} points lost ({100 * lost.low:.1f} to {100 * lost.high:.1f})"
+        how += f"; {len(labels)} of the sweeps"
+        records.append(record_share(f"top-1, {name}", measures.accuracy(right, objects), "", how))
+    return records

@@ -41,8 +41,7 @@ class FittedSVM:
 
     def __call__(self, features: NDArray[np.float32]) -> NDArray[Any]:
         """Decide labels."""
-        found: NDArray[Any] = self.machine.predict(self.kernel(features))
-        return found
+        return np.asarray(self.machine.predict(self.kernel(features)))
 
     def margins(self, features: NDArray[np.float32], classes: int) -> NDArray[np.float64]:
         """Distances from the decision for each of `classes` numbers, against all others.
@@ -60,8 +59,7 @@ class FittedSVM:
     def hits(self, data: "SweepSet") -> NDArray[np.bool_]:
         """(sweep,) whether each is right; one without an onset is not."""
         x, usable = window_features(data)
-        right: NDArray[np.bool_] = (self(x) == data.sweeps.labels) & usable
-        return right
+        return np.asarray((self(x) == data.sweeps.labels) & usable)
 
 
 def fit(
@@ -80,23 +78,16 @@ def fit(
 
 
 def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
-    """Fit one machine per penalty and keep the best on the validation sweeps.
-
-    Raises:
-        ConfigError: what there is to learn from is of one category.
-    """
+    """Fit one machine per penalty and keep the best on the validation sweeps."""
     x, usable = window_features(train)
     if len(set(train.sweeps.labels[usable].tolist())) < 2:
         raise ConfigError("a support vector machine needs touches of two categories to learn from")
+    how = (
+        f"same onsets, baseline, clipping and signed log; {train.timing.steps} steps of mean load; "
+    )
+    among = ", ".join(f"{p:g}" for p in PENALTIES)
     tried = [
-        fit(
-            x[usable],
-            train.sweeps.labels[usable],
-            c,
-            "same onsets, baseline, clipping and signed log; "
-            f"{train.timing.steps} steps of mean load; "
-            f"C = {c:g} of {', '.join(f'{p:g}' for p in PENALTIES)} by validation",
-        )
+        fit(x[usable], train.sweeps.labels[usable], c, f"{how}C = {c:g} of {among} by validation")
         for c in PENALTIES
     ]
     return max(tried, key=lambda one: one.hits(validation).mean())
@@ -117,7 +108,6 @@ def window_features(
     ) -> NDArray[np.float32]:
         cut = np.clip(samples - offset[:, None, None], -limits.clip, limits.clip)
         cut = np.sign(cut) * np.log1p(np.abs(cut) / limits.scale)
-        out: NDArray[np.float32] = cut.mean(axis=2).reshape(len(cut), -1)
-        return out
+        return np.asarray(cut.mean(axis=2).reshape(len(cut), -1))
 
     return run_over(cut_windows(data, disturbance=disturbance or CLEAN), run)

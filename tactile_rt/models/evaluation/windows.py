@@ -29,7 +29,6 @@ def stepped(session: ort.InferenceSession, card: ModelCard, refusals: bool = Fal
         samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         found = file_outputs(session, card, samples, offset, sigma)["logits"]
-        out: NDArray[np.float32] = found[..., :kept] / divisor
-        return out
+        return found[..., :kept] / divisor
 
     return run

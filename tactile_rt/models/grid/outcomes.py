@@ -97,8 +97,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
     def right(self, which: str = "top1") -> NDArray[np.bool_]:
         """(sweep,) of `top1`, `top5` or `noisy`."""
-        right: NDArray[np.bool_] = np.array(list(getattr(self, which)), dtype=np.str_) == "1"
-        return right
+        return np.asarray(np.array(list(getattr(self, which)), dtype=np.str_) == "1")
 
 
 def outcome_path(folder: Path, task: Task) -> Path:
@@ -114,11 +113,7 @@ def write_tested(folder: Path, objects: NDArray[np.str_], classes: int) -> None:
 
 
 def read_tested(folder: Path) -> Tested:
-    """What a grid tests on.
-
-    Raises:
-        ConfigError: it was never begun here, or the file is damaged.
-    """
+    """What a grid tests on."""
     path = folder / TESTED
     if not path.exists():
         raise ConfigError(f"no {path}: run the grid first")
@@ -131,11 +126,7 @@ def runs_of(folder: Path, task: Task) -> Path:
 
 
 def read_point(path: Path, key: str) -> Training | None:
-    """What a training of these settings has found, if it is done.
-
-    Raises:
-        ConfigError: it is of other settings, or damaged.
-    """
+    """What a training of these settings has found, if it is done."""
     if not path.exists():
         return None
     found = _decoded(path, Training, f"delete {path.parent}")

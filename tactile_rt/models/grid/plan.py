@@ -36,6 +36,7 @@ __all__ = [
 SHIPPED = resources.files("tactile_rt.models.grid")
 # of a training's configuration, what a grid sets task by task
 OWN = ("data", "also", "begin", "seed", "learning_rate", "warmup", "epochs", "updates")
+OF_CELL = ("encoder", "attender", "objective", "augmentation", "masking")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
 NAMING = ("pairs",)  # options that tell cells apart in their names
 # what of a training's configuration an untrained network and its probe depend on, too
@@ -188,20 +189,12 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     questions: tuple[Question, ...] = msgspec.field(name="question", default=())
 
     def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
-        """How a task is trained on the sweep set at `data`.
-
-        Raises:
-            ConfigError: an option that there is not, or a value that it cannot have.
-        """
+        """How a task is trained on the sweep set at `data`."""
         cell = task.cell
         assert cell is not None
         options: dict[str, Any] = {
             "data": str(data),
-            "encoder": cell.encoder,
-            "attender": cell.attender,
-            "objective": cell.objective,
-            "augmentation": cell.augmentation,
-            "masking": cell.masking,
+            **{name: getattr(cell, name) for name in OF_CELL},
             "width": cell.width or self.width,
             "batch": self.batch,
             "seed": task.seed,
@@ -214,25 +207,19 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def tasks(self) -> list[Task]:
         """Everything to do, a cell after the other: a grid that is not done has whole rows."""
-        tasks = [Task(SVM, 0, None)] if self.svm else []
-        seen: set[tuple[str, int]] = set()
+        tasks = {(SVM, 0): Task(SVM, 0, None)} if self.svm else {}
         for cell in self.cells:
             for seed in range(cell.seeds or self.seeds):
-                tasks.append(Task(cell.name, seed, cell))
                 random = Task(f"{RANDOM} {cell.network}", seed, self.untrained(cell))
-                if (random.name, seed) not in seen:
-                    seen.add((random.name, seed))
-                    tasks.append(random)
-        return tasks
+                for task in (Task(cell.name, seed, cell), random):
+                    tasks.setdefault((task.name, seed), task)
+        return list(tasks.values())
 
     def untrained(self, cell: Candidate) -> Candidate:
         """What a cell's network is before it is trained, and how it is probed."""
         own, usual = self._options(cell), TrainingConfig("")
-        kept = {
-            k: own.get(k, getattr(usual, k))
-            for k in OF_UNTRAINED
-            if k in {**own, **self.supervised}
-        }
+        told = (k for k in OF_UNTRAINED if k in own or k in self.supervised)
+        kept = {k: own.get(k, getattr(usual, k)) for k in told}
         return Candidate(cell.encoder, cell.attender, width=cell.width, options=kept)
 
     def _options(self, cell: Candidate) -> dict[str, Any]:
@@ -268,9 +255,8 @@ def read_grid(name: str | Path) -> Grid:
     elif Path(name).exists():
         nodes = read_toml(Path(name))
     else:
-        raise ConfigError(
-            f"no grid {name}: name a TOML file, or one of {', '.join(shipped_grids())}"
-        )
+        known = ", ".join(shipped_grids())
+        raise ConfigError(f"no grid {name}: name a TOML file, or one of {known}")
     grid: Grid = convert(nodes, Grid)
     try:
         _check(grid)
@@ -287,9 +273,8 @@ def _check(grid: Grid) -> None:
     if not search.learning_rate or not search.warmup:
         raise ConfigError("search needs a learning_rate and a warmup")
     if growth.most < growth.first:
-        raise ConfigError(
-            f"growth goes from {growth.first} updates to {growth.most}, which is less"
-        )
+        span = f"{growth.first} updates to {growth.most}"
+        raise ConfigError(f"growth goes from {span}, which is less")
     if min(grid.sweeps.train, grid.sweeps.validation, grid.sweeps.test) < 0:
         raise ConfigError("sweeps are counted from 0, which takes all")
     convert(make_node(grid.probe, "probe", 0, Path()), ProbeConfig)

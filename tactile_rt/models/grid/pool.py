@@ -20,16 +20,12 @@ from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.grid.outcomes import SUBSET, TESTED, Outcome, waiting_tasks, write_tested
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
 from tactile_rt.models.grid.work import Workbench
-from tactile_rt.sets.manifest import (
-    SET_VERSION,
-    SPLITS,
-    SweepManifest,
-    has_object,
-)
+from tactile_rt.sets.manifest import SET_VERSION, SPLITS, SweepManifest, has_object
 from tactile_rt.sets.objects import read_object, read_skipped, write_object, write_skipped
 
 __all__ = ["prepare", "run_grid", "write_subset"]
 
+Report = Callable[[Outcome, int, int], None]
 _bench: Workbench | None = None  # of a process of the pool
 
 
@@ -37,7 +33,7 @@ def run_grid(
     grid: Grid,
     folder: Path,
     processes: int = 1,
-    report: Callable[[Outcome, int, int], None] = lambda found, done, total: None,
+    report: Report = lambda found, done, total: None,
     accelerator: str = "cpu",
 ) -> None:
     """Do everything that a grid has not done yet.
@@ -53,13 +49,7 @@ def run_grid(
         _run(grid, folder, processes, report, accelerator)
 
 
-def _run(
-    grid: Grid,
-    folder: Path,
-    processes: int,
-    report: Callable[[Outcome, int, int], None],
-    accelerator: str,
-) -> None:
+def _run(grid: Grid, folder: Path, processes: int, report: Report, accelerator: str) -> None:
     tasks = grid.tasks()
     folder.mkdir(parents=True, exist_ok=True)
     waiting = waiting_tasks(grid, folder)
@@ -165,7 +155,6 @@ def _begin() -> None:
 
 
 def _do(grid: Grid, folder: Path, accelerator: str, task: Task) -> Outcome:
-    """Do a task at the workbench of this process."""
     global _bench
     if _bench is None:
         _bench = Workbench(grid, folder, accelerator)

@@ -11,7 +11,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.evaluation.measures import Interval, accuracy
 from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
-from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
+from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid
 
 __all__ = ["Answer", "GridResults", "Row", "gather", "table", "write_results"]
 
@@ -91,40 +91,30 @@ def gather(grid: Grid, folder: Path) -> GridResults:
                 f"{folder}: {outcome.name!r}, seed {outcome.seed}, was tested on "
                 f"{len(outcome.top1)} sweeps, of which there are {len(objects)}: delete its outcome"
             )
-    rows = []
-    if SVM in found:
-        rows.append(_row(SVM, None, found[SVM], [], objects, grid.growth))
-    for cell in grid.cells:
-        if cell.name in found:
-            random = found.get(f"{RANDOM} {cell.network}", [])
-            rows.append(_row(cell.name, cell, found[cell.name], random, objects, grid.growth))
-    answers = []
-    for question in grid.questions:
-        for pair in question.pairs:
-            difference = _difference(found.get(pair.better), found.get(pair.than), objects)
-            if difference is not None:
-                answers.append(Answer(question.text, pair.better, pair.than, difference))
-    return GridResults(
-        tuple(rows),
-        tuple(answers),
-        len(set(objects.tolist())),
-        len(objects),
-        tested.classes,
-    )
+    cells = {SVM: None, **{cell.name: cell for cell in grid.cells}}
+    rows = [_row(grid, n, cell, found, objects) for n, cell in cells.items() if n in found]
+    answers = [
+        Answer(question.text, pair.better, pair.than, difference)
+        for question in grid.questions
+        for pair in question.pairs
+        if (difference := _difference(found.get(pair.better), found.get(pair.than), objects))
+    ]
+    kinds = len(set(objects.tolist()))
+    return GridResults(tuple(rows), tuple(answers), kinds, len(objects), tested.classes)
 
 
 def _row(
+    grid: Grid,
     name: str,
     cell: Candidate | None,
-    outcomes: list[Outcome],
-    random: list[Outcome],
+    found: dict[str, list[Outcome]],
     objects: NDArray[np.str_],
-    until: Growth,
 ) -> Row:
     def estimate(these: list[Outcome], which: str) -> Interval | None:
         right = [one.right(which) for one in these if getattr(one, which)]
         return accuracy(np.stack(right), objects) if right else None
 
+    outcomes, random = found[name], found.get(f"{RANDOM} {cell.network}", []) if cell else []
     first = outcomes[0]
     scores = [point.score for point in first.growth]
     return Row(
@@ -141,7 +131,7 @@ def _row(
         cell.share if cell else 1.0,
         first.chosen,
         first.growth,
-        len(scores) > 1 and scores[-1] < scores[-2] + until.gain,
+        len(scores) > 1 and scores[-1] < scores[-2] + grid.growth.gain,
         "; ".join(sorted({one.failed for one in outcomes if one.failed})),
     )
 

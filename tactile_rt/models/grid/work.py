@@ -52,6 +52,7 @@ from tactile_rt.sets.splits import check_split
 __all__ = ["Workbench"]
 
 BATCH = 128
+Report = Callable[..., None]
 
 
 class Workbench:
@@ -78,14 +79,12 @@ class Workbench:
             build(config.augmentation, manifest.spec)
             config.network(len(manifest.categories), manifest.frame)
             sweeps = self.splits_of(task.cell.share)[0].sweeps
-            pairs = config.pairs == TWO_SWEEPS
-            check_batches(
-                sweeps.objects, sweeps.values.shape[1], config.batch, config.jitter, pairs
-            )
+            pairs, length = config.pairs == TWO_SWEEPS, sweeps.values.shape[1]
+            check_batches(sweeps.objects, length, config.batch, config.jitter, pairs)
         with launched(config, self.accelerator):
             pass
 
-    def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:
+    def do(self, task: Task, report: Report = lambda _: None) -> Outcome:
         """Do a task and keep its outcome; a network that diverges is an outcome too."""
         found = Outcome(task.name, task.seed, settings_of(self.grid, task))
         try:
@@ -102,7 +101,7 @@ class Workbench:
         write_whole(path, lambda file: file.write(msgspec.json.encode(found)))
         return found
 
-    def _trained(self, found: Outcome, task: Task, report: Callable[..., None]) -> Outcome:
+    def _trained(self, found: Outcome, task: Task, report: Report) -> Outcome:
         if task.seed:
             first = read_outcome(self.grid, self.folder, msgspec.structs.replace(task, seed=0))
             if first is None or first.chosen is None:
@@ -124,21 +123,18 @@ class Workbench:
         found = msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds)
         return self._scored(found, best, self.grid.config(task, self.data))
 
-    def _search(self, task: Task, report: Callable[..., None]) -> tuple[Training, ...]:
+    def _search(self, task: Task, report: Report) -> tuple[Training, ...]:
         """The trials: every rate with the first warm-up, then the other warm-ups with the best."""
         search = self.grid.search
 
         def of(rate: float, warmup: float) -> Training:
-            at = Training(rate, warmup, search.updates, score=0.0, seconds=0.0)
-            return self._train(task, at, report)
+            return self._train(task, Training(rate, warmup, search.updates, 0.0, 0.0), report)
 
         rates = [of(rate, search.warmup[0]) for rate in search.learning_rate]
         best = max(rates, key=_score).learning_rate
         return (*rates, *(of(best, warmup) for warmup in search.warmup[1:]))
 
-    def _grow(
-        self, task: Task, best: Training, report: Callable[..., None]
-    ) -> tuple[Training, ...]:
+    def _grow(self, task: Task, best: Training, report: Report) -> tuple[Training, ...]:
         """Trainings of twice as many updates each, until one gains too little."""
         growth = self.grid.growth
         points: list[Training] = []
@@ -151,7 +147,7 @@ class Workbench:
             updates, before = 2 * updates, points[-1].score
         return tuple(points)
 
-    def _train(self, task: Task, at: Training, report: Callable[..., None]) -> Training:
+    def _train(self, task: Task, at: Training, report: Report) -> Training:
         """One training, unless it is there; of a diverged one the score is 0."""
         cell, run = task.cell, self._run(task, at)
         assert cell is not None
@@ -207,7 +203,6 @@ class Workbench:
         return msgspec.json.encode(settings, order="sorted").decode()
 
     def _run(self, task: Task, at: Training) -> Path:
-        """The folder of one training."""
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
         return runs_of(self.folder, task) / name
 
@@ -240,7 +235,6 @@ class Workbench:
         return msgspec.structs.replace(found, top1=_as_text(right), seconds=seconds)
 
     def _scored(self, found: Outcome, best: Path, config: TrainingConfig) -> Outcome:
-        """The outcome with what a checkpoint's network makes of the test split."""
         model, _ = load_checkpoint(best)
         run, labels = run_on(model), self.test.sweeps.labels
         classes = len(self.test.manifest.categories)
@@ -256,7 +250,6 @@ class Workbench:
         )
 
     def _windows(self, config: TrainingConfig) -> tuple[list[CutWindows], list[CutWindows]]:
-        """The test windows as a configuration begins them, clean and at the rated noise."""
         if config.window not in self._cut:
             test = drawn_as(self.test, {"window": config.window})
             clean, noisy = (

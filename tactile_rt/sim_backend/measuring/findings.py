@@ -65,11 +65,9 @@ class Figure(NamedTuple):
         percent = 100 * above / self.value
         if percent < 0.1:
             return f"{self.value:.4g}"
-        return (
-            f"{self.value:.3g} +- {percent:.0f} %"
-            if percent >= 1
-            else (f"{self.value:.4g} +- {percent:.1f} %")
-        )
+        if percent < 1:
+            return f"{self.value:.4g} +- {percent:.1f} %"
+        return f"{self.value:.3g} +- {percent:.0f} %"
 
 
 class Edit(NamedTuple):

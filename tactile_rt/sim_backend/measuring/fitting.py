@@ -44,11 +44,7 @@ class Fitted(NamedTuple):
 
 
 def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
-    """The array of a file, if a recording can be compared with it.
-
-    Raises:
-        ConfigError: no such file, a mistake in it, or it does not describe a sensor.
-    """
+    """The array of a file, if a recording can be compared with it."""
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"{path}: an array that says what reads it is a .toml file")
     array = load_array(str(path))
@@ -102,8 +98,7 @@ def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
     now, there = np.zeros(1, np.int64), np.ones((1, 1), np.bool_)
     read = Transducer(sensor, (name,)).push(Chunk(now, now, np.zeros((1, 1, 8), np.float32), there))
     assert read is not None
-    found: NDArray[np.float64] = read.values[0, 0].astype(np.float64)
-    return found
+    return np.asarray(read.values[0, 0].astype(np.float64))
 
 
 def _beyond_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
@@ -133,7 +128,6 @@ def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
 def _measure(
     spec: ArraySpec, recorded: Chunk, hz: float, bandwidth_hz: float
 ) -> tuple[dict[str, Rest], dict[str, list[Ring]]]:
-    """Find rest and free swings of each whisker, by its name."""
     rests: dict[str, Rest] = {}
     away: list[NDArray[np.float32]] = []
     for i, name in enumerate(spec.elements):
@@ -198,9 +192,6 @@ def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
 
     A line is changed by its look, which TOML allows to mislead. So what has been written is read
     again, and refused unless it is the file with just these numbers changed.
-
-    Raises:
-        ConfigError: a value stands in the file in a way that this cannot change.
     """
     ending = "\r\n" if "\r\n" in text else "\n"
     text = text.replace("\r\n", "\n")
@@ -224,7 +215,6 @@ def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
 
 
 def _write_edit(text: str, edit: Edit) -> str:
-    """Put a value into its line, or into a new line of its table."""
     lines, numbers = text.split("\n"), find_lines(text)
     table, said = edit.path[:-1], f"measured: {edit.why}"
     new = f"{edit.path[-1]} = {edit.value:g} # {said}"

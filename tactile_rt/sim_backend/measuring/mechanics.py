@@ -63,9 +63,8 @@ def compare_whiskers(
         heard, of, rod = rings.get(whisker.name, ()), f"of {whisker.name}", _rod(whisker)
         if not heard:
             fast = rod.resonance_hz > HEARD * rate_hz
-            silent.setdefault(TOO_FAST.format(rate_hz) if fast else NOT_FREE, []).append(
-                whisker.name
-            )
+            why = TOO_FAST.format(rate_hz) if fast else NOT_FREE
+            silent.setdefault(why, []).append(whisker.name)
             continue
         if note := _unmeasured(rod, heard, rate_hz):
             findings.append(ArrayFinding(f"resonance {of}", "Hz", rod.resonance_hz, None, note))
@@ -174,13 +173,11 @@ def _brought(
         by_table.setdefault(tables[name][0], []).append(name)
     for number, names in by_table.items():
         figure = figures[names[0]]
-        if len(names) > 1 and all(
-            figures[n].value for n in names
-        ):  # a whisker and its mirror image
+        # of a whisker and its mirror image
+        if len(names) > 1 and all(figures[n].value for n in names):
             figure, _ = pooled([figures[n] for n in names], math.inf)
         value = getattr(whiskers[names[0]], field) if column in tables[names[0]][1] else None
         edits = change(("whisker", number, column), value, figure)
-        findings.append(
-            ArrayFinding(f"{column} of {listed(names)}", unit, value, figure, "", edits)
-        )
+        what = f"{column} of {listed(names)}"
+        findings.append(ArrayFinding(what, unit, value, figure, "", edits))
     return findings

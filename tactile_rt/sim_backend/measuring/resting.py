@@ -130,8 +130,7 @@ def _centre(levels: Floats) -> tuple[Floats, Floats]:
 def _inside(blocks: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Those of which the neighbours are the same."""
     beside = np.concatenate([[True], blocks, [True]])
-    inside: NDArray[np.bool_] = beside[:-2] & blocks & beside[2:]
-    return inside
+    return np.asarray(beside[:-2] & blocks & beside[2:])
 
 
 def drift_likelihood(rest: Rest, channel: int, sizes: Floats) -> Floats:
@@ -158,5 +157,4 @@ def drift_likelihood(rest: Rest, channel: int, sizes: Floats) -> Floats:
     shares, seen = shares[1:], (modes.T @ levels)[1:] ** 2  # the first is the constant's
     variances = sizes[:, None, None] ** 2 * shares + (WHITER * white)[:, None]
     fits: Floats = -0.5 * (np.log(variances) + seen / variances).sum(axis=2)
-    best: Floats = fits.max(axis=1)
-    return best
+    return np.asarray(fits.max(axis=1))

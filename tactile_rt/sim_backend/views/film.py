@@ -45,6 +45,7 @@ GHOST = 0.5  # how much of a whisker shows through what hides it
 THIN, BASE, SHAFT = 0.0018, 0.006, 0.005
 ROOM = 10  # half the side of what is around everything, in the camera's distance and more
 MOST_GEOMS = 20_000
+DOT, ARROW = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ARROW
 
 
 class Dressed:
@@ -95,8 +96,7 @@ class Dressed:
         local = boxes[:, 0, None] + corners * boxes[:, 1, None]
         frames = self.data.geom_xmat[self._moved].reshape(-1, 3, 3)
         places = np.einsum("nij,nkj->nki", frames, local) + self.data.geom_xpos[self._moved, None]
-        points: NDArray[np.float64] = places.reshape(-1, 3)
-        return points
+        return np.asarray(places.reshape(-1, 3))
 
     def thicken(self, extent_mm: float) -> None:
         """Draw whiskers thick enough for a picture of this height; thick ones as they are."""
@@ -112,33 +112,6 @@ class Dressed:
         footage.restore(moment, self.data)
         for geoms, force in zip(self.links, 1e3 * footage.forces[moment], strict=True):
             self.model.geom_rgba[geoms] = scale.colour(force)
-
-
-def _add_forces(
-    scene: mujoco.MjvScene,
-    dressed: Dressed,
-    loads: NDArray[np.float64],
-    scale: ForceScale,
-    extent_mm: float,
-) -> None:
-    """Add a dot on every base and the arrow of its force to a scene.
-
-    Args:
-        loads: (element, 6) base loads in the element frames, N and N m.
-        extent_mm: height of the picture, mm.
-    """
-    for site, load in zip(dressed.sites, loads, strict=True):
-        base = dressed.data.site_xpos[site]
-        force = 1e3 * dressed.data.site_xmat[site].reshape(3, 3) @ load[:3]
-        size = float(np.linalg.norm(force))
-        rgba = np.array(scale.colour(size), dtype=np.float32)
-        _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, BASE * extent_mm), base, rgba)
-        if scale.draws(size):
-            arrow = _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, np.ones(3), base, rgba)
-            end = base + force / size * scale.length(size)
-            shaft = SHAFT * extent_mm
-            mujoco.mjv_connector(arrow, mujoco.mjtGeom.mjGEOM_ARROW, shaft, base, end)
-            arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
 
 
 def _add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
@@ -196,12 +169,11 @@ class Stage:
         return np.asarray(Image.blend(whole, bare, GHOST).reduce(FINE))
 
     def _draw(self, loads: NDArray[np.float64], opacity: float) -> Image.Image:
-        """The scene in the fine size."""
         model, data, scene = self.dressed.model, self.dressed.data, self._scene
         self.dressed.cover(opacity)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, self._view, everything, scene)
-        _add_forces(scene, self.dressed, loads, self.scale, self.camera.extent_mm)
+        self._add_forces(loads)
         _add_paper(scene, self.camera)
         pixels = np.empty((self._size[1], self._size[0], 3), dtype=np.uint8)
         area = mujoco.MjrRect(0, 0, *self._size)
@@ -209,6 +181,21 @@ class Stage:
         mujoco.mjr_render(area, scene, self._painter)
         mujoco.mjr_readPixels(pixels, None, area, self._painter)
         return Image.fromarray(pixels[::-1])
+
+    def _add_forces(self, loads: NDArray[np.float64]) -> None:
+        """Draw a dot and an arrow for each load (element, 6), N and N m."""
+        data, scale, extent_mm = self.dressed.data, self.scale, self.camera.extent_mm
+        for site, load in zip(self.dressed.sites, loads, strict=True):
+            base = data.site_xpos[site]
+            force = 1e3 * data.site_xmat[site].reshape(3, 3) @ load[:3]
+            size = float(np.linalg.norm(force))
+            rgba = np.array(scale.colour(size), dtype=np.float32)
+            _add(self._scene, DOT, np.full(3, BASE * extent_mm), base, rgba)
+            if scale.draws(size):
+                arrow = _add(self._scene, ARROW, np.ones(3), base, rgba)
+                end = base + force / size * scale.length(size)
+                mujoco.mjv_connector(arrow, ARROW, SHAFT * extent_mm, base, end)
+                arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
 
     def close(self) -> None:
         """Free what the pictures were drawn with."""

@@ -83,10 +83,7 @@ class Camera:
 
 
 def framing(
-    view: str,
-    points: NDArray[np.float64],
-    aspect: float = 1.5,
-    left: bool = False,
+    view: str, points: NDArray[np.float64], aspect: float = 1.5, left: bool = False
 ) -> Camera:
     """The camera of a named view, set so that all points are in the picture.
 
@@ -134,8 +131,7 @@ class Footage:
     @property
     def forces(self) -> NDArray[np.float64]:
         """(moment, element) size of the force on each base, N."""
-        size: NDArray[np.float64] = np.sqrt((self.loads[..., :3] ** 2).sum(axis=2))
-        return size
+        return np.asarray(np.linalg.norm(self.loads[..., :3], axis=2))
 
     @property
     def strongest(self) -> int:

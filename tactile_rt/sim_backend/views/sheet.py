@@ -1,6 +1,7 @@
 """The whole picture: the scene, the array as a map of forces beside it, their traces below."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -125,7 +126,7 @@ class Sheet:
         # As many cells as pixels, so that none is resampled.
         blank = np.full((height, width, 3), 255, dtype=np.uint8)
         self._scene = scene.imshow(blank, aspect="auto", interpolation="nearest")
-        legend = _draw_ruler(figure, camera, scale)
+        self._legend = _draw_ruler(figure, camera, scale)
 
         middle = MAP[0] + MAP[2] / 2
         head = "force on each whisker's base"
@@ -138,11 +139,14 @@ class Sheet:
         traces = figure.add_axes((0.06, 0.085, 0.925, 0.165))
         draw_traces(traces, footage.times_ms, 1e3 * footage.forces, footage.spec.elements)
         self._cursor = traces.axvline(0, color=INK, lw=1.3)
-        self._clock = figure.text(
-            0.985, 0.945, "", ha="right", va="center", fontsize=14, color=INK, family="monospace"
-        )
-        self._legend = legend
-        for artist in (self._scene, *legend, self._cursor, self._clock):
+        clock: dict[str, Any] = {
+            "ha": "right",
+            "va": "center",
+            "fontsize": 14,
+            "family": "monospace",
+        }
+        self._clock = figure.text(0.985, 0.945, "", color=INK, **clock)
+        for artist in (self._scene, *self._legend, self._cursor, self._clock):
             artist.set_animated(True)
         self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(figure.bbox)
@@ -162,8 +166,7 @@ class Sheet:
         self._canvas.restore_region(self._still)
         for artist in (self._scene, *self._legend, *cells, self._cursor, self._clock):
             self._figure.draw_artist(artist)
-        pixels: NDArray[np.uint8] = np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-        return pixels
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
 
 def _scaled_size(pixels: int) -> tuple[int, int]:
@@ -182,17 +185,9 @@ def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artis
     """A force arrow as long as it is at the point looked at, and what it stands for."""
     left, y = SCENE[0] + 0.022, SCENE[1] + 0.03
     long = scale.arrow_mm / camera.extent_mm * SCENE[3] * TALL / WIDE
-    arrow = FancyArrowPatch(
-        (left, y),
-        (left + long, y),
-        transform=figure.transFigure,
-        arrowstyle="-|>",
-        mutation_scale=14,
-        lw=3,
-        shrinkA=0,
-        shrinkB=0,
-        color=scale.colour(scale.top_mn),
-    )
+    head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
+    places, colour = ((left, y), (left + long, y)), scale.colour(scale.top_mn)
+    arrow = FancyArrowPatch(*places, transform=figure.transFigure, color=colour, lw=3, **head)
     figure.add_artist(arrow)
     clear = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.7}
     words = f"{scale.arrow_mm:g} mm · arrow of {scale.top_mn:g} mN"
@@ -238,28 +233,22 @@ class ForceMap:
         rows, columns = spec.grid_shape
         x = [columns - 1 - column if mirrored else column for _, column in spec.grid]
         self._centres = np.array([(c, row) for c, (row, _) in zip(x, spec.grid, strict=True)])
-        self._cells: list[Rectangle] = []
-        self._arrows: list[FancyArrowPatch] = []
-        self._labels: list[Text] = []
+        self._cells: list[tuple[Rectangle, FancyArrowPatch, Text]] = []
         axes, page = figure.add_axes(place), figure.get_size_inches()
         cell_pt = 72 * float(min(page[0] * place[2] / columns, page[1] * place[3] / rows))
         small = float(np.clip(0.18 * cell_pt, 5.5, 8))
         for (cx, cy), name in zip(self._centres, spec.elements, strict=True):
             cell = Rectangle((cx - 0.47, cy - 0.47), 0.94, 0.94, facecolor=EMPTY)
-            arrow = FancyArrowPatch(
-                (cx, cy),
-                (cx, cy),
-                arrowstyle="-|>",
-                mutation_scale=0.2 * cell_pt,
-                lw=0.035 * cell_pt,
-            )
-            arrow.set_visible(False)
+            head: dict[str, Any] = {
+                "arrowstyle": "-|>",
+                "mutation_scale": 0.2 * cell_pt,
+                "visible": False,
+            }
+            arrow = FancyArrowPatch((cx, cy), (cx, cy), lw=0.035 * cell_pt, **head)
             label = axes.text(cx - 0.41, cy - 0.42, name, va="top", fontsize=small, color="0.6")
             axes.add_patch(cell)
             axes.add_patch(arrow)
-            self._cells.append(cell)
-            self._arrows.append(arrow)
-            self._labels.append(label)
+            self._cells.append((cell, arrow, label))
         if len(set(self._rostral.tolist())) == 1:
             nose = "nose →" if self._flip * self._rostral[0] > 0 else "← nose"
         else:  # both sides of a face
@@ -281,7 +270,7 @@ class ForceMap:
         for i, (force, (cx, cy)) in enumerate(zip(forces, self._centres, strict=True)):
             size = float(np.linalg.norm(force))
             felt = self._scale.draws(size)
-            cell, arrow, label = self._cells[i], self._arrows[i], self._labels[i]
+            cell, arrow, label = self._cells[i]
             ink = "white" if size > 0.5 * self._scale.top_mn else INK
             cell.set_facecolor(self._scale.colour(size) if felt else EMPTY)
             label.set_color(ink if felt else "0.6")
@@ -335,14 +324,8 @@ def draw_traces(
             break
         named = rank < NAMED
         hue = colormaps["tab10"](rank) if named else (0.75, 0.75, 0.75, 1.0)
-        axes.plot(
-            times_ms,
-            forces[:, i],
-            color=hue,
-            lw=1.5 if named else 0.7,
-            zorder=2 - rank / 100,
-            label=names[i] if named else None,
-        )
+        (line,) = axes.plot(times_ms, forces[:, i], color=hue, lw=1.5 if named else 0.7)
+        line.set(zorder=2 - rank / 100, label=names[i] if named else f"_{names[i]}")
     if peaks.any():
         axes.legend(loc="upper right", ncols=NAMED, fontsize=9, frameon=False)
     axes.set_xlim(0, float(times_ms[-1]))

@@ -6,8 +6,6 @@ from typing import Any
 from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 
-__all__ = ["MadeUpArm", "MadeUpArmConfig", "MadeUpHand", "MadeUpHandConfig"]
-
 JOINTS = ("shoulder.pos", "elbow.pos")
 
 
