@@ -47,7 +47,10 @@ def device_keys(urls: list[str]) -> list[str]:
             continue
         target = unquote(parts.netloc + parts.path)
         port = target.removeprefix("slcan:") if target.startswith("slcan:") else target
-        keys.append(f"device {os.path.realpath(port) if port.startswith('/') else target}")
+        # A bus of CAN has a name; a serial line is a file, which may be named from the folder here.
+        line = port != target or parts.scheme == "serial"
+        there = port.startswith("/") or (line and os.path.exists(port))
+        keys.append(f"device {os.path.realpath(port) if there else target}")
     return list(dict.fromkeys(keys))
 
 

@@ -404,10 +404,12 @@ def test_ports_that_differ_after_a_hash_are_two():
     assert len(device_keys(["serial:///dev/null#1?codec=bota", "serial:///dev/null#2"])) == 2
 
 
-def test_two_names_of_a_configuration_or_a_port_are_one(tmp_path):
+def test_two_names_of_a_configuration_or_a_port_are_one(tmp_path, monkeypatch):
     link, file = tmp_path / "whiskers", tmp_path / "robot.toml"
     link.symlink_to("/dev/null")
+    monkeypatch.chdir(tmp_path)
     urls = ["serial:///dev/null?codec=bota", f"serial:{link}?codec=native", "can:slcan:/dev/null"]
+    urls += ["serial://whiskers?codec=bota"]
     assert device_keys([*urls, "synthetic:"]) == ["device /dev/null"]
     assert lock_keys(file, urls) == [f"configuration {file}", "device /dev/null"]
     # A link may lead elsewhere by the time a second one starts, so its own name is held, too.
