@@ -96,7 +96,7 @@ def write_pieces(key: str, thing: TactileObject) -> None:
     path = _path(key)
     if path is None:
         return
-    arrays = {
+    arrays: dict[str, Any] = {
         "vertices": np.concatenate([m.vertices for m in thing.pieces]),
         "faces": np.concatenate([m.faces for m in thing.pieces]).astype(np.int32),
         "corners": [len(m.vertices) for m in thing.pieces],
