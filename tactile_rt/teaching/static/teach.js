@@ -1,5 +1,9 @@
 // Shows what the teacher says, and sends orders. The state is asked for twice a second.
 const $ = (id) => document.getElementById(id);
+const buttons = new Map(); // of the classes, by name
+let listed = ""; // names of the classes on the page
+let shown = ""; // the newest state
+let asked = 0; // how often the state was asked for
 
 async function order(text) {
   try {
@@ -15,16 +19,18 @@ async function order(text) {
   await look();
 }
 
+// A button stays in place while its counts change: a press that lasts over a change is not lost.
 function button(each, entry, chosen) {
-  const made = document.createElement("button");
-  made.type = "button";
+  const made = buttons.get(entry.name) ?? document.createElement("button");
+  if (!buttons.has(entry.name)) {
+    made.type = "button";
+    made.append(entry.name, document.createElement("small"));
+    made.addEventListener("click", () => order(entry.name));
+    buttons.set(entry.name, made);
+  }
   made.setAttribute("aria-pressed", String(chosen));
-  made.append(entry.name);
-  const small = document.createElement("small");
-  small.textContent = `${entry.touches} of ${each} touches`
+  made.lastChild.textContent = `${entry.touches} of ${each} touches`
     + (entry.right === null ? "" : `, ${entry.right} told right`);
-  made.append(small);
-  made.addEventListener("click", () => order(entry.name));
   return made;
 }
 
@@ -32,9 +38,10 @@ function show(state) {
   $("prompt").textContent = state.prompt;
   if (!state.classes) return; // at rest, before the first touch
   $("note").textContent = state.said;
-  $("classes").replaceChildren(
-    ...state.classes.map((entry) => button(state.each, entry, entry.name === state.label)),
-  );
+  const made = state.classes.map((entry) => button(state.each, entry, entry.name === state.label));
+  const names = state.classes.map((entry) => entry.name).join("\n");
+  if (names !== listed) $("classes").replaceChildren(...made);
+  listed = names;
   $("told").textContent = state.of
     ? `${state.right} of ${state.of} touches are right, leave-one-out: judged by all others.`
     : "Two touches of a class are needed first.";
@@ -49,10 +56,11 @@ function show(state) {
   }));
 }
 
-let shown = "";
 async function look() {
+  const mine = ++asked;
   try {
     const text = await (await fetch("state")).text();
+    if (mine !== asked) return; // a newer answer is on its way
     if (text !== shown) show(JSON.parse(text));
     shown = text;
   } catch {
