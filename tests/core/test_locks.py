@@ -3,7 +3,7 @@
 import pytest
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.locks import alone_in
+from tactile_rt.core.locks import alone_in, device_keys
 from tests.helpers.holding import held_elsewhere
 
 
@@ -26,3 +26,20 @@ def test_a_folder_is_free_again_after_an_error(tmp_path):
     for _ in range(2):
         with pytest.raises(ZeroDivisionError), alone_in(tmp_path):
             raise ZeroDivisionError
+
+
+def test_a_device_has_one_key_by_all_its_names(tmp_path, monkeypatch):
+    (tmp_path / "tty0").touch()
+    (tmp_path / "port").symlink_to("tty0")
+    (tmp_path / "vcan0").touch()
+    monkeypatch.chdir(tmp_path)
+    port = f"device {tmp_path / 'tty0'}"
+    assert device_keys([f"serial:{tmp_path}/port?baud=9600", "serial:port", "serial:tty0"]) == [
+        port
+    ]
+    assert device_keys(["can:slcan:port", f"can:slcan:{tmp_path}/tty0"]) == [port]
+    # A bus is no file, though there is one of its name; a port may not be there yet.
+    assert device_keys(["can:vcan0", "serial:port1", "sim:mouse"]) == [
+        "device vcan0",
+        "device port1",
+    ]
