@@ -115,7 +115,8 @@ def _import(
     decoded_as, columns, topic, rate, bus, log_form = wanted
     with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
         from tactile_rt.drivers.logs import read_log
-        from tactile_rt.recording.importing.bag import import_bag, is_bag
+        from tactile_rt.recording.importing.bag import import_bag
+        from tactile_rt.recording.importing.bag_file import is_bag
         from tactile_rt.recording.importing.csv import csv_form, read_table
         from tactile_rt.recording.importing.table import import_table
         from tactile_rt.recording.importing.wire import import_wire

@@ -11,7 +11,7 @@ import typer
 from tactile_rt.cli.app import app, check_output, leaving, starting
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -214,7 +214,7 @@ def _usual_baud(fit: "CodecFit") -> int:
 def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     from tactile_rt.drivers.logs import read_log
     from tactile_rt.drivers.sniffing import LOOK_BYTES, LOOK_FRAMES, sniff_bytes, sniff_frames
-    from tactile_rt.recording.importing.bag import is_bag
+    from tactile_rt.recording.importing.bag_file import is_bag
 
     if is_bag(path):
         _sniff_bag(path, told)
@@ -278,14 +278,11 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
-    from tactile_rt.recording.importing.bag import bag_topics
+    from tactile_rt.recording.importing.bag import bag_topics, is_recording
     from tactile_rt.recording.ros2 import messages
 
-    try:
-        about = Recording(path).description if path.suffix == ".mcap" else None
-    except (RecordingError, ConfigError):
-        about = None
-    if about is not None:
+    if is_recording(path):
+        about = Recording(path).description
         told.say(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
         told.go_on(f"tactile-rt run --source {shlex.quote(f'replay:{path}')}")
         return
