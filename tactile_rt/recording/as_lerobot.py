@@ -32,7 +32,7 @@ from tactile_rt.recording.lerobot_meta import (
     CameraFilm,
     Episode,
     Statistics,
-    need_pyarrow,
+    import_pyarrow,
     write_film,
     write_meta,
 )
@@ -70,7 +70,7 @@ def write_dataset(
             unevenly for rows.
         SpecMismatch: They are of several arrays.
     """
-    pa, pq = need_pyarrow()
+    pa, pq = import_pyarrow()
     if films and len(recordings) != 1:
         raise ConfigError("films go with one recording: make a dataset of each")
     spec = recordings[0].spec

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import whole_folder, write_whole
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.recording.description import RECOVERED, Description, seal
 from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
@@ -69,7 +69,7 @@ def convert(path: str | Path, output: str | Path) -> int:
             "and, of tables, by `tactile-rt import`"
         )
     if write is write_hdf5:
-        need_h5py()
+        _import_h5py()
     recording, n = Recording(path), 0
 
     def fill(file: BinaryIO) -> None:
@@ -135,7 +135,7 @@ def write_npz(recording: Recording, file: BinaryIO) -> int:
 
 def write_hdf5(recording: Recording, file: BinaryIO) -> int:
     """Write datasets block by block, with the names and units of the array."""
-    h5py, about, n = need_h5py(), recording.description, 0
+    h5py, about, n = _import_h5py(), recording.description, 0
     with _PatientFile(os.dup(file.fileno())) as patient, h5py.File(patient, "w") as made:
         for block in _read_blocks(recording):
             for name in COLUMNS:
@@ -197,16 +197,9 @@ def _read_texts(recording: Recording, topic: str) -> tuple[list[str], NDArray[np
     return [raw.data.decode() for raw in raws], np.array([raw.t_ns for raw in raws], np.int64)
 
 
-def need_h5py() -> Any:
-    """Import the module.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
-    try:
+def _import_h5py() -> Any:
+    with require_extra("HDF5 needs", "hdf5"):
         import h5py
-    except ModuleNotFoundError as error:
-        raise lacking("HDF5 needs", "hdf5", error) from None
     return h5py
 
 

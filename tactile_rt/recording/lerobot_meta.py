@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 
 __all__ = [
     "DATA",
@@ -24,7 +24,7 @@ __all__ = [
     "Episode",
     "Statistics",
     "film_of",
-    "need_pyarrow",
+    "import_pyarrow",
     "write_film",
     "write_meta",
 ]
@@ -88,7 +88,7 @@ def film_of(text: str) -> CameraFilm:
         file, begin_s = place, 0.0
     if not (equals and name.replace("_", "").isalnum() and file and np.isfinite(begin_s)):
         raise ConfigError(f"--video is NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
-    av = _need_av()
+    av = _import_av()
     try:
         with av.open(file) as film:
             stream = film.streams.video[0]
@@ -109,7 +109,7 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
     Raises:
         ConfigError: The film cannot be decoded.
     """
-    av = _need_av()
+    av = _import_av()
     path = folder / VIDEO.format(video_key=film.key, chunk_index=0, file_index=0)
     path.parent.mkdir(parents=True)
     height, width = film.size
@@ -133,7 +133,7 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
     found = {
         "min": colours.min(axis=0), "max": colours.max(axis=0), "mean": colours.mean(axis=0),
         "std": colours.std(axis=0),
-        **{f"q{q:02d}": np.percentile(colours, q, axis=0) for q in (1, 10, 50, 90, 99)},
+        **{name: np.quantile(colours, q, axis=0) for name, q in QUANTILES.items()},
     }  # fmt: skip
     shaped = {name: value.reshape(3, 1, 1) for name, value in found.items()}
     return {**shaped, "count": np.array([len(seen)])}
@@ -156,11 +156,9 @@ def _frames(av: Any, film: CameraFilm, rows: int, fps: int) -> Iterator[Any]:
             yield now[1]
 
 
-def _need_av() -> Any:
-    try:
+def _import_av() -> Any:
+    with require_extra("films need", "lerobot"):
         import av
-    except ModuleNotFoundError as error:
-        raise lacking("films need", "lerobot", error) from None
     return av
 
 
@@ -180,17 +178,15 @@ QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 MOST_KEPT = 10_000  # rows of numbers, of which quantiles are taken
 
 
-def need_pyarrow() -> tuple[Any, Any]:
-    """The modules ``pyarrow`` and ``pyarrow.parquet``.
+def import_pyarrow() -> tuple[Any, Any]:
+    """Import ``pyarrow`` and ``pyarrow.parquet``.
 
     Raises:
         ConfigError: The extra is not installed.
     """
-    try:
+    with require_extra("LeRobot datasets need", "lerobot"):
         import pyarrow
         import pyarrow.parquet
-    except ModuleNotFoundError as error:
-        raise lacking("LeRobot datasets need", "lerobot", error) from None
     return pyarrow, pyarrow.parquet
 
 
@@ -292,7 +288,7 @@ def write_meta(
     films: Sequence[CameraFilm],
 ) -> None:
     """Write all of it but what is ours."""
-    pa, pq = need_pyarrow()
+    pa, pq = import_pyarrow()
     info = {
         "codebase_version": CODEBASE,
         "robot_type": "tactile_rt",

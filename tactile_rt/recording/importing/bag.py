@@ -321,7 +321,7 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
 
 
 def _find_array(bag: OpenBag, samples: str) -> ArraySpec | None:
-    """Find the description of the array of a topic of samples, if the bag has one."""
+    """Find what the bag says of the array of a topic of samples."""
     beside = f"{samples.rpartition('/')[0]}/{ARRAY}"
     if beside not in bag.reader.topics or bag.reader.topics[beside].msgtype != messages.ARRAY:
         return None

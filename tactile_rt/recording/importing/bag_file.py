@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, Final
 
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.files import check_no_pointer, open_regular
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 from tactile_rt.recording.records import MAGIC
 
 __all__ = ["OpenBag", "is_bag", "open_bag"]
@@ -30,7 +30,7 @@ TIMES_AND_SUM: Final = 8 + 8 + 8 + 4  # bytes of a chunk before the name of its 
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether this is a bag of ROS 1 or ROS 2, or any MCAP file."""
+    """Tell whether this is a bag of ROS, or an MCAP file."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     with open_regular(path) as file:
@@ -92,11 +92,9 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     Raises:
         RecordingError: it is damaged, or has lost its end.
     """
-    try:
+    with require_extra("bags need", "import"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ModuleNotFoundError as error:
-        raise lacking("bags need", "import", error) from None
     for file in path.iterdir() if path.is_dir() else ():
         check_no_pointer(file)
     with ExitStack() as stack:
