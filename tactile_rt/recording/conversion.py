@@ -18,6 +18,7 @@ gets its wrenches as ``geometry_msgs/msg/WrenchStamped`` besides.
 import csv
 import io
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,7 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import whole_folder, write_whole
 from tactile_rt.core.packages import require_extra
-from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
+from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording.description import RECOVERED, Description, seal
 from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
 from tactile_rt.recording.reader import Recording
@@ -94,19 +95,14 @@ def write_csv(recording: Recording, file: BinaryIO) -> int:
     """Write a line per sample, with empty cells for elements that are not valid."""
     text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
     lines = csv.writer(text, lineterminator="\n")
-    lines.writerow(_name_columns(recording.spec))
-    n = 0
+    spec, n = recording.spec, 0
+    channels = [f"{c} [{unit}]" for c, unit in zip(spec.channels, spec.units, strict=True)]
+    lines.writerow(["seq", "t_ns", *(f"{e}.{c}" for e in spec.elements for c in channels)])
     for chunk in _read_blocks(recording):
         lines.writerows(_write_rows(chunk))
         n += len(chunk)
     text.detach()
     return n
-
-
-def _name_columns(spec: ArraySpec) -> list[str]:
-    of = zip(spec.channels, spec.units, strict=True)
-    channels = [f"{channel} [{unit}]" for channel, unit in of]
-    return ["seq", "t_ns", *(f"{e}.{c}" for e in spec.elements for c in channels)]
 
 
 def _write_rows(chunk: Chunk) -> Iterator[list[Any]]:
@@ -214,11 +210,7 @@ class _PatientFile(io.FileIO):
         self._failed: OSError | None = None
 
     def check(self) -> None:
-        """Raise what has failed.
-
-        Raises:
-            OSError: something could not be written.
-        """
+        """Raise what has failed."""
         if self._failed is not None:
             raise self._failed
 
@@ -304,10 +296,9 @@ def _add_wrenches(made: McapFile, raw: Raw) -> int:
 
 def _metadata(files: Sequence[_File]) -> str:
     """What ROS 2 reads first: YAML, of which JSON is a part."""
-    totals: dict[tuple[str, str], int] = {}
+    totals = Counter[tuple[str, str]]()
     for file in files:
-        for key, many in file.counts.items():
-            totals[key] = totals.get(key, 0) + many
+        totals.update(file.counts)
     begin_ns, end_ns = min(f.begin_ns for f in files), max(f.end_ns for f in files)
     about = {
         "version": BAG_VERSION,

@@ -6,6 +6,7 @@ Its names and shapes are LeRobot's; https://github.com/huggingface/lerobot, ``da
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -343,19 +344,15 @@ def _all_of(episodes: Sequence[Episode]) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for feature in episodes[0].statistics:
         each = [e.statistics[feature] for e in episodes]
-        weight = np.array([float(found["count"][0]) for found in each])
-        weight /= weight.sum()
-
-        def mean(values: list[NDArray[Any]], w: NDArray[np.float64] = weight) -> NDArray[Any]:
-            return np.tensordot(w, np.array(values), 1)
-
+        counts = [int(found["count"][0]) for found in each]
+        mean = partial(np.average, axis=0, weights=counts)
         whole = {name: mean([f[name] for f in each]) for name in ("mean", *QUANTILES)}
         spread = [f["std"] ** 2 + (f["mean"] - whole["mean"]) ** 2 for f in each]
         made[feature] = {
             "min": np.min([f["min"] for f in each], axis=0).tolist(),
             "max": np.max([f["max"] for f in each], axis=0).tolist(),
             "std": np.sqrt(mean(spread)).tolist(),
-            "count": [int(sum(f["count"][0] for f in each))],
+            "count": [sum(counts)],
             **{name: value.tolist() for name, value in whole.items()},
         }
     return made
