@@ -135,10 +135,8 @@ def _check_supported(scene: Any) -> None:
     """Refuse what of a glTF the mesh library would leave out or misread."""
     for required in scene.get("extensionsRequired", ()):
         if not HARMLESS.match(required):
-            how = "`gltfpack -noq -i IN -o OUT` writes it without" if "meshopt" in required else ""
-            raise ValueError(
-                f"it needs {required}, which is not supported" + f"; {how}" * bool(how)
-            )
+            how = "; `gltfpack -noq -i IN -o OUT` writes it without" * ("meshopt" in required)
+            raise ValueError(f"it needs {required}, which is not supported{how}")
     if any("EXT_mesh_gpu_instancing" in n.get("extensions", ()) for n in scene.get("nodes", ())):
         raise ValueError("its nodes have copies by EXT_mesh_gpu_instancing")
     for primitive in (p for mesh in scene.get("meshes", ()) for p in mesh["primitives"]):
