@@ -27,7 +27,7 @@ from tactile_rt.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.alignment.neural import NeuralSession
 from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
-from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, explain_errors, name_some
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.packages import require_extra
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
@@ -128,14 +128,12 @@ def read_session(
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
     h5py = _import_h5py()
     check_no_pointer(path)
-    try:
-        with h5py.File(path, "r") as file:
-            return _session(file, path.stem, window, progress, clock, selection or Selection())
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
-    except Exception as error:  # of a damaged file HDF5 raises a dozen unrelated types
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path}: cannot be read as NWB ({reason})") from None
+    with explain_errors(ConfigError, f"{path}: cannot be read as NWB ("):
+        try:
+            with h5py.File(path, "r") as file:
+                return _session(file, path.stem, window, progress, clock, selection or Selection())
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
 
 
 def _import_h5py() -> Any:

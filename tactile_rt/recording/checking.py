@@ -21,7 +21,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import WIRE
 from tactile_rt.recording.reader import Recording
-from tactile_rt.recording.replay import open_replay
+from tactile_rt.recording.replay import prepare_replay
 
 __all__ = [
     "FACTS",
@@ -289,7 +289,8 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
     """
     recording = Recording(path)
     recorded = list(recording)
-    with open_replay(str(path), {**(options or {}), "from": WIRE, "speed": "0"}) as source:
+    fields = {**(options or {}), "from": WIRE, "speed": "0"}
+    with prepare_replay(str(path), fields).open() as source:
         spec, decoded = source.spec, list(source)
     if not recorded or not decoded:
         raise RecordingError(

@@ -24,6 +24,7 @@ __all__ = [
     "CameraFilm",
     "Episode",
     "Statistics",
+    "describe_feature",
     "film_of",
     "import_pyarrow",
     "write_film",
@@ -163,18 +164,19 @@ def _import_av() -> Any:
     return av
 
 
+def describe_feature(kind: str, *shape: int, names: Any = None) -> dict[str, Any]:
+    """Describe a column of the rows as ``info.json`` has it."""
+    return {"dtype": kind, "shape": list(shape), "names": names}
+
+
 INFO = "meta/info.json"
-DATA = "data/chunk-{:03d}/file-{:03d}.parquet"
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 CODEBASE = "v3.0"
 IN_CHUNK = 1000  # files of a folder
 # What every row has besides.
-FRAME: dict[str, dict[str, Any]] = {
-    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    **{
-        name: {"dtype": "int64", "shape": [1], "names": None}
-        for name in ("frame_index", "episode_index", "index", "task_index")
-    },
-}
+NUMBERS = ("frame_index", "episode_index", "index", "task_index")
+FRAME = {"timestamp": describe_feature("float32", 1)}
+FRAME |= {name: describe_feature("int64", 1) for name in NUMBERS}
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 MOST_KEPT = 10_000  # rows of numbers, of which quantiles are taken
 
@@ -301,7 +303,7 @@ def write_meta(
         "video_files_size_in_mb": 200,
         "fps": fps,
         "splits": {"train": f"0:{len(episodes)}"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "data_path": DATA,
         "video_path": VIDEO if films else None,
         "features": {**features, **{film.key: film.feature(fps) for film in films}},
     }

@@ -34,7 +34,7 @@ from tactile_rt.recording.records import MAGIC
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_object
 
-__all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
+__all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "prepare_replay"]
 
 # Six objects sweep past simulated whiskers, see bench/write_demo.py: `replay:demo`.
 DEMO = Path(__file__).parents[1] / "assets" / "demo.mcap"
@@ -61,17 +61,12 @@ class ReplayOptions:
     loop: bool = False
 
 
-def open_replay(target: str, fields: dict[str, str]) -> Source:
-    """A recording, or one object of a sweep set, as a stream.
+def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
+    """Prepare to open a recording, or one object of a sweep set, as a stream.
 
     Raises:
         ConfigError: no such file, a wrong option, or the extra is not installed.
     """
-    return prepare_replay(target, fields).open()
-
-
-def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
-    """What opens a recording, or one object of a sweep set, as a stream."""
     path, what = Path(target), f"replay:{target}"
     if not target:
         raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
