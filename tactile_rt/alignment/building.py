@@ -77,9 +77,6 @@ def build(
             "or units applies to it"
         )
 
-    def reading(share: float) -> None:
-        progress(READING * share)
-
     def splitting(share: float) -> None:
         progress(READING + (1 - READING) * share)
 
@@ -89,7 +86,9 @@ def build(
         notes = [f"{archives[0].name}: {len(rates)} animals, {units} units"]
     else:
         files = find_nwb(inputs)
-        sessions, notes = checked_sessions(files, strict, reading, clock, selection)
+        sessions, notes = checked_sessions(
+            files, strict, lambda share: progress(READING * share), clock, selection
+        )
         if not strict:
             animals = by_animal(_complete(sessions, notes))
             rates = {animal.name: published_layout(animal) for animal in animals}

@@ -60,8 +60,8 @@ class ContactResponse:
     windows: int
     rise: float
     spread: float
-    other_s: float
-    other_z: float
+    other_s: float = 0.0
+    other_z: float = 0.0
 
     @property
     def z(self) -> float:
@@ -175,8 +175,6 @@ def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
         windows=sum(r.windows for r in responses),
         rise=sum(r.rise for r in responses),
         spread=float(np.sqrt(sum(r.spread**2 for r in responses))),
-        other_s=0.0,
-        other_z=0.0,
     )
     shifts = [r.shift_s for r in responses]
     where = "spikes on the session's clock (offset 0 s)"

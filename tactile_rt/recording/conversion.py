@@ -168,11 +168,7 @@ def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
 
 
 def _read_blocks(recording: Recording) -> Iterator[Chunk]:
-    """Read the samples, some `BLOCK` at a time.
-
-    Raises:
-        RecordingError: the recording is damaged, or has no samples.
-    """
+    """Read the samples, some `BLOCK` at a time; refuse a recording without any."""
     waiting: list[Chunk] = []
     n = total = 0
     for chunk in recording:

@@ -317,12 +317,7 @@ class SweepOptions:
 
 
 def _sweep_chunks(path: Path, manifest: SweepManifest, options: SweepOptions) -> Timed:
-    """Cut the sweeps into chunks, times from 0, and when they are due.
-
-    Raises:
-        ConfigError: no such sweep.
-        RecordingError: the file is damaged, or not of the manifest's array.
-    """
+    """Cut the sweeps of an object, once they are checked, into chunks."""
     values, _ = read_object(path.parent, path.stem)
     if values.ndim != 4 or values.shape[2:] != manifest.spec.shape or not values.shape[1]:
         raise RecordingError(

@@ -169,15 +169,11 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     raise ConfigError(f"{path} has the topics {told}: {what}")
 
 
-def _frame_of(message: Any) -> str:
-    name = getattr(getattr(message, "header", None), "frame_id", "") or "sensor"
-    return _NO_NAME.sub("_", name).strip("_") or "sensor"
-
-
 def _columns_of(kind: str, message: Any) -> str:
-    """What a message of this type is a sample of, in words; empty: only a user can tell."""
+    """Describe the columns of a known type; empty where only a user can tell."""
     if kind in KNOWN:
-        return KNOWN[kind].format(_frame_of(message))
+        frame = getattr(getattr(message, "header", None), "frame_id", "")
+        return KNOWN[kind].format(_NO_NAME.sub("_", frame).strip("_") or "sensor")
     if not NUMBERS.fullmatch(kind) or not len(message.data):
         return ""
     channels = _channels_of(message)

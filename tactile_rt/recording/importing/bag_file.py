@@ -127,12 +127,10 @@ def _mend_bag(path: Path, new: Path) -> int:
     n = 0
     with open_regular(path) as file, new.open("wb") as made:
         made.write(file.read(len(MAGIC)))
-        try:
+        with suppress(Exception):  # where it is damaged: anything may be raised of such bytes
             for opcode, data in _split_records(file):
                 made.write(struct.pack("<BQ", opcode, len(data)) + data)
                 n += opcode == MESSAGE
-        except Exception:  # damaged from here on: anything may be raised of such bytes
-            pass
         made.write(struct.pack("<BQ4x", DATA_END, 4) + struct.pack("<BQ20x", FOOTER, 20) + MAGIC)
     return n
 
