@@ -201,9 +201,7 @@ def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
             kept &= (chunk.t_ns < skip["from_ns"]) | (chunk.t_ns >= skip["until_ns"])
     if kept.all():
         return chunk
-    if not kept.any():
-        return None
-    return Chunk(chunk.seq[kept], chunk.t_ns[kept], chunk.values[kept], chunk.valid[kept])
+    return chunk.select(kept) if kept.any() else None
 
 
 def _of(decision: Fields) -> str:
