@@ -52,15 +52,7 @@ from tactile_rt.models.evaluation.measures import (
 )
 from tactile_rt.sets.splits import join_manifests
 
-__all__ = [
-    "COVERAGE",
-    "fit_open_set",
-    "fit_prediction_sets",
-    "fit_temperature",
-    "quantisation_figures",
-    "release",
-    "run_file",
-]
+__all__ = ["fit_open_set", "fit_prediction_sets", "fit_temperature", "release"]
 
 TEMPERATURES = np.geomspace(0.25, 4.0, 81)
 COVERAGE = 0.95
