@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import PROTOCOLS, Benchmark
-from tactile_rt.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
+from tactile_rt.alignment.clock import CLOCKS, WARNING, said_of
 from tactile_rt.alignment.neural import NeuralSession, by_animal, published_layout, read_published
 from tactile_rt.alignment.nwb import Reading, find_nwb, read_nwb
 from tactile_rt.alignment.paper_code import freeze_paper_code
@@ -62,10 +62,11 @@ def build(
         raise ConfigError("name NWB files or a folder of them to build from")
     if bootstraps < 1:
         raise ConfigError(f"{bootstraps} bootstraps: at least one")
+    strict = protocol == "strict"
     archives = [path for path in inputs if path.suffix == ".npz"]
     if archives and len(inputs) > 1:
         raise ConfigError(f"{archives[0]}: an .npz holds all animals: name nothing beside it")
-    if archives and protocol == "strict":
+    if archives and strict:
         raise ConfigError(
             f"{archives[0]}: its stimuli have no names, and trials that did not show a stimulus "
             "count as zero: build with protocol paper-code, or strict from the NWB files"
@@ -76,36 +77,33 @@ def build(
             "or units applies to it"
         )
 
-    def reading(share: float) -> None:
-        progress(READING * share)
-
     def splitting(share: float) -> None:
         progress(READING + (1 - READING) * share)
 
     if archives:
-        rates = read_published(archives[0])
-        made = freeze_paper_code(rates, bootstraps, seed, splitting)
+        files, rates = archives, read_published(archives[0])
         units = sum(array.shape[2] for array in rates.values())
-        note = f"{archives[0].name}: {len(rates)} animals, {units} units"
-        made = replace(made, sources=(archives[0].name,), notes=(note, *made.notes))
-        _check_reliable(made)
-        return made
-    strict = protocol == "strict"
-    files = find_nwb(inputs)
-    sessions, notes = checked_sessions(files, strict, reading, clock, selection)
+        notes = [f"{archives[0].name}: {len(rates)} animals, {units} units"]
+    else:
+        files = find_nwb(inputs)
+        sessions, notes = checked_sessions(
+            files, strict, lambda share: progress(READING * share), clock, selection
+        )
+        if not strict:
+            animals = by_animal(_complete(sessions, notes))
+            rates = {animal.name: published_layout(animal) for animal in animals}
     if strict:
         made = freeze_strict(by_animal(sessions), bootstraps, seed, splitting)
     else:
-        sessions = _complete(sessions, notes)
-        layouts = {animal.name: published_layout(animal) for animal in by_animal(sessions)}
-        made = freeze_paper_code(layouts, bootstraps, seed, splitting)
-    made = replace(
-        made,
-        sources=tuple(sorted(f.name for f in files)),
-        notes=(*notes, *made.notes),
-    )
-    _check_reliable(made)
-    return made
+        made = freeze_paper_code(rates, bootstraps, seed, splitting)
+    if not made.reliable:
+        found = name_some(
+            f"{t.name} {t.chosen.reliability:.2f} ({t.chosen.units} of {t.unfiltered.units} units)"
+            for t in made.targets
+        )
+        raise ConfigError(f"no animal is reliable enough to score on; reliabilities: {found}")
+    sources = tuple(sorted(file.name for file in files))
+    return replace(made, sources=sources, notes=(*notes, *made.notes))
 
 
 def checked_sessions(
@@ -150,7 +148,12 @@ def _clock_checked(
     wrong = [response for response in responses if response.elsewhere]
     if not wrong:
         return readings, said
-    why = _other(wrong, readings)
+    first = wrong[0]
+    why = (
+        f"in {len(wrong)} of {len(readings)} sessions another offset fits contacts better: in "
+        f"{first.session} rates rise most (z = {first.other_z:.1f}) if {first.other_s:.3f} s is "
+        f"subtracted from spike times, and not {first.shift_s:.3f} s (z = {first.z:.1f})"
+    )
     if strict and 2 * len(wrong) > len(responses):
         raise ConfigError(f"{said[0].removeprefix(WARNING)}; {why}: see --clock")
     if not strict:
@@ -158,15 +161,6 @@ def _clock_checked(
     names = {response.session for response in wrong}
     kept = [r for r in readings if r.session.name not in names]
     return kept, [*said, f"{WARNING}{why}: left out: {', '.join(sorted(names))}"]
-
-
-def _other(wrong: Sequence[ContactResponse], readings: Sequence[Reading]) -> str:
-    first = wrong[0]
-    return (
-        f"in {len(wrong)} of {len(readings)} sessions another offset fits contacts better: in "
-        f"{first.session} rates rise most (z = {first.other_z:.1f}) if {first.other_s:.3f} s is "
-        f"subtracted from spike times, and not {first.shift_s:.3f} s (z = {first.z:.1f})"
-    )
 
 
 def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[NeuralSession]:
@@ -185,15 +179,6 @@ def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[Neura
     return kept
 
 
-def _check_reliable(made: Benchmark) -> None:
-    if not made.reliable:
-        found = name_some(
-            f"{t.name} {t.chosen.reliability:.2f} ({t.chosen.units} of {t.unfiltered.units} units)"
-            for t in made.targets
-        )
-        raise ConfigError(f"no animal is reliable enough to score on; reliabilities: {found}")
-
-
 def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
     """Refuse recordings that hold a session twice, in another sorting or order, or units less.
 
@@ -205,16 +190,13 @@ def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
     units = [_count_units(session) for session in sessions]
     for j, later in enumerate(sessions):
         for i, earlier in enumerate(sessions[:j]):
-            if _share_most(units[i], units[j]):
-                how = ""
-            elif _share_most(trials[i], trials[j]):
-                how = " with other units"
-            else:
-                continue
-            raise ConfigError(
-                f"sessions {earlier.name} and {later.name} hold the same trials{how}: "
-                "give one of them"
-            )
+            same_units = _share_most(units[i], units[j])
+            if same_units or _share_most(trials[i], trials[j]):
+                how = "" if same_units else " with other units"
+                raise ConfigError(
+                    f"sessions {earlier.name} and {later.name} hold the same trials{how}: "
+                    "give one of them"
+                )
 
 
 def _share_most(one: Counter[bytes], other: Counter[bytes]) -> bool:

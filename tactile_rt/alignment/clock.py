@@ -29,6 +29,8 @@ WARNING = "WARNING: "  # begins a note that must not be overlooked
 APART_S = 0.25  # between a contact that counts and the one before it
 RISE_MS = (3, 40)
 BEFORE_MS, AFTER_MS = 40, 60  # of the histogram
+BEFORE = slice(BEFORE_MS - RISE_MS[1], BEFORE_MS - RISE_MS[0])  # the parts of it that are compared
+AFTER = slice(BEFORE_MS + RISE_MS[0], BEFORE_MS + RISE_MS[1])
 BIN_S = 0.002  # of the search for another shift
 HERE_S = 0.03  # a shift below this is none
 SEARCH_S, FURTHER_S = 20.0, 5.0  # as far as that, and so much beyond the starting time
@@ -58,8 +60,8 @@ class ContactResponse:
     windows: int
     rise: float
     spread: float
-    other_s: float
-    other_z: float
+    other_s: float = 0.0
+    other_z: float = 0.0
 
     @property
     def z(self) -> float:
@@ -79,14 +81,12 @@ class ContactResponse:
     @property
     def before_hz(self) -> float:
         """Mean rate of a unit 3 to 40 ms before contact, in spikes per second."""
-        low, high = RISE_MS
-        return self._rate(BEFORE_MS - high, BEFORE_MS - low)
+        return self._rate(BEFORE)
 
     @property
     def after_hz(self) -> float:
         """Mean rate of a unit 3 to 40 ms after contact, in spikes per second."""
-        low, high = RISE_MS
-        return self._rate(BEFORE_MS + low, BEFORE_MS + high)
+        return self._rate(AFTER)
 
     @property
     def latency_s(self) -> float:
@@ -95,9 +95,9 @@ class ContactResponse:
         base, after = smooth[1:BEFORE_MS].mean(), smooth[BEFORE_MS:-1]
         return float(np.argmax(after >= (base + after.max()) / 2) + 0.5) * 1e-3
 
-    def _rate(self, begin: int, end: int) -> float:
-        time_s = self.windows * (end - begin) * 1e-3
-        return float(self.histogram[begin:end].sum() / time_s) if time_s else 0.0
+    def _rate(self, part: slice) -> float:
+        time_s = self.windows * (part.stop - part.start) * 1e-3
+        return float(self.histogram[part].sum() / time_s) if time_s else 0.0
 
 
 def contact_response(
@@ -130,11 +130,6 @@ def contact_response(
     # A microsecond less: what is stored in seconds lies beside a bin's edge by rounding.
     reached = np.searchsorted(times, first[:, None] + edges_s - 1e-6)
     histogram = np.diff(reached.sum(axis=0))
-    begin, end = RISE_MS
-    rise = (
-        histogram[BEFORE_MS + begin : BEFORE_MS + end].sum()
-        - histogram[BEFORE_MS - end : BEFORE_MS - begin].sum()
-    )
     shifts, rises = _search(times, first, reach)
     low, high = np.percentile(rises, (2.5, 97.5))  # few enough shifts lie in a true rise
     spread = float(high - low) / 3.92
@@ -145,7 +140,7 @@ def contact_response(
         shift_s=shift_s,
         histogram=histogram,
         windows=len(first) * len(spikes),
-        rise=float(rise),
+        rise=float(histogram[AFTER].sum() - histogram[BEFORE].sum()),
         spread=spread,
         other_s=float(shifts[best]) + shift_s,
         other_z=float(rises[best]) / spread if spread > 0 else 0.0,
@@ -180,8 +175,6 @@ def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
         windows=sum(r.windows for r in responses),
         rise=sum(r.rise for r in responses),
         spread=float(np.sqrt(sum(r.spread**2 for r in responses))),
-        other_s=0.0,
-        other_z=0.0,
     )
     shifts = [r.shift_s for r in responses]
     where = "spikes on the session's clock (offset 0 s)"

@@ -11,7 +11,7 @@ import numpy as np
 from tactile_rt.alignment.layers import PARTS, Layers
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import read_model
-from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.core.errors import ConfigError, ModelError, explain_errors
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoints import describe_checkpoint
@@ -150,7 +150,7 @@ def responses_layers(path: Path) -> Layers:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     traces = {}
-    try:
+    with explain_errors(ConfigError, f"{path}: no archive of arrays ("):
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 array = archive[name]
@@ -172,11 +172,6 @@ def responses_layers(path: Path) -> Layers:
                     short = full.removeprefix("encoder.")
                     raise ConfigError(f"{path}: arrays {short} and {full} are one layer: name one")
                 traces[full] = (array if array.ndim == 3 else array[:, None]).astype(np.float32)
-    except ConfigError:
-        raise
-    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path}: no archive of arrays ({reason})") from None
     if not traces:
         raise ConfigError(f"{path}: has no array, so no layer")
     return Layers(

@@ -27,9 +27,9 @@ from tactile_rt.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.alignment.neural import NeuralSession
 from tactile_rt.alignment.rdm import stimulus_index
 from tactile_rt.alignment.selection import Selection
-from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, explain_errors, name_some
 from tactile_rt.core.files import check_no_pointer
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def read_nwb(
         What was read of the sessions that are selected, and notes on what was left out, sessions
         that cannot be read among these.
     """
-    _h5py()
+    _import_h5py()
     wanted = selection or Selection()
     named = list(files)
     files = [path for path in named if wanted.takes(path.stem)]
@@ -126,23 +126,19 @@ def read_session(
     for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
-    h5py = _h5py()
+    h5py = _import_h5py()
     check_no_pointer(path)
-    try:
-        with h5py.File(path, "r") as file:
-            return _session(file, path.stem, window, progress, clock, selection or Selection())
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
-    except Exception as error:  # of a damaged file HDF5 raises a dozen unrelated types
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{path}: cannot be read as NWB ({reason})") from None
+    with explain_errors(ConfigError, f"{path}: cannot be read as NWB ("):
+        try:
+            with h5py.File(path, "r") as file:
+                return _session(file, path.stem, window, progress, clock, selection or Selection())
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
 
 
-def _h5py() -> Any:
-    try:
+def _import_h5py() -> Any:
+    with require_extra("reading NWB needs", "align"):
         import h5py
-    except ModuleNotFoundError as error:
-        raise lacking("reading NWB needs", "align", error) from None
     return h5py
 
 

@@ -11,8 +11,7 @@ keeps both these and every tensor's name. A graph encoder's maps are its recurre
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from tactile_rt.alignment.layers import PARTS, Layers, first_difference, table
 from tactile_rt.alignment.stimuli_input import STEPS, StimuliInput
 from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.runtime import FlushDenormals
-from tactile_rt.core.errors import ModelError, TactileError
+from tactile_rt.core.errors import ModelError, explain_errors
 
 __all__ = ["GRU_LAYERS", "named_taps", "onnx_layers", "precision_of", "step_graph", "with_outputs"]
 
@@ -186,7 +185,7 @@ TAP = "tap:"  # prefix of the outputs that are added
 
 def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
     """Read the layers of a step or window file, and its card."""
-    with _readable(path):
+    with explain_errors(ModelError, f"{path}: its layers cannot be read (", most=REASON):
         plain, card, model = _opened(path, stimuli)
         taps = named_taps(model)
         tensors = list(dict.fromkeys(taps.values()))
@@ -234,18 +233,6 @@ def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelPr
             for axes in (a for a in scan.attribute if a.name == "scan_output_axes"):
                 axes.ints.append(0)  # as it is unless told
     return copy
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Say of which file it is that onnxruntime cannot run it, or that it is not as ours are."""
-    try:
-        yield
-    except TactileError:
-        raise
-    except Exception as error:  # onnxruntime raises a dozen unrelated types
-        reason = " ".join(str(error).split())[:REASON] or type(error).__name__
-        raise ModelError(f"{path}: its layers cannot be read ({reason})") from None
 
 
 def _opened(

@@ -23,6 +23,8 @@ the same key in the end is interchangeable.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,7 +195,7 @@ def _pools(
         kept.append(
             _Pool(moments_of(made.halves, chosen), moments_of(made.quarters, chosen[:, :, None]))
         )
-    return _sum(every), _sum(kept)
+    return reduce(add, every), reduce(add, kept)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,19 +260,12 @@ def _consistency(
         others = [j for j in usable if j != i]
         if not others:
             break
-        source = _sum([pools[j] for j in others]).freeze()
+        source = reduce(add, [pools[j] for j in others]).freeze()
         pooled[i] = pearson(source.rdm, mine.rdm) * source.factor * mine.factor
         for j in others:
             other = targets[j].chosen
             pairwise[i, j] = pearson(mine.rdm, other.rdm) * mine.factor * other.factor
     return Consistency(names, pooled, pairwise)
-
-
-def _sum(pools: Sequence[_Pool]) -> _Pool:
-    total = pools[0]
-    for pool in pools[1:]:
-        total = total + pool
-    return total
 
 
 def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:

@@ -45,6 +45,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse", "without_bad_samples"]
 
 Mode = Literal["episode", "sliding"]
+Floats = NDArray[np.float32]
 EVERY = 4
 # How far a live network may be behind before it skips to the newest sample: so many steps, and at
 # least so long.
@@ -88,12 +89,12 @@ class Classification:
     final: bool
     label: str
     labels: tuple[str, ...]
-    probabilities: NDArray[np.float32]
+    probabilities: Floats
     latency_s: float
     prediction_set: tuple[str, ...] = ()
     coverage: float | None = None
     late: bool = False
-    embedding: NDArray[np.float32] | None = None
+    embedding: Floats | None = None
 
     @property
     def probability(self) -> float:
@@ -274,9 +275,7 @@ class Classifier:
             if decision is not None:
                 yield decision
 
-    def _sample(
-        self, t_ns: int, sample: NDArray[np.float32], valid: NDArray[np.bool_]
-    ) -> Classification | None:
+    def _sample(self, t_ns: int, sample: Floats, valid: NDArray[np.bool_]) -> Classification | None:
         touched = self.detector.contact
         begins = self.detector.update(sample, valid)
         if self.detector.contact != touched:
@@ -295,12 +294,9 @@ class Classifier:
         elif before and self._sliding and self.detector.contact:
             self._begin(t_ns)  # a window within a contact, as others of this mode
             self._set_rule = None
-        if self._onset_ns is None:
-            return None
         if self._decided and not self.detector.contact:
             self._onset_ns = None  # released: the next contact is a new episode
-            return None
-        if self._decided and not self._sliding:
+        if self._onset_ns is None or (self._decided and not self._sliding):
             return None
         now = np.where(untouched[:, None], self._offset, sample)
         self._stepper.samples[:, self._filled] = now[self._order]
@@ -353,12 +349,16 @@ class Classifier:
         lane, step = asked
         probabilities = self._posterior(logits[lane])
         if probabilities is None:
-            self._give_up()
+            # The state is no number and would stay none: end the episode, or begin windows anew.
+            self.stats.bad_steps += 1
+            self._step, self._decided = 0, True
+            self._stepper.begin(self._offset[self._order], self._sigma[self._order])
             return None
         best = decided(self.card, probabilities, step)
         final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
         # it was fitted on windows that begin where the contact does
         rule = None if self._decided else self._set_rule
+        left = rule.prediction_set(probabilities[: len(self.card.classes)], step) if rule else []
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
             self.stats.withheld += 1
@@ -372,37 +372,21 @@ class Classifier:
             labels=self.card.labels,
             probabilities=probabilities,
             latency_s=latency,
-            prediction_set=self._predict_set(rule, probabilities, step),
+            prediction_set=tuple(self.card.classes[k] for k in left),
             coverage=rule.coverage if rule else None,
             late=late,
             embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
         )
 
-    def _predict_set(
-        self, rule: PredictionSetRule | None, probabilities: NDArray[np.float32], step: int
-    ) -> tuple[str, ...]:
-        if rule is None:
-            return ()
-        classes = self.card.classes
-        left = rule.prediction_set(probabilities[: len(classes)], step)
-        return tuple(classes[k] for k in left)
-
-    def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:
-        probabilities: NDArray[np.float32] = logits / self.card.temperature
+    def _posterior(self, logits: Floats) -> Floats | None:
+        probabilities: Floats = logits / self.card.temperature
         probabilities -= probabilities.max()
         np.exp(probabilities, out=probabilities)
         probabilities /= probabilities.sum()
         return probabilities if np.isfinite(probabilities).all() else None
 
-    def _give_up(self) -> None:
-        """The state is no number and would stay none: end the episode, or begin windows anew."""
-        self.stats.bad_steps += 1
-        self._step = 0
-        self._decided = True
-        self._stepper.begin(self._offset[self._order], self._sigma[self._order])
 
-
-def fuse(posteriors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+def fuse(posteriors: Sequence[Floats]) -> Floats:
     """Combine posteriors (class,) of independent sweeps of one object: their normalised product.
 
     Assumes equal priors, as the training sets have.
@@ -412,7 +396,7 @@ def fuse(posteriors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     """
     evidence = np.log(np.clip(np.stack(posteriors), 1e-12, None)).sum(axis=0)
     fused = np.exp(evidence - evidence.max())
-    normalised: NDArray[np.float32] = (fused / fused.sum()).astype(np.float32)
+    normalised: Floats = (fused / fused.sum()).astype(np.float32)
     return normalised
 
 

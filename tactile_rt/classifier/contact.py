@@ -37,6 +37,8 @@ SUSPICION = 0.45  # of the onset's threshold: samples since then are not the bas
 # touch soon after its end.
 LIMIT = np.array([np.inf, 3.0, 3.0], dtype=np.float32)[:, None, None]
 
+Floats = NDArray[np.float32]
+
 
 def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
     """Compute the thresholds of the EWMA charts, (chart, element) sigma^2.
@@ -92,7 +94,7 @@ class ContactDetector:
             they may be of the touch already.
     """
 
-    def __init__(self, shape: tuple[int, int], floor: NDArray[np.float32]) -> None:
+    def __init__(self, shape: tuple[int, int], floor: Floats) -> None:
         self.floor = floor.astype(np.float32)
         self.contact = False
         self.offset = np.zeros(shape, dtype=np.float32)
@@ -119,7 +121,7 @@ class ContactDetector:
         """Whether the baseline is complete."""
         return len(self._baseline) >= MIN_BASELINE_SAMPLES
 
-    def update(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> bool:
+    def update(self, sample: Floats, valid: NDArray[np.bool_]) -> bool:
         """Take one sample; return True when contact begins with it.
 
         Args:
@@ -155,7 +157,7 @@ class ContactDetector:
             self._learn(GUARD_SAMPLES)
         return begins
 
-    def _excess(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _excess(self, sample: Floats, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(element,) largest statistic, each in units of its threshold."""
         trusted = (valid & self.has_baseline)[:, None]
         z = np.where(trusted, sample - self.offset, np.float32(0)) / self._pooled
@@ -164,7 +166,7 @@ class ContactDetector:
         excess: NDArray[np.float64] = (z2 / self._onset_z2).max(axis=0)
         return excess
 
-    def _wait(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> None:
+    def _wait(self, sample: Floats, valid: NDArray[np.bool_]) -> None:
         if not valid.any():  # it says nothing, and takes no place in the baseline of one that did
             return
         self._quiet += 1
@@ -226,17 +228,11 @@ class _Rest:
     """
 
     def __init__(self) -> None:
-        self.block: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
+        self.block: list[tuple[Floats, NDArray[np.bool_]]] = []
         self._levels: deque[_Level] = deque(maxlen=LEVELS)
         self._at: _Level | None = None  # None: it moves
 
-    def found(
-        self,
-        sample: NDArray[np.float32],
-        known: NDArray[np.bool_],
-        sigma: NDArray[np.float32],
-        quiet: int,
-    ) -> bool:
+    def found(self, sample: Floats, known: NDArray[np.bool_], sigma: Floats, quiet: int) -> bool:
         """Take one sample; whether it completes a stretch of rest.
 
         Args:
@@ -270,18 +266,18 @@ class _Rest:
         all_of_them: NDArray[np.bool_] = np.logical_and.reduce([known for _, known in self.block])
         return all_of_them
 
-    def _new(self, median: NDArray[np.float32]) -> "_Level":
+    def _new(self, median: Floats) -> "_Level":
         self._levels.append(level := _Level(median))
         return level
 
 
 @dataclass
 class _Level:
-    median: NDArray[np.float32]  # (element, channel) NaN: not known
+    median: Floats  # (element, channel) NaN: not known
     returns: int = 0
     samples: int = 0
 
-    def near(self, median: NDArray[np.float32], sigma: NDArray[np.float32]) -> bool:
+    def near(self, median: Floats, sigma: Floats) -> bool:
         """Whether the median of another stretch is the same, but for noise."""
         # The variance of a median is pi / 2 times that of a mean, and there are two of them.
         z2 = np.square((median - self.median) / sigma).sum(axis=1) * STRETCH_SAMPLES / np.pi

@@ -76,7 +76,7 @@ class Resampler:
         """Cut a chunk at its long silences."""
         cuts = np.flatnonzero(np.diff(chunk.t_ns) > self._longest_gap_ns) + 1
         edges = [0, *cuts.tolist(), len(chunk)]
-        return [_slice(chunk, a, b) for a, b in itertools.pairwise(edges)]
+        return [chunk.select(slice(a, b)) for a, b in itertools.pairwise(edges)]
 
     def _in_order(self, chunk: Chunk) -> Chunk | None:
         last = np.iinfo(np.int64).min if self._held is None else self._held.t_ns[-1]
@@ -85,9 +85,7 @@ class Resampler:
         self.out_of_order += int((~keep).sum())
         if keep.all():
             return chunk
-        if not keep.any():
-            return None
-        return Chunk(chunk.seq[keep], chunk.t_ns[keep], chunk.values[keep], chunk.valid[keep])
+        return chunk.select(keep) if keep.any() else None
 
     def _skip_to(self, t_ns: int) -> None:
         assert self._origin is not None
@@ -107,7 +105,7 @@ class Resampler:
         self._next = max(self._next, ready)
         oldest = self._origin + self._next * self.period_ns - self.half_width_ns
         keep = min(int(np.searchsorted(held.t_ns, oldest)), len(held) - 1)
-        self._held = _slice(held, keep, None)
+        self._held = held.select(slice(keep, None))
         return out
 
     def _output(self, held: Chunk, k: int) -> Chunk:
@@ -130,12 +128,3 @@ class Resampler:
             mean[None].astype(np.float32),
             valid[None],
         )
-
-
-def _slice(chunk: Chunk, start: int, stop: int | None) -> Chunk:
-    return Chunk(
-        chunk.seq[start:stop],
-        chunk.t_ns[start:stop],
-        chunk.values[start:stop],
-        chunk.valid[start:stop],
-    )

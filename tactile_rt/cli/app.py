@@ -17,7 +17,7 @@ import typer
 
 from tactile_rt.cli.panels import WELCOME, PanelGroup
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.packages import VERSION, lacking
+from tactile_rt.core.packages import VERSION, require_extra
 
 if TYPE_CHECKING:
     from tactile_rt.core.stream import Source
@@ -124,11 +124,8 @@ def open_url(url: str) -> "Source":
 @contextmanager
 def needing(extra: str) -> Iterator[None]:
     """Let the block import what an extra brings; say which where it is missing."""
-    try:
-        with starting():
-            yield
-    except ModuleNotFoundError as error:
-        raise lacking("this needs", extra, error) from None
+    with require_extra("this needs", extra), starting():
+        yield
 
 
 @contextmanager

@@ -286,11 +286,8 @@ class Demonstration:
         self._miss_before(number)
         self.target, self.decision = self.passes[number], decision
         if decision.final:
-            self.outcomes.append(
-                SweepOutcome(
-                    self.target.name, self.target.category, decision.label, decision.probability
-                )
-            )
+            of = self.target.name, self.target.category
+            self.outcomes.append(SweepOutcome(*of, decision.label, decision.probability))
 
     def _miss_before(self, number: int) -> None:
         for missed in self.passes[len(self.outcomes) : number]:

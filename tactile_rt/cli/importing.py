@@ -79,8 +79,10 @@ def import_file(
     check_new(output, force)
     if plot is not None:
         check_output(plot)
-        with needing("view"):
-            check_picture(plot)
+        if plot.suffix.lower() not in PICTURES:
+            raise ConfigError(f"{plot} is no picture: give --plot a {', '.join(PICTURES)}")
+        with needing("view"):  # before anything is read
+            import matplotlib  # noqa: F401
     if decimal not in ("", ",", "."):
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
     with ExitStack() as stack:
@@ -88,8 +90,38 @@ def import_file(
         if strict:  # hidden until it is known to be good
             hidden = stack.enter_context(TemporaryDirectory(prefix=".", dir=output.parent))
             target = Path(hidden) / output.name
-        wanted = (decoded_as, columns, topic, rate, bus, form)
-        made = _import(log, target, wanted, (delimiter, decimal, skip, lines))
+        with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
+            from tactile_rt.drivers.logs import read_log
+            from tactile_rt.recording.importing.bag import import_bag
+            from tactile_rt.recording.importing.bag_file import is_bag
+            from tactile_rt.recording.importing.csv import csv_form, read_table
+            from tactile_rt.recording.importing.report import report_lines
+            from tactile_rt.recording.importing.table import import_table
+            from tactile_rt.recording.importing.wire import import_wire
+
+            if is_bag(log):
+                if decoded_as:
+                    raise ConfigError(
+                        f"{log} is a bag: its messages are no bytes of a codec; no --as"
+                    )
+                made = import_bag(log, target, topic, columns, rate)
+            elif decoded_as and columns:
+                raise ConfigError("give --as, for what a device spoke, or --columns, for a table")
+            elif decoded_as:
+                packets = read_log(log, form, bus)
+                made = import_wire(packets, target, codec_fields(decoded_as, "--as"), rate)
+            elif columns:
+                table = read_table(log, csv_form(log, delimiter, decimal, skip, lines))
+                made = import_table(table, target, columns, rate)
+            else:
+                raise ConfigError(
+                    f"{log}: say what it is: --as codec=NAME or --columns ...; "
+                    f"`tactile-rt sniff {log}` tells which"
+                )
+        if rate and not decoded_as:
+            made.said_hz = rate
+            if made.found_hz == rate:
+                made.found_hz = None  # no column is a time
         odd = _list_odd(made)
         for note in made.notes:
             typer.echo(f"{log}: {note}", err=True)
@@ -99,50 +131,8 @@ def import_file(
             draw_import(target, made, odd, plot)
         if strict:
             os.replace(target, output)
-    from tactile_rt.recording.importing.report import report_lines
-
     if not told_as_json({"file": output, **vars(made), "odd": odd}, json):
         typer.echo(f"{output}: " + "\n  ".join(report_lines(made)))
-
-
-def _import(
-    log: Path,
-    output: Path,
-    wanted: tuple[str, str, str, float, str, str],
-    form: tuple[str, str, int, int],
-) -> "Import":
-    """Write the recording of a file, whatever it is."""
-    decoded_as, columns, topic, rate, bus, log_form = wanted
-    with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
-        from tactile_rt.drivers.logs import read_log
-        from tactile_rt.recording.importing.bag import import_bag, is_bag
-        from tactile_rt.recording.importing.csv import csv_form, read_table
-        from tactile_rt.recording.importing.table import import_table
-        from tactile_rt.recording.importing.wire import import_wire
-
-        made: Import
-        if is_bag(log):
-            if decoded_as:
-                raise ConfigError(f"{log} is a bag: its messages are no bytes of a codec; no --as")
-            made = import_bag(log, output, topic, columns, rate)
-        elif decoded_as and columns:
-            raise ConfigError("give --as, for what a device spoke, or --columns, for a table")
-        elif decoded_as:
-            packets = read_log(log, log_form, bus)
-            made = import_wire(packets, output, codec_fields(decoded_as, "--as"), rate)
-        elif columns:
-            table = read_table(log, csv_form(log, *form))
-            made = import_table(table, output, columns, rate)
-        else:
-            raise ConfigError(
-                f"{log}: say what it is: --as codec=NAME or --columns ...; "
-                f"`tactile-rt sniff {log}` tells which"
-            )
-    if rate and not decoded_as:
-        made.said_hz = rate
-        if made.found_hz == rate:
-            made.found_hz = None  # no column is a time
-    return made
 
 
 def _list_odd(made: "Import") -> list[str]:
@@ -166,13 +156,6 @@ def codec_fields(text: str, option: str) -> dict[str, str]:
     if len(fields) < len(pairs) or not fields.get("codec"):
         raise ConfigError(f"{option} is codec=NAME&OPTION=VALUE..., each once, not {text!r}")
     return fields
-
-
-def check_picture(out: Path) -> None:
-    """Refuse a picture that cannot be drawn, before anything is read."""
-    if out.suffix.lower() not in PICTURES:
-        raise ConfigError(f"{out} is no picture: give --plot a {', '.join(PICTURES)}")
-    import matplotlib  # noqa: F401
 
 
 def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> None:

@@ -114,12 +114,12 @@ class _Replay:
         """A line for each decision, as soon as it is due."""
         import msgspec
 
-        from tactile_rt.recording.replay import open_replay
+        from tactile_rt.recording.replay import prepare_replay
 
         classifier: Classifier | None = None
         after = 0
         for recording in self.files:
-            with open_replay(str(recording.path), dict(self._fields)) as source:
+            with prepare_replay(str(recording.path), dict(self._fields)).open() as source:
                 for chunk in source:
                     # Numbers that begin anew are another stream: what was touched is not known.
                     if classifier is None or chunk.seq[0] < after:

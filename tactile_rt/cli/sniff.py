@@ -11,7 +11,7 @@ import typer
 from tactile_rt.cli.app import app, check_output, leaving, starting
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -63,9 +63,7 @@ def sniff(
     check_output(json)
     told = _Told(target, json)
     tried = [codec_fields(text, "--try") for text in further or []]
-    candidates: list[Tried] = [
-        (f["codec"], {k: v for k, v in f.items() if k != "codec"}) for f in tried
-    ]
+    candidates: list[Tried] = [(fields.pop("codec"), fields) for fields in tried]
     path = Path(target.removeprefix("serial://").removeprefix("serial:"))
     with starting(), leaving(None):
         if target.startswith("can:"):
@@ -100,9 +98,9 @@ class _Told:
         if not self._alone:
             typer.echo(text)
 
-    def go_on(self, command: str) -> None:
-        """The last line: how to go on."""
-        self._all["command"] = command
+    def go_on(self, *words: object) -> None:
+        """Show the last line: the command to go on with."""
+        self._all["command"] = command = shlex.join(["tactile-rt", *map(str, words)])
         if not self._alone:
             typer.echo(command)
         told_as_json(self._all, self._json)
@@ -162,7 +160,7 @@ def _sniff_port(
         told.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
         fields = {"codec": "ascii_line", "columns": columns}
         fields |= {} if baud == 115_200 else {"baud": str(baud)}
-        told.go_on(f"tactile-rt run --source {shlex.quote(f'{url}?{_query(fields)}')}")
+        told.go_on("run", "--source", f"{url}?{_query(fields)}")
         return
     if not any(data for _, data in texts):
         hint = "" if ask else "try --ask: it may have to be started"
@@ -197,7 +195,7 @@ def _run(url: str, fit: "CodecFit", further: dict[str, str], told: _Told) -> Non
     if not fit.described:
         told.say("it has not described its array here; it does when it is started")
     sign = "&" if "?" in url else "?"
-    told.go_on(f"tactile-rt run --source {shlex.quote(f'{url}{sign}{_query(fields)}')}")
+    told.go_on("run", "--source", f"{url}{sign}{_query(fields)}")
 
 
 def _usual_baud(fit: "CodecFit") -> int:
@@ -214,7 +212,7 @@ def _usual_baud(fit: "CodecFit") -> int:
 def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     from tactile_rt.drivers.logs import read_log
     from tactile_rt.drivers.sniffing import LOOK_BYTES, LOOK_FRAMES, sniff_bytes, sniff_frames
-    from tactile_rt.recording.importing.bag import is_bag
+    from tactile_rt.recording.importing.bag_file import is_bag
 
     if is_bag(path):
         _sniff_bag(path, told)
@@ -249,8 +247,7 @@ def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
     if not fit.described:
         told.say("it has not described its array: array=FILE.json, by `tactile-rt describe`, does")
         fields["array"] = "FILE.json"
-    quoted = shlex.quote(_query(fields)) if len(fields) > 1 else _query(fields)
-    told.go_on(f"tactile-rt import {shlex.quote(str(path))} --as {quoted}")
+    told.go_on("import", path, "--as", _query(fields))
 
 
 def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
@@ -263,14 +260,13 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     if not proposed.columns:
         told.nothing(f"no columns are found with which it is read: {proposed.said}"[:200])
     told.say(f"{proposed.said}: names and units are for you to say")
-    rate, option, columns = "", "--columns", proposed.columns
+    options: list[object] = ["--columns", proposed.columns]
     if not proposed.table:
-        option, columns = "--as", _query({"codec": "ascii_line", "columns": columns})
+        options = ["--as", _query({"codec": "ascii_line", "columns": proposed.columns})]
     elif not proposed.timed:
         told.say(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
-        rate = f" --rate {GUESSED_HZ}"
-    command = f"tactile-rt import {shlex.quote(str(path))} {option} {shlex.quote(columns)}{rate}"
-    told.go_on(command)
+        options += ["--rate", GUESSED_HZ]
+    told.go_on("import", path, *options)
     return True
 
 
@@ -278,16 +274,13 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
-    from tactile_rt.recording.importing.bag import bag_topics
+    from tactile_rt.recording.importing.bag import bag_topics, is_recording
     from tactile_rt.recording.ros2 import messages
 
-    try:
-        about = Recording(path).description if path.suffix == ".mcap" else None
-    except (RecordingError, ConfigError):
-        about = None
-    if about is not None:
+    if is_recording(path):
+        about = Recording(path).description
         told.say(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
-        told.go_on(f"tactile-rt run --source {shlex.quote(f'replay:{path}')}")
+        told.go_on("run", "--source", f"replay:{path}")
         return
     topics = bag_topics(path)
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
@@ -299,14 +292,12 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     if not known and proposed:
         best = max(proposed, key=lambda t: t.messages)
         told.say(f"{best.name} has numbers: names and units are for you to say")
-        quoted = f"{shlex.quote(str(path))} --topic {shlex.quote(best.name)}"
-        told.go_on(f"tactile-rt import {quoted} --columns {shlex.quote(best.proposed)}")
+        told.go_on("import", path, "--topic", best.name, "--columns", best.proposed)
         return
     if not known:
         told.nothing(f"{path}: of no topic is known what is what", "say it with --columns")
     best = max(known, key=lambda t: t.messages)
-    only = "" if len(known) == 1 else f" --topic {shlex.quote(best.name)}"
-    told.go_on(f"tactile-rt import {shlex.quote(str(path))}{only}")
+    told.go_on("import", path, *(["--topic", best.name] if len(known) > 1 else []))
 
 
 # what is said
@@ -321,12 +312,10 @@ def _show(fits: "list[CodecFit]", told: _Told, speeds: Sequence[int] = ()) -> No
     names = ["codec", "options", *(["baud"] if speeds else []), "intact", "corrupt", "explains"]
     table = Table(*names, "notices damage", box=None, header_style="bold")
     for one in found:
-        one = one | {
-            "options": "&".join(f"{a}={b}" for a, b in one["options"].items()),
-            "explains": f"{one['explained']:.0%}",
-        }
+        options = "&".join(f"{a}={b}" for a, b in one["options"].items())
+        shown = one | {"options": options, "explains": f"{one['explained']:.0%}"}
         proof = f"{one['proof']:.0%}" if one["wire"] == "serial" else "by CAN"
-        table.add_row(*(str(one[name]) for name in names), proof)
+        table.add_row(*(str(shown[name]) for name in names), proof)
     told.show("fits", found, table)
 
 

@@ -10,7 +10,8 @@
 They are apart from `stream`, which needs numpy, so that a command starts quickly.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 __all__ = [
     "ConfigError",
@@ -19,6 +20,7 @@ __all__ = [
     "SourceError",
     "SpecMismatch",
     "TactileError",
+    "explain_errors",
     "length",
     "name_some",
     "shorten",
@@ -71,3 +73,21 @@ class RecordingError(TactileError):
 
 class ModelError(TactileError):
     """A model file is damaged, incomplete or of another version; the message names the file."""
+
+
+@contextmanager
+def explain_errors(
+    kind: type[TactileError], before: str, after: str = ")", most: int | None = None
+) -> Iterator[None]:
+    """Raise what a parser raises as one error of ours, its words within a text.
+
+    Args:
+        most: Number of characters of its words.
+    """
+    try:
+        yield
+    except TactileError:
+        raise
+    except Exception as error:  # parsers raise a dozen unrelated types
+        reason = " ".join(str(error).split())[:most] or type(error).__name__
+        raise kind(f"{before}{reason}{after}") from None

@@ -15,6 +15,8 @@ checkout by its folder; otherwise to what is installed, which pip then need not 
 import shlex
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,6 +37,7 @@ __all__ = [
     "install_extra",
     "install_line",
     "lacking",
+    "require_extra",
 ]
 
 VERSION = "0.2.0"  # which recordings, sweep sets and model files carry
@@ -91,6 +94,15 @@ def install_line(requirement: str, option: str = "") -> str:
     ours = shutil.which("pip") == str(python.with_name("pip"))
     pip = "pip" if ours else f"{shlex.quote(str(python))} -m pip"
     return f"{pip} install {option}{shlex.quote(requirement)}"
+
+
+@contextmanager
+def require_extra(what: str, extra: str) -> Iterator[None]:
+    """Raise `lacking` if an import in the block fails."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise lacking(what, extra, error) from None
 
 
 def lacking(what: str, extra: str, error: ModuleNotFoundError) -> ConfigError:

@@ -8,6 +8,7 @@ import base64
 import re
 from collections import Counter
 from collections.abc import Mapping
+from decimal import Decimal
 from typing import Any, Final
 
 from tactile_rt.core.stream import NS_PER_S
@@ -288,13 +289,10 @@ def _frame(
     return bus, [CanFrame(number, data, extended, fd or n > 8, remote)], t_ns
 
 
-def _time(text: str, unit_ns: int = NS_PER_S) -> int | None:
-    """A time in ns: whole and parts exactly, or a date."""
+def _time(text: str) -> int | None:
+    """Read a time in seconds, or a date, as ns; None if it is neither."""
     plain = text.strip()
     if "-" in plain or ":" in plain:
         plain = in_seconds(plain)
-    whole, _, part = plain.partition(".")
-    if not (whole.isdecimal() and (part.isdecimal() or not part)):
-        return None
-    scale: int = 10 ** len(part)
-    return int(whole) * unit_ns + int(part or 0) * unit_ns // scale
+    exact = re.fullmatch(r"\d+(?:\.\d*)?", plain)
+    return int(Decimal(plain) * NS_PER_S) if exact else None

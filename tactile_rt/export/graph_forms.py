@@ -65,11 +65,8 @@ def _store(proto: onnx.ModelProto, precision: Precision) -> None:
         name = weight.name
         if precision == "fp16":
             limit = np.finfo(np.float16).max
-            weight.CopyFrom(
-                numpy_helper.from_array(
-                    np.clip(values, -limit, limit).astype(np.float16), f"{name}_16"
-                )
-            )
+            half = np.clip(values, -limit, limit).astype(np.float16)
+            weight.CopyFrom(numpy_helper.from_array(half, f"{name}_16"))
         else:
             weight.CopyFrom(_bfloat16(values, f"{name}_16"))
         casts.append(

@@ -38,6 +38,9 @@ from tactile_rt.models.checkpoints import load_checkpoint, trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
 from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.models.evaluation.measures import (
+    Floats,
+    Labels,
+    Names,
     Step,
     among,
     at_temperature,
@@ -49,15 +52,7 @@ from tactile_rt.models.evaluation.measures import (
 )
 from tactile_rt.sets.splits import join_manifests
 
-__all__ = [
-    "COVERAGE",
-    "fit_open_set",
-    "fit_prediction_sets",
-    "fit_temperature",
-    "quantisation_figures",
-    "release",
-    "run_file",
-]
+__all__ = ["fit_open_set", "fit_prediction_sets", "fit_temperature", "release"]
 
 TEMPERATURES = np.geomspace(0.25, 4.0, 81)
 COVERAGE = 0.95
@@ -70,7 +65,7 @@ SMALLEST = 0.05  # what is usual, at least: where nearly all sweeps are right, i
 NOISE = {0.3: (0.0, 0.3), 1.2: (1.2,), 2.2: (2.2,)}
 REFUSED_AT = (0.0, 1.0)  # the noise at which so few are refused, each
 
-Floats = NDArray[np.float64]
+Doubles = NDArray[np.float64]
 
 
 def release(
@@ -136,14 +131,12 @@ def embedding_statistics(
 ) -> EmbeddingStatistics | None:
     """Where labelled sweeps of the known classes lie; None if a class has fewer than two."""
 
-    def embed(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def embed(*loads: Floats) -> Floats:
         device = model.inputs.clip.device
-        windows = (torch.from_numpy(a).to(device) for a in (samples, offset, sigma))
+        windows = (torch.from_numpy(a).to(device) for a in loads)
         with torch.inference_mode():
             steps = model.eval().network.embed(model.inputs(*windows))
-            mean: NDArray[np.float32] = steps.mean(dim=1).float().cpu().numpy()
+            mean: Floats = steps.mean(dim=1).float().cpu().numpy()
         return mean
 
     found, touched = run_over(cut_windows(data), embed)
@@ -159,9 +152,7 @@ def run_file(path: Path) -> Step:
     """The function that `evaluation.predict` wants, of a model file of either kind."""
     session, card = load_model(path, kind=None)
 
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
         # One by one, as a robot runs it: a batch would share the scale of its activations.
         parts = (slice(i, i + 1) for i in range(len(samples)))
         outputs = [file_outputs(session, card, samples[i], offset[i], sigma[i]) for i in parts]
@@ -178,10 +169,10 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
         ``quantisation_posterior``, the largest difference of a posterior, and
         ``quantisation_sweeps``, how many that were.
     """
-    file, classes = run_file(path), len(sweeps.manifest.categories)
+    classes = len(sweeps.manifest.categories)
     before, after = (
         np.concatenate([among(predict(sweeps, run, n)[:, -1], classes) for n in (0.0, 1.0)])
-        for run in (trained, file)
+        for run in (trained, run_file(path))
     )
     labels = np.tile(sweeps.sweeps.labels, 2)
     decided = ~np.isnan(before[:, 0])
@@ -204,7 +195,7 @@ def _described(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelC
     return card
 
 
-def fit_temperature(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> float:
+def fit_temperature(posteriors: Floats, labels: Labels) -> float:
     """The temperature that minimises the negative log-likelihood (Guo et al. 2017).
 
     Args:
@@ -270,9 +261,7 @@ def fit_rules(
     return unknown, tuple(rules)
 
 
-def fit_open_set(
-    groups: Sequence[tuple[NDArray[np.float32], NDArray[np.str_]]], refused: float = REFUSED
-) -> OpenSetRule:
+def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSED) -> OpenSetRule:
     """Fit thresholds that refuse few sweeps of known kinds at each step.
 
     Args:
@@ -295,9 +284,7 @@ def fit_open_set(
 
 
 def fit_prediction_sets(
-    groups: Sequence[tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.str_]]],
-    noise: float,
-    coverage: float = COVERAGE,
+    groups: Sequence[tuple[Floats, Labels, Names]], noise: float, coverage: float = COVERAGE
 ) -> PredictionSetRule | None:
     """Fit the quantiles of a coverage in each group; None with too few objects.
 
@@ -317,14 +304,8 @@ def fit_prediction_sets(
         objects |= set(own)
         scores = mass_above(posteriors)[np.arange(len(labels)), :, labels]
         usual = np.isin(names, own[::2])
-        fitted.append(
-            _envelope(
-                scores[~usual],
-                _weights(names[~usual]),
-                _usual(scores[usual], _weights(names[usual])),
-                coverage,
-            )
-        )
+        level = _usual(scores[usual], _weights(names[usual]))
+        fitted.append(_envelope(scores[~usual], _weights(names[~usual]), level, coverage))
     quantiles = np.max(fitted, axis=0)
     return PredictionSetRule(
         MASS_ABOVE, coverage, tuple(float(q) for q in quantiles), len(objects), noise=noise
@@ -349,24 +330,24 @@ def _touched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     return kept
 
 
-def _weights(names: NDArray[np.str_]) -> Floats:
+def _weights(names: Names) -> Doubles:
     """(sweep,) Each object's weight is one of all objects and one yet to come."""
     _, which, count = np.unique(names, return_inverse=True, return_counts=True)
-    weights: Floats = 1 / (count[which] * (len(count) + 1))
+    weights: Doubles = 1 / (count[which] * (len(count) + 1))
     return weights
 
 
-def _usual(scores: Floats, weights: Floats) -> Floats:
+def _usual(scores: Doubles, weights: Doubles) -> Doubles:
     """(step,) What few sweeps (sweep, step) of scores in [0, 1) exceed at a step."""
     order = np.argsort(scores, axis=0)
     share = np.cumsum(weights[order], axis=0) / weights.sum()
     rank = np.minimum((share < USUAL).sum(axis=0), len(scores) - 1)
     usual = np.take_along_axis(scores, order, axis=0)[rank, np.arange(len(rank))]
-    clipped: Floats = np.clip(usual, SMALLEST, 1 - SMALLEST * 1e-4)
+    clipped: Doubles = np.clip(usual, SMALLEST, 1 - SMALLEST * 1e-4)
     return clipped
 
 
-def _envelope(scores: Floats, weights: Floats, usual: Floats, coverage: float) -> Floats:
+def _envelope(scores: Doubles, weights: Doubles, usual: Doubles, coverage: float) -> Doubles:
     """(step,) The scores that no step of so large a share of the sweeps exceeds.
 
     Args:
@@ -381,5 +362,5 @@ def _envelope(scores: Floats, weights: Floats, usual: Floats, coverage: float) -
     enough = np.searchsorted(np.cumsum(weights[order]), coverage - 1e-12)
     if enough == len(worst):
         return np.ones(len(usual))  # too few objects for any set but that of all classes
-    found: Floats = 1 - (1 - usual) ** (worst[order[enough]] * (1 + 1e-9))
+    found: Doubles = 1 - (1 - usual) ** (worst[order[enough]] * (1 + 1e-9))
     return found

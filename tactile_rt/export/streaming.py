@@ -20,16 +20,8 @@ from tactile_rt.models.attenders import GPT
 from tactile_rt.models.ead import EAD
 from tactile_rt.models.encoders.cells import FORGET_BIAS, Cell, IntersectionCell, State
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
-from tactile_rt.models.encoders.resnet import FoldedResNet18, ResNet18Encoder
 
-__all__ = [
-    "StreamingGPT",
-    "StreamingGraph",
-    "StreamingIntersection",
-    "StreamingResNet18",
-    "streaming",
-]
-
+__all__ = ["StreamingGraph", "streaming"]
 
 LARGE = 2**18  # numbers of a convolution's weights, from where on `Pointwise` was the faster form
 
@@ -49,8 +41,6 @@ def streaming(network: EAD, integer: bool = False) -> EAD:
     if isinstance(encoder, GraphEncoder):
         if all(_plain(encoder, node.name) for node in encoder.graph.nodes):
             out.encoder = StreamingGraph(encoder, integer)
-    elif isinstance(encoder, ResNet18Encoder):
-        out.encoder = StreamingResNet18(encoder)
     elif hasattr(encoder, "deployed"):
         out.encoder = encoder.deployed()
     if isinstance(network.attender, GPT):
@@ -213,10 +203,8 @@ class StreamingGraph(nn.Module):
                 x, memory = cell(x, tuple(state[name] for name in names))
                 new |= dict(zip(names, memory, strict=True))
             new[f"{node.name}_h"] = F.relu(x)
-        return new[f"{self.graph.readout}_h"], {key: new[key] for key in self.initial_keys()}
-
-    def initial_keys(self) -> list[str]:
-        return [key for node in self.graph.nodes for key in self._keys(node.name)]
+        kept = (key for node in self.graph.nodes for key in self._keys(node.name))
+        return new[f"{self.graph.readout}_h"], {key: new[key] for key in kept}
 
     def _dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
         """Of every site's channels, then those of vectors."""
@@ -236,22 +224,3 @@ class StreamingGraph(nn.Module):
             assert isinstance(cell, Cell)
             memory = [f"{name}_{kind}" for kind in cell.states]
         return memory + [f"{name}_h"] * (name in self.heard)
-
-
-class StreamingResNet18(FoldedResNet18):
-    """A `FoldedResNet18` that is traced for any number of lanes."""
-
-    def _encode(self, frames: Tensor) -> Tensor:
-        layers = self.layers
-        x = F.relu(layers["stem"](frames.flatten(2).transpose(1, 2).flatten(1)))
-        x = x.unflatten(1, (*self.shape, -1))
-        for axis in (1, 2):  # the largest of 3 x 3 sites, stride 2, padded by 1
-            size = x.shape[axis]
-            ranges = [(max(c - 1, 0), min(c + 2, size)) for c in range(0, size, 2)]
-            x = torch.stack([x.narrow(axis, a, b - a).amax(axis) for a, b in ranges], axis)
-        x = x.flatten(1)
-        for i in range(self.count):
-            short = layers[f"{i}_shortcut"](x) if f"{i}_shortcut" in layers else x
-            x = F.relu(short + layers[f"{i}_second"](F.relu(layers[f"{i}_first"](x))))
-        features: Tensor = layers["fc"](x)
-        return features

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from tactile_rt.models.attenders import GPT, HEADS, TOKENS
 from tactile_rt.models.attenders.gpt import TransformerBlock
 
-__all__ = ["Columns", "Pointwise", "Product", "StreamingGPT", "product_of"]
+__all__ = ["Columns", "Pointwise", "Product", "StreamingGPT"]
 
 WIDE = 256  # features, from where on convolutions were the faster products
 
@@ -81,11 +81,6 @@ class Pointwise(nn.Module):
         return out.permute(0, 2, 3, 1).flatten(0, missing)
 
 
-def product_of(linear: nn.Linear) -> Product:
-    """A linear layer as a product."""
-    return Product(linear.weight, linear.bias)
-
-
 class StreamingGPT(nn.Module):
     """A `GPT` whose cache is one tensor per layer and kind, of which a step writes its own rows."""
 
@@ -102,7 +97,7 @@ class StreamingGPT(nn.Module):
             positions[:, 1] += gpt.project_in(gpt.action)
         self.register_buffer("positions", positions.flatten(1))
         self.project_in = Product(gpt.project_in.weight, None)
-        self.project_out = product_of(gpt.project_out)
+        self.project_out = Product(gpt.project_out.weight, gpt.project_out.bias)
         self.norm = gpt.norm
         convolve = not integer and gpt.features >= WIDE
         self.layout = (1, -1, TOKENS, gpt.features) if convolve else (-1, gpt.features)

@@ -16,6 +16,8 @@ __all__ = ["CLEAN", "OFFSET", "RATED", "Disturbance"]
 
 OFFSET = 2.0  # a unit of offset that appears after the baseline, in units of the rated noise
 
+Floats = NDArray[np.float32]
+
 
 @dataclass(frozen=True)
 class Disturbance:
@@ -53,9 +55,7 @@ class Disturbance:
             if not getattr(self, name) >= 0:  # which NaN is not either
                 raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
 
-    def of_samples(
-        self, values: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def of_samples(self, values: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
         """What the detector sees.
 
         Args:
@@ -89,9 +89,7 @@ class Disturbance:
             values = values + noise * data.noise * level[:, None, None, None]
         return values
 
-    def of_windows(
-        self, samples: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
-    ) -> NDArray[np.float32]:
+    def of_windows(self, samples: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
         """What the network sees, of (sweep, step, sub-step, element, channel) SI."""
         steps, substeps = samples.shape[1:3]
         course = np.arange(1, steps * substeps + 1, dtype=np.float32) / (steps * substeps)

@@ -73,41 +73,28 @@ class DeviceLine:
     options: dict[str, str]
 
 
-@dataclass(frozen=True)
 class Project:
-    """A project's folder."""
+    """A project's folder.
 
-    folder: Path
+    Attributes:
+        array: The description of the array.
+        model: The model that is made.
+        build: The folder of what is made on the way.
+        report: The folder of the report card.
+    """
 
-    def __post_init__(self) -> None:
-        if not self.folder.is_dir():
-            raise ConfigError(f"no folder {self.folder}: begin with `tactile-rt new {self.folder}`")
+    def __init__(self, folder: Path) -> None:
+        if not folder.is_dir():
+            raise ConfigError(f"no folder {folder}: begin with `tactile-rt new {folder}`")
         for name in ("array.toml", "sweeps.toml"):
-            if not (self.folder / name).is_file():
+            if not (folder / name).is_file():
                 raise ConfigError(
-                    f"{self.folder} is no project, it has no {name}: begin one with "
+                    f"{folder} is no project, it has no {name}: begin one with "
                     "`tactile-rt new` in a folder of its own"
                 )
-
-    @property
-    def array(self) -> Path:
-        """The description of the array."""
-        return self.folder / "array.toml"
-
-    @property
-    def model(self) -> Path:
-        """The model that is made."""
-        return self.folder / "model.onnx"
-
-    @property
-    def build(self) -> Path:
-        """The folder of what is made on the way."""
-        return self.folder / "build"
-
-    @property
-    def report(self) -> Path:
-        """The folder of the report card."""
-        return self.folder / "report"
+        self.folder = folder
+        self.array, self.model = folder / "array.toml", folder / "model.onnx"
+        self.build, self.report = folder / "build", folder / "report"
 
     def recipe(self) -> SweepRecipe:
         """What is to be swept past the array; its numbers of objects and sweeps are the most."""

@@ -32,7 +32,8 @@ from tactile_rt.recording.lerobot_meta import (
     CameraFilm,
     Episode,
     Statistics,
-    need_pyarrow,
+    describe_feature,
+    import_pyarrow,
     write_film,
     write_meta,
 )
@@ -70,7 +71,7 @@ def write_dataset(
             unevenly for rows.
         SpecMismatch: They are of several arrays.
     """
-    pa, pq = need_pyarrow()
+    pa, pq = import_pyarrow()
     if films and len(recordings) != 1:
         raise ConfigError("films go with one recording: make a dataset of each")
     spec = recordings[0].spec
@@ -88,7 +89,7 @@ def write_dataset(
             said = task or about.session.get("task") or spec.name
             episode = Episode(k, len(end), first, said, tasks.setdefault(said, len(tasks)))
             state, values = Statistics(), Statistics()
-            path = made / DATA.format(k // 1000, k % 1000)
+            path = made / DATA.format(chunk_index=k // 1000, file_index=k % 1000)
             path.parent.mkdir(parents=True, exist_ok=True)
             # A dictionary of values takes all kinds of NaN for one.
             with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False) as file:
@@ -195,11 +196,7 @@ def _newest(
 
 def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
     """As ``info.json`` has them."""
-    elements, channels = list(spec.elements), list(spec.channels)
-
-    def feature(kind: str, *shape: int, names: Any = None) -> dict[str, Any]:
-        return {"dtype": kind, "shape": list(shape), "names": names}
-
+    elements, channels, feature = list(spec.elements), list(spec.channels), describe_feature
     flat = [f"{e}.{c}" for e in elements for c in channels]
     return {
         STATE: feature("float32", len(flat), names=flat),

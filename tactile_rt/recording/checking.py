@@ -21,7 +21,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import WIRE
 from tactile_rt.recording.reader import Recording
-from tactile_rt.recording.replay import open_replay
+from tactile_rt.recording.replay import prepare_replay
 
 __all__ = [
     "FACTS",
@@ -201,9 +201,7 @@ def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
             kept &= (chunk.t_ns < skip["from_ns"]) | (chunk.t_ns >= skip["until_ns"])
     if kept.all():
         return chunk
-    if not kept.any():
-        return None
-    return Chunk(chunk.seq[kept], chunk.t_ns[kept], chunk.values[kept], chunk.valid[kept])
+    return chunk.select(kept) if kept.any() else None
 
 
 def _of(decision: Fields) -> str:
@@ -289,7 +287,8 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
     """
     recording = Recording(path)
     recorded = list(recording)
-    with open_replay(str(path), {**(options or {}), "from": WIRE, "speed": "0"}) as source:
+    fields = {**(options or {}), "from": WIRE, "speed": "0"}
+    with prepare_replay(str(path), fields).open() as source:
         spec, decoded = source.spec, list(source)
     if not recorded or not decoded:
         raise RecordingError(

@@ -18,6 +18,7 @@ gets its wrenches as ``geometry_msgs/msg/WrenchStamped`` besides.
 import csv
 import io
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +30,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.files import whole_folder, write_whole
-from tactile_rt.core.packages import lacking
-from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
+from tactile_rt.core.packages import require_extra
+from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording.description import RECOVERED, Description, seal
 from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
 from tactile_rt.recording.reader import Recording
@@ -69,7 +70,7 @@ def convert(path: str | Path, output: str | Path) -> int:
             "and, of tables, by `tactile-rt import`"
         )
     if write is write_hdf5:
-        need_h5py()
+        _import_h5py()
     recording, n = Recording(path), 0
 
     def fill(file: BinaryIO) -> None:
@@ -94,19 +95,14 @@ def write_csv(recording: Recording, file: BinaryIO) -> int:
     """Write a line per sample, with empty cells for elements that are not valid."""
     text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
     lines = csv.writer(text, lineterminator="\n")
-    lines.writerow(_name_columns(recording.spec))
-    n = 0
+    spec, n = recording.spec, 0
+    channels = [f"{c} [{unit}]" for c, unit in zip(spec.channels, spec.units, strict=True)]
+    lines.writerow(["seq", "t_ns", *(f"{e}.{c}" for e in spec.elements for c in channels)])
     for chunk in _read_blocks(recording):
         lines.writerows(_write_rows(chunk))
         n += len(chunk)
     text.detach()
     return n
-
-
-def _name_columns(spec: ArraySpec) -> list[str]:
-    of = zip(spec.channels, spec.units, strict=True)
-    channels = [f"{channel} [{unit}]" for channel, unit in of]
-    return ["seq", "t_ns", *(f"{e}.{c}" for e in spec.elements for c in channels)]
 
 
 def _write_rows(chunk: Chunk) -> Iterator[list[Any]]:
@@ -135,7 +131,7 @@ def write_npz(recording: Recording, file: BinaryIO) -> int:
 
 def write_hdf5(recording: Recording, file: BinaryIO) -> int:
     """Write datasets block by block, with the names and units of the array."""
-    h5py, about, n = need_h5py(), recording.description, 0
+    h5py, about, n = _import_h5py(), recording.description, 0
     with _PatientFile(os.dup(file.fileno())) as patient, h5py.File(patient, "w") as made:
         for block in _read_blocks(recording):
             for name in COLUMNS:
@@ -172,11 +168,7 @@ def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
 
 
 def _read_blocks(recording: Recording) -> Iterator[Chunk]:
-    """Read the samples, some `BLOCK` at a time.
-
-    Raises:
-        RecordingError: the recording is damaged, or has no samples.
-    """
+    """Read the samples, some `BLOCK` at a time; refuse a recording without any."""
     waiting: list[Chunk] = []
     n = total = 0
     for chunk in recording:
@@ -197,16 +189,9 @@ def _read_texts(recording: Recording, topic: str) -> tuple[list[str], NDArray[np
     return [raw.data.decode() for raw in raws], np.array([raw.t_ns for raw in raws], np.int64)
 
 
-def need_h5py() -> Any:
-    """Import the module.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
-    try:
+def _import_h5py() -> Any:
+    with require_extra("HDF5 needs", "hdf5"):
         import h5py
-    except ModuleNotFoundError as error:
-        raise lacking("HDF5 needs", "hdf5", error) from None
     return h5py
 
 
@@ -221,11 +206,7 @@ class _PatientFile(io.FileIO):
         self._failed: OSError | None = None
 
     def check(self) -> None:
-        """Raise what has failed.
-
-        Raises:
-            OSError: something could not be written.
-        """
+        """Raise what has failed."""
         if self._failed is not None:
             raise self._failed
 
@@ -311,10 +292,9 @@ def _add_wrenches(made: McapFile, raw: Raw) -> int:
 
 def _metadata(files: Sequence[_File]) -> str:
     """What ROS 2 reads first: YAML, of which JSON is a part."""
-    totals: dict[tuple[str, str], int] = {}
+    totals = Counter[tuple[str, str]]()
     for file in files:
-        for key, many in file.counts.items():
-            totals[key] = totals.get(key, 0) + many
+        totals.update(file.counts)
     begin_ns, end_ns = min(f.begin_ns for f in files), max(f.end_ns for f in files)
     about = {
         "version": BAG_VERSION,

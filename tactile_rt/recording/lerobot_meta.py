@@ -6,6 +6,7 @@ Its names and shapes are LeRobot's; https://github.com/huggingface/lerobot, ``da
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 
 __all__ = [
     "DATA",
@@ -23,8 +24,9 @@ __all__ = [
     "CameraFilm",
     "Episode",
     "Statistics",
+    "describe_feature",
     "film_of",
-    "need_pyarrow",
+    "import_pyarrow",
     "write_film",
     "write_meta",
 ]
@@ -88,7 +90,7 @@ def film_of(text: str) -> CameraFilm:
         file, begin_s = place, 0.0
     if not (equals and name.replace("_", "").isalnum() and file and np.isfinite(begin_s)):
         raise ConfigError(f"--video is NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
-    av = _need_av()
+    av = _import_av()
     try:
         with av.open(file) as film:
             stream = film.streams.video[0]
@@ -109,7 +111,7 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
     Raises:
         ConfigError: The film cannot be decoded.
     """
-    av = _need_av()
+    av = _import_av()
     path = folder / VIDEO.format(video_key=film.key, chunk_index=0, file_index=0)
     path.parent.mkdir(parents=True)
     height, width = film.size
@@ -133,7 +135,7 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
     found = {
         "min": colours.min(axis=0), "max": colours.max(axis=0), "mean": colours.mean(axis=0),
         "std": colours.std(axis=0),
-        **{f"q{q:02d}": np.percentile(colours, q, axis=0) for q in (1, 10, 50, 90, 99)},
+        **{name: np.quantile(colours, q, axis=0) for name, q in QUANTILES.items()},
     }  # fmt: skip
     shaped = {name: value.reshape(3, 1, 1) for name, value in found.items()}
     return {**shaped, "count": np.array([len(seen)])}
@@ -156,41 +158,38 @@ def _frames(av: Any, film: CameraFilm, rows: int, fps: int) -> Iterator[Any]:
             yield now[1]
 
 
-def _need_av() -> Any:
-    try:
+def _import_av() -> Any:
+    with require_extra("films need", "lerobot"):
         import av
-    except ModuleNotFoundError as error:
-        raise lacking("films need", "lerobot", error) from None
     return av
 
 
+def describe_feature(kind: str, *shape: int, names: Any = None) -> dict[str, Any]:
+    """Describe a column of the rows as ``info.json`` has it."""
+    return {"dtype": kind, "shape": list(shape), "names": names}
+
+
 INFO = "meta/info.json"
-DATA = "data/chunk-{:03d}/file-{:03d}.parquet"
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 CODEBASE = "v3.0"
 IN_CHUNK = 1000  # files of a folder
 # What every row has besides.
-FRAME: dict[str, dict[str, Any]] = {
-    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    **{
-        name: {"dtype": "int64", "shape": [1], "names": None}
-        for name in ("frame_index", "episode_index", "index", "task_index")
-    },
-}
+NUMBERS = ("frame_index", "episode_index", "index", "task_index")
+FRAME = {"timestamp": describe_feature("float32", 1)}
+FRAME |= {name: describe_feature("int64", 1) for name in NUMBERS}
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 MOST_KEPT = 10_000  # rows of numbers, of which quantiles are taken
 
 
-def need_pyarrow() -> tuple[Any, Any]:
-    """The modules ``pyarrow`` and ``pyarrow.parquet``.
+def import_pyarrow() -> tuple[Any, Any]:
+    """Import ``pyarrow`` and ``pyarrow.parquet``.
 
     Raises:
         ConfigError: The extra is not installed.
     """
-    try:
+    with require_extra("LeRobot datasets need", "lerobot"):
         import pyarrow
         import pyarrow.parquet
-    except ModuleNotFoundError as error:
-        raise lacking("LeRobot datasets need", "lerobot", error) from None
     return pyarrow, pyarrow.parquet
 
 
@@ -292,7 +291,7 @@ def write_meta(
     films: Sequence[CameraFilm],
 ) -> None:
     """Write all of it but what is ours."""
-    pa, pq = need_pyarrow()
+    pa, pq = import_pyarrow()
     info = {
         "codebase_version": CODEBASE,
         "robot_type": "tactile_rt",
@@ -304,7 +303,7 @@ def write_meta(
         "video_files_size_in_mb": 200,
         "fps": fps,
         "splits": {"train": f"0:{len(episodes)}"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "data_path": DATA,
         "video_path": VIDEO if films else None,
         "features": {**features, **{film.key: film.feature(fps) for film in films}},
     }
@@ -347,19 +346,15 @@ def _all_of(episodes: Sequence[Episode]) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for feature in episodes[0].statistics:
         each = [e.statistics[feature] for e in episodes]
-        weight = np.array([float(found["count"][0]) for found in each])
-        weight /= weight.sum()
-
-        def mean(values: list[NDArray[Any]], w: NDArray[np.float64] = weight) -> NDArray[Any]:
-            return np.tensordot(w, np.array(values), 1)
-
+        counts = [int(found["count"][0]) for found in each]
+        mean = partial(np.average, axis=0, weights=counts)
         whole = {name: mean([f[name] for f in each]) for name in ("mean", *QUANTILES)}
         spread = [f["std"] ** 2 + (f["mean"] - whole["mean"]) ** 2 for f in each]
         made[feature] = {
             "min": np.min([f["min"] for f in each], axis=0).tolist(),
             "max": np.max([f["max"] for f in each], axis=0).tolist(),
             "std": np.sqrt(mean(spread)).tolist(),
-            "count": [int(sum(f["count"][0] for f in each))],
+            "count": [sum(counts)],
             **{name: value.tolist() for name, value in whole.items()},
         }
     return made

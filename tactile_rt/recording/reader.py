@@ -1,13 +1,13 @@
 """Read a recording back. What is damaged is named, never misread."""
 
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import msgspec
 
-from tactile_rt.core.errors import ConfigError, RecordingError, TactileError
+from tactile_rt.core.errors import ConfigError, RecordingError, explain_errors
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
@@ -192,15 +192,7 @@ def _has_end(file: BinaryIO) -> bool:
     return tail.startswith(FOOTER) and tail.endswith(MAGIC)
 
 
-@contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Whatever a damaged file makes the MCAP library raise, as one error that names the file."""
-    try:
-        yield
-    except (TactileError, GeneratorExit):
-        raise
-    except Exception as error:  # a dozen unrelated types, as for any parser of damaged bytes
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RecordingError(
-            f"{path} is damaged ({reason}); `tactile-rt recover` keeps what is whole"
-        ) from None
+def _naming(path: Path) -> AbstractContextManager[None]:
+    """Name the file where its damage makes the MCAP library raise anything."""
+    hint = "); `tactile-rt recover` keeps what is whole"
+    return explain_errors(RecordingError, f"{path} is damaged (", hint)

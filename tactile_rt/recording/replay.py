@@ -12,10 +12,10 @@ replay:demo?loop=true                             the recording that comes with 
 import math
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ from tactile_rt.recording.records import MAGIC
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_object
 
-__all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
+__all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "prepare_replay"]
 
 # Six objects sweep past simulated whiskers, see bench/write_demo.py: `replay:demo`.
 DEMO = Path(__file__).parents[1] / "assets" / "demo.mcap"
@@ -61,17 +61,12 @@ class ReplayOptions:
     loop: bool = False
 
 
-def open_replay(target: str, fields: dict[str, str]) -> Source:
-    """A recording, or one object of a sweep set, as a stream.
+def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
+    """Prepare to open a recording, or one object of a sweep set, as a stream.
 
     Raises:
         ConfigError: no such file, a wrong option, or the extra is not installed.
     """
-    return prepare_replay(target, fields).open()
-
-
-def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
-    """What opens a recording, or one object of a sweep set, as a stream."""
     path, what = Path(target), f"replay:{target}"
     if not target:
         raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
@@ -79,45 +74,32 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         path = DEMO
     _check_file(path)
     if path.suffix == ".npz":
-        (sweeps,) = take_options(what, fields, SweepOptions)
-        _check_speed(what, sweeps.speed)
-        spec, manifest = _sweep_spec(path)
-        return Prepared(
-            spec,
-            partial(
-                ReplaySource,
-                spec,
-                lambda _: _sweep_chunks(path, manifest, sweeps),
-                sweeps.speed,
-                loop=sweeps.loop,
-            ),
-        )
+        sweeps = _take_options(what, fields, SweepOptions)
+        manifest = SweepManifest.read(path.parent)
+        spec = replace(manifest.spec, rate_hz=NS_PER_S / manifest.period_ns)
+
+        def sweep(_: SourceStats) -> Timed:
+            return _sweep_chunks(path, manifest, sweeps)
+
+        return Prepared(spec, partial(ReplaySource, spec, sweep, sweeps.speed, loop=sweeps.loop))
     fields = dict(fields)
     channel = fields.pop("from", SAMPLES)
     recording = Recording(path)
     about = recording.description
     if channel == SAMPLES:
-        (options,) = take_options(what, fields, ReplayOptions)
-        _check_speed(what, options.speed)
+        options = _take_options(what, fields, ReplayOptions)
         if options.codec:
             raise ConfigError(f"{what}: codec= is for from=wire; samples are decoded already")
-        return Prepared(
-            about.spec,
-            partial(
-                ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed,
-                about.calibration is not None, options.loop,
-            ),
-        )  # fmt: skip
+        chunks, calibrated = partial(_recorded, recording), about.calibration is not None
+        again = (about.spec, chunks, options.speed, calibrated, options.loop)
+        return Prepared(about.spec, partial(ReplaySource, *again))
     if channel != WIRE:
         raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
     if not about.wire:
         raise ConfigError(f"{what} has no raw packets: {about.source or 'its source'} is no device")
-    (options,) = take_options(
-        what, {k: v for k, v in fields.items() if k in ReplayOptions.__dataclass_fields__},
-        ReplayOptions,
-    )  # fmt: skip
-    _check_speed(what, options.speed)
-    own = {k: v for k, v in fields.items() if k not in ReplayOptions.__dataclass_fields__}
+    ours = [k for k in fields if k in ReplayOptions.__dataclass_fields__]
+    options = _take_options(what, {k: fields[k] for k in ours}, ReplayOptions)
+    own = {k: v for k, v in fields.items() if k not in ours}
     same = options.codec in ("", about.codec)
     if same:
         own = {**about.codec_options, **own}
@@ -159,9 +141,11 @@ def _check_file(path: Path) -> None:
         raise RecordingError(f"{path} is no recording: it is neither MCAP nor npz")
 
 
-def _check_speed(what: str, speed: float) -> None:
-    if not 0 <= speed < math.inf:
+def _take_options(what: str, fields: dict[str, str], kind: type[Any]) -> Any:
+    (options,) = take_options(what, fields, kind)
+    if not 0 <= (speed := options.speed) < math.inf:
         raise ConfigError(f"{what}: speed must be 0 (as fast as it is read) or more, not {speed:g}")
+    return options
 
 
 class ReplaySource(Source):
@@ -270,7 +254,7 @@ class _Decoding:
         self, path: str, codec: Codec[Any], packets: Iterator[tuple[Packet, int]], clock: str
     ) -> None:
         self._codec, self._packets, self._clock = codec, packets, clock
-        self._early: deque[tuple[Samples | None, int]] = deque()
+        self._early: list[tuple[Samples | None, int]] = []
         # What the codec finds before the device has described itself waits, as in a live start.
         while codec.spec is None:
             found = next(packets, None)
@@ -290,7 +274,8 @@ class _Decoding:
         if self._clock == "device" and codec.tick_ns is not None:
             stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         connected = False
-        for samples, t_ns in self._found():
+        later = chain.from_iterable(self._feed(packet, t_ns) for packet, t_ns in self._packets)
+        for samples, t_ns in chain(self._early, later):
             if samples is None:
                 if connected:
                     stamper.resume()
@@ -299,12 +284,6 @@ class _Decoding:
             chunk = stamper.chunk(samples)
             if chunk is not None:
                 yield t_ns, chunk
-
-    def _found(self) -> Iterator[tuple[Samples | None, int]]:
-        while self._early:
-            yield self._early.popleft()
-        for packet, t_ns in self._packets:
-            yield from self._feed(packet, t_ns)
 
     def _feed(self, packet: Packet, t_ns: int) -> list[tuple[Samples | None, int]]:
         if packet is None:
@@ -337,25 +316,8 @@ class SweepOptions:
             raise ConfigError(f"rest_s must be 0 to 3600 s, not {self.rest_s:g}")
 
 
-def _sweep_spec(path: Path) -> tuple[ArraySpec, SweepManifest]:
-    """The array at the rate of the stored sweeps, and the set's manifest.
-
-    Raises:
-        RecordingError: it is of no sweep set.
-    """
-    manifest = SweepManifest.read(path.parent)
-    return replace(manifest.spec, rate_hz=NS_PER_S / manifest.period_ns), manifest
-
-
-def _sweep_chunks(
-    path: Path, manifest: SweepManifest, options: SweepOptions
-) -> Iterator[tuple[int, Chunk]]:
-    """The chunks, times from 0, and when they are due.
-
-    Raises:
-        ConfigError: no such sweep.
-        RecordingError: the file is damaged, or not of the manifest's array.
-    """
+def _sweep_chunks(path: Path, manifest: SweepManifest, options: SweepOptions) -> Timed:
+    """Cut the sweeps of an object, once they are checked, into chunks."""
     values, _ = read_object(path.parent, path.stem)
     if values.ndim != 4 or values.shape[2:] != manifest.spec.shape or not values.shape[1]:
         raise RecordingError(
@@ -364,17 +326,14 @@ def _sweep_chunks(
     which = range(len(values)) if options.sweep is None else [options.sweep]
     if options.sweep is not None and not 0 <= options.sweep < len(values):
         raise ConfigError(f"{path} has sweeps 0 to {len(values) - 1}, not {options.sweep}")
-    period = manifest.period_ns
-    return _cut(values, which, round(options.rest_s * NS_PER_S / period), manifest)
+    sweeps = (values[k].astype(np.float32) for k in which)
+    return _cut_sweeps(sweeps, round(options.rest_s * NS_PER_S / manifest.period_ns), manifest)
 
 
-def _cut(
-    values: np.ndarray, which: "range | list[int]", rest: int, manifest: SweepManifest
-) -> Iterator[tuple[int, Chunk]]:
+def _cut_sweeps(sweeps: Iterator[np.ndarray], rest: int, manifest: SweepManifest) -> Timed:
     period, size = manifest.period_ns, max(1, SWEEP_CHUNK_NS // manifest.period_ns)
     first = 0
-    for k in which:
-        sweep = values[k].astype(np.float32)
+    for sweep in sweeps:
         # The lead again and again, so that the rest has the noise of the sweep.
         lead = sweep[: max(1, manifest.lead)]
         stream = np.concatenate([np.resize(lead, (rest, *lead.shape[1:])), sweep])

@@ -27,6 +27,8 @@ ANGLES = ("theta", "phi", "zeta")
 COLUMN = re.compile(r"(theta|phi|zeta)_deg(?:_(.+))?")
 LARGEST_DEG = 120.0  # beyond it is an absolute angle or another unit, not a whisk
 
+Floats = NDArray[np.float64]
+
 
 class Trajectory(Protocol):
     """Anything that says how the bases turn."""
@@ -35,9 +37,7 @@ class Trajectory(Protocol):
     def duration_s(self) -> float:
         """How long it lasts, s; infinite if it has no end."""
 
-    def offsets(
-        self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
-    ) -> NDArray[np.float64]:
+    def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
         """Turn from the resting angles, (len(t_s), whisker, 3) rad, at times from 0 on.
 
         Protraction, elevation and torsion; positive protraction is rostral on both sides. It
@@ -76,9 +76,7 @@ class Whisk:
                     f"whisk: {name} must be {low:g} to {high:g}, not {getattr(self, name):g}"
                 )
 
-    def offsets(
-        self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
-    ) -> NDArray[np.float64]:
+    def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
         """See `Trajectory`."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)[:, None]
         phase = 2 * np.pi * self.frequency_hz * t  # 0 is fully retracted
@@ -96,8 +94,8 @@ class Recorded:
         turns: The (sample, whisker, 3) turn from the resting angles, rad.
     """
 
-    times_s: NDArray[np.float64]
-    turns: NDArray[np.float64]
+    times_s: Floats
+    turns: Floats
     names: tuple[str, ...]
 
     @property
@@ -109,27 +107,25 @@ class Recorded:
     def _spline(self) -> CubicSpline:
         return CubicSpline(self.times_s, self.turns - self.turns[0])
 
-    def offsets(
-        self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
-    ) -> NDArray[np.float64]:
+    def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
         """See `Trajectory`. The last posture is kept after the end."""
         at = [self.names.index(w.name) for w in whiskers]
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
         moved = self._spline(t)
-        turns: NDArray[np.float64] = self.turns[0] + moved * _ramp(t / Whisk.ramp_s)[:, None, None]
+        turns: Floats = self.turns[0] + moved * _ramp(t / Whisk.ramp_s)[:, None, None]
         return turns[:, at]
 
 
-def _ramp(x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ramp(x: Floats) -> Floats:
     """From 0 (x <= 0) to 1 (x >= 1), its first two derivatives continuous."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def coupled(theta: NDArray[np.float64], whiskers: tuple[Whisker, ...]) -> NDArray[np.float64]:
+def coupled(theta: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
     """Protractions (n, whisker) with each row's elevation and torsion: (n, whisker, 3) rad."""
     slopes = np.array([[1.0, *_slopes(w.row)] for w in whiskers])
-    turns: NDArray[np.float64] = theta[:, :, None] * slopes
+    turns: Floats = theta[:, :, None] * slopes
     return turns
 
 
@@ -192,19 +188,17 @@ def _letter(row: int) -> str:
     return chr(ord("A") + row)
 
 
-def base_angles(
-    trajectory: Trajectory, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
-) -> NDArray[np.float64]:
+def base_angles(trajectory: Trajectory, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
     """Base angles theta, phi, zeta in the morphology's convention, (len(t_s), whisker, 3) rad.
 
     On the left side, where azimuth and torsion are mirrored, protraction lowers theta.
     """
     resting = np.array([w.angles for w in whiskers])
-    angles: NDArray[np.float64] = resting + mirror(whiskers) * trajectory.offsets(t_s, whiskers)
+    angles: Floats = resting + mirror(whiskers) * trajectory.offsets(t_s, whiskers)
     return angles
 
 
-def mirror(whiskers: tuple[Whisker, ...]) -> NDArray[np.float64]:
+def mirror(whiskers: tuple[Whisker, ...]) -> Floats:
     """(whisker, 3) signs of theta, phi and zeta for a rostral turn: by the side of the base."""
     sides = [-1.0 if w.base[0] < 0 else 1.0 for w in whiskers]
     return np.array([(side, 1.0, side) for side in sides])

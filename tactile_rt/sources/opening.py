@@ -18,7 +18,7 @@ from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, SpecMismatch
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 from tactile_rt.core.settings import nearest, split_url, take_options
 from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.opening import Prepared
@@ -101,10 +101,8 @@ def _of_scheme(
 ) -> Prepared:
     if scheme in SCHEMES:
         module, attribute, extra = SCHEMES[scheme]
-        try:
+        with require_extra(f"source {scheme}: needs", extra):
             made: Any = getattr(import_module(module), attribute)
-        except ModuleNotFoundError as error:
-            raise lacking(f"source {scheme}: needs", extra, error) from None
         if not hasattr(made, "Options"):
             further = {"array": told} if scheme in ASKED else {}
             prepared: Prepared = made(target, fields, **further)

@@ -60,10 +60,7 @@ class Listener:
             self._first_ns = int(chunk.t_ns[0])
         self._heard += len(chunk)
         for k in range(0, len(chunk), self._together):
-            one = slice(k, k + self._together)
-            yield from self._listen(
-                Chunk(chunk.seq[one], chunk.t_ns[one], chunk.values[one], chunk.valid[one])
-            )
+            yield from self._listen(chunk.select(slice(k, k + self._together)))
 
     def _listen(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         decisions = self.classifier.push(chunk)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
-from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
+from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedDevice, EmulatedSerial
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import synthetic_spec
 
@@ -51,15 +51,10 @@ def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) 
     signal = np.asarray(values, dtype=np.float32)
     seq = np.arange(len(signal), dtype=np.int64)
     t_ns = start_ns + np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64)
-    return [
-        Chunk(
-            seq[i : i + samples],
-            t_ns[i : i + samples],
-            signal[i : i + samples],
-            np.ones(signal[i : i + samples].shape[:2], dtype=np.bool_),
-        )
-        for i in range(0, len(signal), samples)
-    ]
+    if not len(signal):
+        return []
+    whole = Chunk(seq, t_ns, signal, np.ones(signal.shape[:2], dtype=np.bool_))
+    return [whole.select(slice(i, i + samples)) for i in range(0, len(signal), samples)]
 
 
 class ArraySource(Source):
@@ -93,7 +88,24 @@ class ArraySource(Source):
         self._left.clear()
 
 
-class FakeSerial(EmulatedSerial):
+class _SignalDevice(EmulatedDevice):
+    """An emulated device that takes a signal, on a line without a speed."""
+
+    paced = False
+
+    def __init__(
+        self,
+        signal: ArrayLike | Source,
+        codec: str = "native",
+        *,
+        spec: ArraySpec | None = None,
+        **further: Any,
+    ) -> None:
+        source = _source_of(signal, self.wire, codec, spec, further)
+        super().__init__(source, codec, **further)
+
+
+class FakeSerial(_SignalDevice, EmulatedSerial):
     """A device on a serial port, plugged in while entered: see `EmulatedSerial`. Its line carries
     all that it sends, unless an option ``baud`` says how fast it is.
 
@@ -103,45 +115,17 @@ class FakeSerial(EmulatedSerial):
         further: Options of `EmulatedSerial`.
     """
 
-    paced = False
 
-    def __init__(
-        self,
-        signal: ArrayLike | Source,
-        codec: str = "native",
-        *,
-        spec: ArraySpec | None = None,
-        **further: Any,
-    ) -> None:
-        super().__init__(_source_of(signal, self.wire, codec, spec, further), codec, **further)
-
-
-class FakeCan(EmulatedCan):
+class FakeCan(_SignalDevice, EmulatedCan):
     """A device on a CAN bus, plugged in while entered: see `EmulatedCan`. Its bus carries all that
     it sends, unless an option ``bitrate`` says how fast it is.
 
     The arguments are those of `FakeSerial`, and `EmulatedCan` has further options.
     """
 
-    paced = False
-
-    def __init__(
-        self,
-        signal: ArrayLike | Source,
-        codec: str = "native",
-        *,
-        spec: ArraySpec | None = None,
-        **further: Any,
-    ) -> None:
-        super().__init__(_source_of(signal, self.wire, codec, spec, further), codec, **further)
-
 
 def _source_of(
-    signal: ArrayLike | Source,
-    wire: str,
-    codec: str,
-    spec: ArraySpec | None,
-    further: dict[str, Any],
+    signal: ArrayLike | Source, wire: str, codec: str, spec: ArraySpec | None, further: Any
 ) -> Source:
     if isinstance(signal, Source):
         return signal

@@ -186,6 +186,10 @@ class Chunk:
     def __len__(self) -> int:
         return len(self.seq)
 
+    def select(self, at: slice | NDArray[np.bool_]) -> "Chunk":
+        """Return some of the samples, by a slice or by a mask (n,)."""
+        return Chunk(self.seq[at], self.t_ns[at], self.values[at], self.valid[at])
+
 
 def concatenate(chunks: list[Chunk]) -> Chunk:
     """Join consecutive chunks of one stream into one; the samples are copied."""

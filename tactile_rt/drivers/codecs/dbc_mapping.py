@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.files import open_regular
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 from tactile_rt.core.settings import convert, read_toml
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame
@@ -189,11 +189,9 @@ def _near(name: str, known: Iterable[str]) -> str:
 
 class _Reader:
     def __init__(self, path: Path, file: _File) -> None:
-        try:
+        with require_extra("codec can-dbc needs", "dbc"):
             import cantools
             from cantools.database.errors import Error as DatabaseError
-        except ModuleNotFoundError as error:
-            raise lacking("codec can-dbc needs", "dbc", error) from None
         self.path, self.file = path, file
         self.dbc = path.parent / file.dbc
         try:

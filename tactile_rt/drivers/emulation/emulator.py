@@ -252,7 +252,7 @@ class Emulator:
                     self._out.end_ns = self._first_ns + self._seconds * NS_PER_S
             n = int(np.searchsorted(chunk.t_ns, self._out.end_ns))
             if n:
-                ahead.append(chunk if n == len(chunk) else _slice(chunk, 0, n))
+                ahead.append(chunk.select(slice(n)))
             while ahead and ahead[-1].t_ns[-1] - ahead[0].t_ns[-1] >= self._ahead_ns:
                 yield ahead.pop(0)
                 if not self._ahead_ns:
@@ -273,14 +273,14 @@ class Emulator:
                     if not self._wait_for_host():
                         return
                     stop = at + (PIECE if self.codec.streaming else 1)
-                    self._offer(_slice(chunk, at, stop))
+                    self._offer(chunk.select(slice(at, stop)))
             else:
                 if self.source.live:
                     time.sleep(YIELD_S)
                     stop = at + PIECE
                 else:
                     stop = self._due(chunk, at)
-                self._offer(_slice(chunk, at, stop))
+                self._offer(chunk.select(slice(at, stop)))
             at = min(stop, len(chunk))
 
     def _due(self, chunk: Chunk, at: int) -> int:
@@ -317,7 +317,7 @@ class Emulator:
             if self.codec.streaming:
                 self._out.send(piece)
             else:
-                self._newest = self.codec.newest = _slice(piece, -1, None)
+                self._newest = self.codec.newest = piece.select(slice(-1, None))
                 if self._out.away:  # nobody can ask, and only time brings it back
                     self._out.look(int(self._newest.t_ns[0]))
                 self._answer_polls(self._newest)
@@ -337,12 +337,3 @@ class Emulator:
             move = getattr(self.source, "set_whisking", None)
             if move is not None:
                 move(*wanted)
-
-
-def _slice(chunk: Chunk, start: int, stop: int | None) -> Chunk:
-    return Chunk(
-        chunk.seq[start:stop],
-        chunk.t_ns[start:stop],
-        chunk.values[start:stop],
-        chunk.valid[start:stop],
-    )

@@ -24,21 +24,7 @@ from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.convolution import Convolution, convolve
 
-__all__ = [
-    "CELLS",
-    "FORGET_BIAS",
-    "NORM_EPSILON",
-    "Cell",
-    "GRUCell",
-    "IntersectionCell",
-    "LSTMCell",
-    "PublishedLSTMCell",
-    "TimeDecayCell",
-    "UGRNNCell",
-    "VanillaCell",
-    "VanillaELUCell",
-    "make_cell",
-]
+__all__ = ["CELLS", "FORGET_BIAS", "Cell", "IntersectionCell", "make_cell"]
 
 FORGET_BIAS = 1.0
 # Where nothing is touched the gates have no variance, and the gradient through a norm grows by

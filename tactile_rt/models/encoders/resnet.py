@@ -197,7 +197,7 @@ def sites_first(frames: Tensor) -> Tensor:
 
 def maximum(x: Tensor, shape: Shape) -> Tensor:
     """Largest of 3 x 3 sites, stride 2, padded by 1: (frame, site * channel) to the same layout."""
-    x = x.view(len(x), *shape, -1)
+    x = x.unflatten(1, (*shape, -1))  # not by len(x), which an export would take for fixed
     for axis in (1, 2):
         size = x.shape[axis]
         ranges = [(max(c - 1, 0), min(c + 2, size)) for c in range(0, size, 2)]

@@ -13,7 +13,7 @@ from tactile_rt.classifier.model_file import load_model
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.measures import Interval
+from tactile_rt.models.evaluation.measures import Floats, Interval
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
@@ -80,7 +80,7 @@ def measure_coverage(
     )
 
 
-def score_known(path: Path, test: SweepSet) -> NDArray[np.float32]:
+def score_known(path: Path, test: SweepSet) -> Floats:
     """Score (sweep,), open set, how sure a model is that things are of known kinds.
 
     That is the posterior of all labels but `unknown`; of a model that has no such label, that of
@@ -110,16 +110,13 @@ def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
         yield name, measures.accuracy(np.isin(said, faults), test.sweeps.objects)
 
 
-def _posteriors(path: Path, test: SweepSet, disturbance: Disturbance) -> NDArray[np.float32]:
+def _posteriors(path: Path, test: SweepSet, disturbance: Disturbance) -> Floats:
     """(sweep, step, label) of all labels, refusals last."""
-    session, card = load_model(path)
-    run = stepped(session, card, refusals=True)
+    run = stepped(*load_model(path), refusals=True)
     return measures.predict(test, run, disturbance=disturbance)
 
 
-def _decisions(card: ModelCard, posteriors: NDArray[np.float32]) -> NDArray[np.str_]:
+def _decisions(card: ModelCard, posteriors: Floats) -> NDArray[np.str_]:
     """(sweep,) What is decided at the last step; "" where no contact was found."""
-    labels = [
-        "" if np.isnan(p).any() else card.labels[decided(card, p, card.steps)] for p in posteriors
-    ]
-    return np.array(labels)
+    found = [None if np.isnan(p).any() else decided(card, p, card.steps) for p in posteriors]
+    return np.array(["" if k is None else card.labels[k] for k in found])

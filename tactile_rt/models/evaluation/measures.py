@@ -46,11 +46,12 @@ __all__ = [
     "softmax",
 ]
 
+Floats = NDArray[np.float32]
+Labels = NDArray[np.int64]
+Names = NDArray[np.str_]
 # samples (batch, step, sub-step, element, channel), offset and sigma (batch, element, channel), SI
 # -> logits (batch, step, class)
-Step = Callable[
-    [NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]
-]
+Step = Callable[[Floats, Floats, Floats], Floats]
 LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
 
 
@@ -65,9 +66,9 @@ class CutWindows:
             mean nothing.
     """
 
-    samples: NDArray[np.float32]
-    offset: NDArray[np.float32]
-    sigma: NDArray[np.float32]
+    samples: Floats
+    offset: Floats
+    sigma: Floats
     detected: NDArray[np.bool_]
 
 
@@ -89,7 +90,7 @@ def predict(
     noise_level: float = 0.0,
     seed: int = 0,
     disturbance: Disturbance = CLEAN,
-) -> NDArray[np.float32]:
+) -> Floats:
     """Posteriors of every sweep at every step, from where the detector finds its onset.
 
     Args:
@@ -105,7 +106,7 @@ def predict(
     return posteriors(cut_windows(data, seed, disturbance=disturbance), run)
 
 
-def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
+def posteriors(cut: Iterable[CutWindows], run: Step) -> Floats:
     """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected,
     or the network overflows.
     """
@@ -129,7 +130,7 @@ def cut_windows(
         yield CutWindows(cut, found.offset, found.sigma, found.start >= 0)
 
 
-def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[Floats, NDArray[np.bool_]]:
     """Return what a function makes of windows, and (sweep,) whether a contact was detected.
 
     Args:
@@ -140,35 +141,33 @@ def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[NDArray[np.float32],
     return np.concatenate(out), np.concatenate(detected)
 
 
-def at_temperature(posteriors: NDArray[np.float32], temperature: float) -> NDArray[np.float32]:
+def at_temperature(posteriors: Floats, temperature: float) -> Floats:
     """(..., class) posteriors as they would be with their logits divided by a temperature."""
     with np.errstate(divide="ignore"):
         logits = np.log(posteriors) / np.float32(temperature)
     return softmax(logits)
 
 
-def softmax(logits: NDArray[Any]) -> NDArray[np.float32]:
+def softmax(logits: NDArray[Any]) -> Floats:
     """Turn (..., class) logits into posteriors."""
     raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
     return np.asarray(raised / raised.sum(axis=-1, keepdims=True))
 
 
-def among(posteriors: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
+def among(posteriors: Floats, classes: int) -> Floats:
     """(..., class) posteriors of the first so many labels alone, had it to be one of them."""
     own = posteriors[..., :classes]
     return np.asarray(own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30))
 
 
-def hits(
-    posteriors: NDArray[np.float32], labels: NDArray[np.int64], top: int = 1
-) -> NDArray[np.bool_]:
+def hits(posteriors: Floats, labels: Labels, top: int = 1) -> NDArray[np.bool_]:
     """(sweep,) whether the label is among the `top` most probable of (sweep, class) posteriors."""
     decided = ~np.isnan(posteriors).any(axis=1)
     order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
     return np.asarray(decided & (order == labels[:, None]).any(axis=1))
 
 
-def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
+def auroc(known: Floats, unknown: Floats) -> float:
     """Chance that a sweep of a known category scores higher than one of an unknown category.
 
     Args:
@@ -185,23 +184,18 @@ def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
     return float((below + ties).mean() / (2 * len(low)))
 
 
-def open_set(
-    known: NDArray[np.float32],
-    objects: NDArray[np.str_],
-    unknown: NDArray[np.float32],
-    others: NDArray[np.str_],
-) -> Interval:
+def open_set(known: Floats, objects: Names, unknown: Floats, others: Names) -> Interval:
     """Measure the AUROC, open set, of scores (sweep,) of known things against unknown ones."""
     scores = np.concatenate([known, unknown])
 
-    def area(at: NDArray[np.int64]) -> float:
+    def area(at: Labels) -> float:
         mine = at < len(known)
         return auroc(scores[at[mine]], scores[at[~mine]])
 
     return bootstrap(area, np.concatenate([objects, others]))
 
 
-def deciding_step(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> NDArray[np.int64]:
+def deciding_step(posteriors: Floats, labels: Labels) -> NDArray[np.int64]:
     """(sweep,) the step, from 1, from which the decision is right and stays so; 0: it never does.
 
     Args:
@@ -214,12 +208,7 @@ def deciding_step(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) ->
     return np.where(kept > 0, steps - kept + 1, 0).astype(np.int64)
 
 
-def fused_accuracy(
-    posteriors: NDArray[np.float32],
-    labels: NDArray[np.int64],
-    objects: NDArray[np.str_],
-    sweeps: int = 2,
-) -> Interval:
+def fused_accuracy(posteriors: Floats, labels: Labels, objects: Names, sweeps: int = 2) -> Interval:
     """Accuracy of decisions fused over consecutive sweeps of one object, (sweep, class) given.
 
     An undetected sweep contributes nothing; a group of only such sweeps is wrong.
@@ -234,9 +223,7 @@ def fused_accuracy(
     return accuracy(np.array(correct), np.array(of))
 
 
-def confusion(
-    posteriors: NDArray[np.float32], labels: NDArray[np.int64], classes: int
-) -> NDArray[np.int64]:
+def confusion(posteriors: Floats, labels: Labels, classes: int) -> NDArray[np.int64]:
     """(true class, decided class) counts of the sweeps that were decided."""
     decided = ~np.isnan(posteriors).any(axis=1)
     table = np.zeros((classes, classes), dtype=np.int64)
@@ -244,9 +231,7 @@ def confusion(
     return table
 
 
-def expected_calibration_error(
-    posteriors: NDArray[np.float32], labels: NDArray[np.int64], bins: int = 15
-) -> float:
+def expected_calibration_error(posteriors: Floats, labels: Labels, bins: int = 15) -> float:
     """ECE (Guo et al. 2017): mean gap between confidence and accuracy over equal-width bins."""
     decided = ~np.isnan(posteriors).any(axis=1)
     confidence = posteriors[decided].max(axis=1)
@@ -259,7 +244,7 @@ def expected_calibration_error(
     return float(sum(gaps) / max(len(right), 1))
 
 
-def accuracy(correct: NDArray[Any], objects: NDArray[np.str_], resamples: int = 2000) -> Interval:
+def accuracy(correct: NDArray[Any], objects: Names, resamples: int = 2000) -> Interval:
     """A mean over sweeps with a percentile bootstrap over objects.
 
     Args:
@@ -284,9 +269,7 @@ def accuracy(correct: NDArray[Any], objects: NDArray[np.str_], resamples: int = 
 
 
 def bootstrap(
-    statistic: Callable[[NDArray[np.int64]], float],
-    objects: NDArray[np.str_],
-    resamples: int = 300,
+    statistic: Callable[[NDArray[np.int64]], float], objects: Names, resamples: int = 300
 ) -> Interval:
     """Any statistic of a set of sweeps with a percentile bootstrap over objects.
 
@@ -310,13 +293,11 @@ def run_on(model: TactileClassifier) -> Step:
     """The function that `predict` wants, of a torch model."""
     import torch  # here: a model file is measured without
 
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def run(*loads: Floats) -> Floats:
         model.eval()
         device = model.inputs.clip.device
         with torch.inference_mode():
-            logits = model(*(torch.from_numpy(a).to(device) for a in (samples, offset, sigma)))
+            logits = model(*(torch.from_numpy(a).to(device) for a in loads))
         return np.asarray(logits.float().cpu().numpy())
 
     return run

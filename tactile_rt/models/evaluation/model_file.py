@@ -19,6 +19,7 @@ from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults, score_known
+from tactile_rt.models.evaluation.measures import Floats, Labels, Names
 from tactile_rt.models.evaluation.records import Record, record_share
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
 from tactile_rt.models.evaluation.windows import stepped
@@ -69,7 +70,7 @@ def evaluate_model(
     # of objects of the kind that it was trained on
     bars = {} if _from_elsewhere(test, card) else BARS.get(len(card.classes), {})
 
-    def top(name: str, posteriors: NDArray[np.float32], how: str = sample, top: int = 1) -> Record:
+    def top(name: str, posteriors: Floats, how: str = sample, top: int = 1) -> Record:
         right = measures.hits(posteriors, labels, top)
         return record_share(name, measures.accuracy(right, objects), bars.get(name, ""), how)
 
@@ -176,12 +177,7 @@ def _from_elsewhere(test: SweepSet, card: ModelCard) -> bool:
 
 
 def _calibration(
-    clean: NDArray[np.float32],
-    noisy: NDArray[np.float32],
-    labels: NDArray[np.int64],
-    objects: NDArray[np.str_],
-    temperature: float,
-    sample: str,
+    clean: Floats, noisy: Floats, labels: Labels, objects: Names, temperature: float, sample: str
 ) -> list[Record]:
     at = f"at temperature {temperature:.3g}"
     raw = measures.at_temperature(clean, 1 / temperature)
@@ -193,7 +189,7 @@ def _calibration(
     records = []
     for name, posteriors, bar, how in cases:
 
-        def ece(at: NDArray[np.int64], p: NDArray[np.float32] = posteriors) -> float:
+        def ece(at: Labels, p: Floats = posteriors) -> float:
             return measures.expected_calibration_error(p[at], labels[at])
 
         estimate = measures.bootstrap(ece, objects)
@@ -243,7 +239,7 @@ def _measure_open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record
     return record_share(name, estimate, "", how, "% AUROC", "; 50: chance")
 
 
-def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
+def _firsts(objects: Names, sweeps: int) -> Labels:
     mine = [np.flatnonzero(objects == name)[:sweeps] for name in dict.fromkeys(objects.tolist())]
     return np.concatenate(mine)
 

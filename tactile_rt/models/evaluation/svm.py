@@ -30,20 +30,21 @@ __all__ = ["PENALTIES", "FittedSVM", "fit", "fit_svm", "window_features"]
 MOST_PAIRED = 8000  # sweeps whose kernel, 8 bytes a pair, is kept: half a gigabyte
 PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
 
+Floats = NDArray[np.float32]
+
 
 @dataclass(frozen=True)
 class FittedSVM:
     """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels."""
 
     machine: SVC
-    kernel: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+    kernel: Callable[[Floats], Floats]
     how: str = ""
 
-    def __call__(self, features: NDArray[np.float32]) -> NDArray[Any]:
-        """Decide labels."""
+    def __call__(self, features: Floats) -> NDArray[Any]:
         return np.asarray(self.machine.predict(self.kernel(features)))
 
-    def margins(self, features: NDArray[np.float32], classes: int) -> NDArray[np.float64]:
+    def margins(self, features: Floats, classes: int) -> NDArray[np.float64]:
         """Distances from the decision for each of `classes` numbers, against all others.
 
         Returns:
@@ -62,9 +63,7 @@ class FittedSVM:
         return np.asarray((self(x) == data.sweeps.labels) & usable)
 
 
-def fit(
-    features: NDArray[np.float32], labels: NDArray[Any], penalty: float, how: str = ""
-) -> FittedSVM:
+def fit(features: Floats, labels: NDArray[Any], penalty: float, how: str = "") -> FittedSVM:
     """Fit one machine to (sweep, feature) values and (sweep,) labels, at penalty C."""
     # Of its own gamma, "scale". The kernel is a product of matrices, which libsvm by itself works
     # out pair by pair: dozens of times slower where there are thousands of features.
@@ -82,12 +81,10 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
     x, usable = window_features(train)
     if len(set(train.sweeps.labels[usable].tolist())) < 2:
         raise ConfigError("a support vector machine needs touches of two categories to learn from")
-    how = (
-        f"same onsets, baseline, clipping and signed log; {train.timing.steps} steps of mean load; "
-    )
+    how = f"same onsets, baseline, clipping and signed log; {train.timing.steps} steps of mean load"
     among = ", ".join(f"{p:g}" for p in PENALTIES)
     tried = [
-        fit(x[usable], train.sweeps.labels[usable], c, f"{how}C = {c:g} of {among} by validation")
+        fit(x[usable], train.sweeps.labels[usable], c, f"{how}; C = {c:g} of {among} by validation")
         for c in PENALTIES
     ]
     return max(tried, key=lambda one: one.hits(validation).mean())
@@ -95,7 +92,7 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
 
 def window_features(
     data: "SweepSet", disturbance: "Disturbance | None" = None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[Floats, NDArray[np.bool_]]:
     """(sweep, step * element * channel) compressed loads, and whether there was an onset."""
     # Imported here: it brings torch, which whoever only writes a set's card does without.
     from tactile_rt.models.disturbances import CLEAN
@@ -103,9 +100,7 @@ def window_features(
 
     limits = data.manifest.limits
 
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
         cut = np.clip(samples - offset[:, None, None], -limits.clip, limits.clip)
         cut = np.sign(cut) * np.log1p(np.abs(cut) / limits.scale)
         return np.asarray(cut.mean(axis=2).reshape(len(cut), -1))

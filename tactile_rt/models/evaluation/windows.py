@@ -2,11 +2,10 @@
 
 import numpy as np
 import onnxruntime as ort
-from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import file_outputs
-from tactile_rt.models.evaluation.measures import Step
+from tactile_rt.models.evaluation.measures import Floats, Step
 
 __all__ = ["stepped"]
 
@@ -25,9 +24,7 @@ def stepped(session: ort.InferenceSession, card: ModelCard, refusals: bool = Fal
     divisor = np.float32(card.temperature)
     kept = len(card.labels) if refusals else len(card.classes)
 
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
         found = file_outputs(session, card, samples, offset, sigma)["logits"]
         return found[..., :kept] / divisor
 

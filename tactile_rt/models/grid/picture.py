@@ -58,9 +58,7 @@ def draw_grid(results: GridResults, path: Path) -> None:
     handles.append(Patch(color="0.4", alpha=PALE, label="same network, untrained, linear probe"))
     if svm is not None:
         label = f"RBF SVM on the same windows ({100 * svm.value:.1f} %)"
-        handles.append(
-            bottom.plot([], [], color="tab:red", linestyle="--", label=label)[0],
-        )
+        handles.append(bottom.plot([], [], color="tab:red", linestyle="--", label=label)[0])
     label = f"chance ({100 / results.classes:.1f} %)"
     handles.append(bottom.plot([], [], color="0.3", linestyle=":", label=label)[0])
     figure.legend(handles=handles, loc="outside lower center", ncols=3, fontsize=8)
@@ -100,17 +98,13 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
 def _bar(axes: Axes, at: float, value: Interval, colour: str, alpha: float) -> None:
     axes.barh(at, 100 * value.value, BAR, color=colour, alpha=alpha, linewidth=0)
     # A percentile interval need not hold its estimate, and matplotlib wants no negative bars.
-    below = max(value.value - value.low, 0.0)
-    above = max(value.high - value.value, 0.0)
-    error = 100 * np.array([[below], [above]])
+    sides = [[value.value - value.low], [value.high - value.value]]
+    error = 100 * np.maximum(sides, 0.0)
     axes.errorbar(100 * value.value, at, xerr=error, fmt="none", ecolor="black", elinewidth=1)
 
 
 def _family(row: Row) -> tuple[str, str]:
-    for prefix, family in FAMILIES.items():
-        if row.network.startswith(prefix):
-            return family
-    return OTHER
+    return next((f for prefix, f in FAMILIES.items() if row.network.startswith(prefix)), OTHER)
 
 
 def _label(row: Row) -> str:

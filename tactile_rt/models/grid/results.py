@@ -5,11 +5,10 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
-from tactile_rt.models.evaluation.measures import Interval, accuracy
+from tactile_rt.models.evaluation.measures import Interval, Names, accuracy
 from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid
 
@@ -104,11 +103,7 @@ def gather(grid: Grid, folder: Path) -> GridResults:
 
 
 def _row(
-    grid: Grid,
-    name: str,
-    cell: Candidate | None,
-    found: dict[str, list[Outcome]],
-    objects: NDArray[np.str_],
+    grid: Grid, name: str, cell: Candidate | None, found: dict[str, list[Outcome]], objects: Names
 ) -> Row:
     def estimate(these: list[Outcome], which: str) -> Interval | None:
         right = [one.right(which) for one in these if getattr(one, which)]
@@ -137,7 +132,7 @@ def _row(
 
 
 def _difference(
-    better: list[Outcome] | None, than: list[Outcome] | None, objects: NDArray[np.str_]
+    better: list[Outcome] | None, than: list[Outcome] | None, objects: Names
 ) -> Interval | None:
     """Of top-1, over the seeds that both have; the SVM has one for all."""
     mine = {one.seed: one.right() for one in better or () if one.top1}

@@ -238,9 +238,8 @@ class Workbench:
         model, _ = load_checkpoint(best)
         run, labels = run_on(model), self.test.sweeps.labels
         classes = len(self.test.manifest.categories)
-        clean, noisy = (  # had it to name one
-            among(posteriors(cut, run)[:, -1], classes) for cut in self._windows(config)
-        )
+        # Had it to name one.
+        clean, noisy = (among(posteriors(c, run)[:, -1], classes) for c in self._windows(config))
         return msgspec.structs.replace(
             found,
             top1=_as_text(hits(clean, labels)),
@@ -252,9 +251,8 @@ class Workbench:
     def _windows(self, config: TrainingConfig) -> tuple[list[CutWindows], list[CutWindows]]:
         if config.window not in self._cut:
             test = drawn_as(self.test, {"window": config.window})
-            clean, noisy = (
-                list(cut_windows(test, batch=BATCH, disturbance=one)) for one in (CLEAN, RATED)
-            )
+            clean = list(cut_windows(test, batch=BATCH, disturbance=CLEAN))
+            noisy = list(cut_windows(test, batch=BATCH, disturbance=RATED))
             self._cut[config.window] = clean, noisy
         return self._cut[config.window]
 

@@ -226,10 +226,8 @@ class TrainingBatches:
         """Add, in place, what has come to the readings since their baseline."""
         data, timing, n = self._data, self._data.timing, len(samples)
         course = np.arange(1, timing.samples + 1) / timing.samples
-        for most, over in (
-            (self._faults.offset, np.ones_like(course)),
-            (self._faults.drift, course),
-        ):
+        faults = self._faults
+        for most, over in ((faults.offset, np.ones_like(course)), (faults.drift, course)):
             # half of the sweeps have none
             share = severity * np.maximum(rng.uniform(-1, 1, (n, 1, 1)), 0)
             size = most * share * data.noise

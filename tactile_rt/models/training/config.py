@@ -240,10 +240,8 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
         ) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
-    differing = [
-        key for key in {**mine, **theirs} if not _same(key, theirs.get(key), mine.get(key))
-    ]
-    if differing:
+    keys = {**mine, **theirs}
+    if differing := [key for key in keys if not _same(key, theirs.get(key), mine.get(key))]:
         raise ConfigError(
             f"{folder} holds a run of another configuration (other {name_some(differing)}): choose "
             "another folder, or repeat the options that began it"

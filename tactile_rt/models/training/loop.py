@@ -81,19 +81,13 @@ def train(
         ModelError: `last.pt` or `history.csv` is damaged, or the best network is gone.
         OSError: the medium is full, or failed; the last checkpoint is as it was.
     """
-    with (
-        alone_in(folder) if _is_first() else nullcontext(),
-        launched(config, device) as fabric,
-    ):
+    first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, the one that writes
+    with alone_in(folder) if first else nullcontext(), launched(config, device) as fabric:
         return _train(fabric, config, folder, report, splits)
 
 
 def _train(
-    fabric: "Fabric",
-    config: TrainingConfig,
-    folder: Path,
-    report: Report,
-    splits: Splits | None,
+    fabric: "Fabric", config: TrainingConfig, folder: Path, report: Report, splits: Splits | None
 ) -> Path:
     torch.manual_seed(config.seed)
     training, validating = _take_splits(config, splits)
@@ -132,15 +126,12 @@ def _train(
                 loss = loss_of(batch)
                 run.optimizer.zero_grad()
                 fabric.backward(loss)
+                most = config.clip_norm or inf
                 norm = fabric.clip_gradients(
-                    wrapped,
-                    run.optimizer,
-                    max_norm=config.clip_norm or inf,
-                    error_if_nonfinite=False,
+                    wrapped, run.optimizer, max_norm=most, error_if_nonfinite=False
                 )
-                if norm is None or not torch.isfinite(
-                    norm
-                ):  # clipping would turn it into silence or NaN
+                # Clipping would turn it into silence or NaN.
+                if norm is None or not torch.isfinite(norm):
                     raise DivergedError(
                         f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
                         f"try a learning rate below {config.learning_rate:g}"
@@ -207,11 +198,6 @@ def _mean(fabric: "Fabric", losses: list[float]) -> float:
     shared = fabric.all_reduce(torch.tensor(mean))
     assert isinstance(shared, torch.Tensor)
     return shared.item()
-
-
-def _is_first() -> bool:
-    """Tell whether this process is the one that writes: of torchrun's it is the first."""
-    return os.environ.get("RANK", "0") == "0"
 
 
 @contextmanager

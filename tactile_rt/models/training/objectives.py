@@ -290,10 +290,8 @@ class Autoencoder(Objective):
         features, (channels, *grid) = model.network.feature_size, model.network.config.frame
         cells = grid[0] * grid[1]
         first = min(channels, features // cells + 1)
-        layers: list[nn.Module] = [
-            nn.Linear(features, first * cells),
-            nn.Unflatten(1, (first, *grid)),
-        ]
+        layers: list[nn.Module] = [nn.Linear(features, first * cells)]
+        layers.append(nn.Unflatten(1, (first, *grid)))
         for n in range(DECONVOLUTIONS):
             layers += [nn.ReLU()] if n else []
             layers.append(nn.ConvTranspose2d(channels if n else first, channels, 3, padding=1))

@@ -48,64 +48,52 @@ def probe(
         RecordingError, ConfigError: the set cannot be used, as in `train`; the folder is that of a
             training run, or another process writes into it.
     """
+    config = config or ProbeConfig()
     with alone_in(folder):
-        return _probe(checkpoint, folder, config or ProbeConfig(), report, splits)
-
-
-def _probe(
-    checkpoint: Path,
-    folder: Path,
-    config: ProbeConfig,
-    report: Callable[[Progress], None],
-    splits: tuple[SweepSet, SweepSet] | None,
-) -> Path:
-    trained, saved = load_checkpoint(checkpoint)
-    path, manifest = probed_on(checkpoint, saved, folder, config.data)
-    if splits is None:
-        check_split(path, manifest)
-        splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
-        check_sets(path, splits)
-    # a layer over categories learns nothing of what is refused
-    data, validation = (of_categories(drawn_as(one, saved["config"])) for one in splits)
-    torch.manual_seed(config.seed)
-    jitter = saved["config"].get("jitter", JITTER)
-    touched = int((data.noisy_starts[0] >= 0).sum())  # a few of few sweeps may be silent
-    batches = TrainingBatches(data, max(min(WINDOWS, touched), 1), config.seed, jitter)
-    begin = trained.network.encoder.lag if config.readout == "mean" else -1
-    drawn = [(_features(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
-    features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
-    layer, history = linear_probe(
-        features, labels, *_validation(trained, begin, validation), len(manifest.categories), config
-    )
-    network = replace(
-        trained.network.config,
-        classes=len(manifest.categories),
-        decoder="linear",
-        readout=config.readout,
-    )
-    model = TactileClassifier(manifest.spec, network, manifest.limits)
-    kept = {k: v for k, v in trained.state_dict().items() if not k.startswith("network.decoder.")}
-    kept |= {f"network.decoder.{name}": value for name, value in layer.state_dict().items()}
-    model.load_state_dict(kept)
-    answers = validation.sweeps.labels
-    metrics = {
-        "epoch": config.epochs,
-        "loss": history[-1]["loss"],
-        "validation_top1": float(hits(predict(validation, run_on(model))[:, -1], answers).mean()),
-        "validation_top1_noisy": float(
-            hits(predict(validation, run_on(model), 1.0)[:, -1], answers).mean()
-        ),
-    }
-    folder.mkdir(parents=True, exist_ok=True)
-    for line in history:
-        log_epoch(folder / "history.csv", line)
-    told = {
-        **saved["config"], "data": str(path), "also": (), "begin": "", "probe": asdict(config)
-    }  # fmt: skip
-    met = trained_objects([manifest], saved)
-    save_whole(folder / "best.pt", fill_checkpoint(model, manifest, (), told, met, metrics))
-    report(Progress(config.epochs, config.epochs, 1, 1, metrics["loss"], metrics))
-    return folder / "best.pt"
+        trained, saved = load_checkpoint(checkpoint)
+        path, manifest = probed_on(checkpoint, saved, folder, config.data)
+        if splits is None:
+            check_split(path, manifest)
+            splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
+            check_sets(path, splits)
+        # a layer over categories learns nothing of what is refused
+        data, validation = (of_categories(drawn_as(one, saved["config"])) for one in splits)
+        torch.manual_seed(config.seed)
+        jitter = saved["config"].get("jitter", JITTER)
+        touched = int((data.noisy_starts[0] >= 0).sum())  # a few of few sweeps may be silent
+        batches = TrainingBatches(data, max(min(WINDOWS, touched), 1), config.seed, jitter)
+        begin = trained.network.encoder.lag if config.readout == "mean" else -1
+        drawn = [(_features(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
+        features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
+        classes, held_out = len(manifest.categories), _validation(trained, begin, validation)
+        layer, history = linear_probe(features, labels, *held_out, classes, config)
+        network = replace(
+            trained.network.config, classes=classes, decoder="linear", readout=config.readout
+        )
+        model = TactileClassifier(manifest.spec, network, manifest.limits)
+        head = "network.decoder."
+        kept = {k: v for k, v in trained.state_dict().items() if not k.startswith(head)}
+        kept |= {head + name: value for name, value in layer.state_dict().items()}
+        model.load_state_dict(kept)
+        answers = validation.sweeps.labels
+        clean, noisy = (
+            float(hits(predict(validation, run_on(model), level)[:, -1], answers).mean())
+            for level in (0.0, 1.0)
+        )
+        metrics = {
+            "epoch": config.epochs, "loss": history[-1]["loss"],
+            "validation_top1": clean, "validation_top1_noisy": noisy,
+        }  # fmt: skip
+        folder.mkdir(parents=True, exist_ok=True)
+        for line in history:
+            log_epoch(folder / "history.csv", line)
+        told = {
+            **saved["config"], "data": str(path), "also": (), "begin": "", "probe": asdict(config)
+        }  # fmt: skip
+        met = trained_objects([manifest], saved)
+        save_whole(folder / "best.pt", fill_checkpoint(model, manifest, (), told, met, metrics))
+        report(Progress(config.epochs, config.epochs, 1, 1, metrics["loss"], metrics))
+        return folder / "best.pt"
 
 
 def linear_probe(

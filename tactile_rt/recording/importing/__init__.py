@@ -2,7 +2,7 @@
 
     wire   logs of a serial line or a CAN bus, decoded by a codec
     csv    tables of numbers in text
-    bag    topics of ROS 1 and ROS 2 bags
+    bag    topics of ROS 1 and ROS 2 bags, which bag_file opens and mends
     table  what the last two share: columns in words, times, a recording of them
 
 What comes out is there whole or not at all, and says what was lost on the way.

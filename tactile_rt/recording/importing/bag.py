@@ -7,25 +7,22 @@ The time is that of the header, where there is one that is set, else that of the
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, is_dataclass
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.files import check_no_pointer, open_regular
-from tactile_rt.core.packages import lacking
 from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.drivers.codecs.ascii_mapping import parse_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.logs import Occurrences
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.importing.mending import mend_bag
+from tactile_rt.recording.importing.bag_file import OpenBag, open_bag
 from tactile_rt.recording.importing.proposing import propose_fields
 from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
 from tactile_rt.recording.importing.table import (
@@ -37,16 +34,12 @@ from tactile_rt.recording.importing.table import (
 )
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
-from tactile_rt.recording.records import MAGIC
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2_form import ARRAY
 
-__all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
+__all__ = ["BagTopic", "bag_topics", "import_bag", "is_recording"]
 
-SIZES: Final = 64  # of messages of one topic that are looked at, the largest
 LOOKED_AT: Final = 1 << 28  # bytes of a topic, before it is known which one is wanted
-SQLITE: Final = b"SQLite format 3\0"
-ROS1: Final = b"#ROSBAG V2.0\n"
 MOST: Final = 4096  # fields of a message that are columns
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.
 KNOWN: Final = {
@@ -85,116 +78,22 @@ class BagTopic:
     proposed: str = ""
 
 
-@dataclass
-class OpenBag:
-    """A bag that is open."""
-
-    reader: Any
-    notes: list[str] = field(default_factory=list)
-    back: int = 0  # times that go back
-
-    def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
-        """Read (time in ns, bytes, message) of a topic; a damaged message is None."""
-        for connection, t_ns, raw in self._read_stored(topic):
-            yield t_ns, bytes(raw), self._decode(connection, raw)
-
-    def samples(self, topic: str, most: float = np.inf) -> list[Any]:
-        """Read one message of each size, the largest first; see `SIZES`.
-
-        Args:
-            most: number of bytes of the topic to look at.
-        """
-        sizes: dict[int, tuple[Any, bytes]] = {}
-        for connection, _, raw in self._read_stored(topic):
-            most -= len(raw)
-            sizes.setdefault(len(raw), (connection, bytes(raw)))
-            if len(sizes) > SIZES:
-                del sizes[min(sizes)]
-            if most <= 0:
-                break
-        found = (self._decode(*sizes[size]) for size in sorted(sizes, reverse=True))
-        return [message for message in found if message is not None]
-
-    def _read_stored(self, topic: str) -> Iterator[tuple[Any, int, bytes]]:
-        which = [c for c in self.reader.connections if c.topic == topic]
-        stored = self.reader.messages(connections=which)
-        while True:
-            try:
-                yield next(stored)
-            except StopIteration:
-                return
-            except Exception as error:  # so it does where a chunk is damaged
-                note = f"it is damaged, and read up to there ({_words(error)})"
-                self.notes += [note] if note not in self.notes else []
-                return
-
-    def _decode(self, connection: Any, raw: bytes) -> Any:
-        try:
-            return self.reader.deserialize(raw, connection.msgtype)
-        except Exception:  # rosbags raises anything on bytes that are no such message
-            return None
-
-
-@contextmanager
-def open_bag(path: Path) -> Iterator[OpenBag]:
-    """Open a bag of ROS 1 or ROS 2.
-
-    Raises:
-        RecordingError: it is damaged, or has lost its end.
-    """
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ModuleNotFoundError as error:
-        raise lacking("bags need", "import", error) from None
-    for file in path.iterdir() if path.is_dir() else ():
-        check_no_pointer(file)
-    with ExitStack() as stack:
-        notes: list[str] = []
-        store = get_typestore(Stores.LATEST)
-        reader = None
-        try:
-            reader = stack.enter_context(AnyReader([path], default_typestore=store))
-        except Exception as error:  # rosbags and what it reads by raise anything on a damaged bag
-            why = _words(error)
-            notes = [f"its end is missing or damaged ({why}): what is whole before it was read"]
-            new = Path(stack.enter_context(TemporaryDirectory())) / "mended.mcap"
-            if path.suffix == ".mcap" and mend_bag(path, new):
-                with suppress(Exception):  # as above
-                    reader = stack.enter_context(AnyReader([new], default_typestore=store))
-            if reader is None:
-                raise RecordingError(
-                    f"{path} cannot be read as a bag: {why:.90}; `rosbag reindex` or "
-                    "`ros2 bag reindex` mend one without its end"
-                ) from None
-        yield OpenBag(reader, notes)
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def is_bag(path: Path) -> bool:
-    """Whether this is a bag: a file of ROS 1, a folder or file of ROS 2; of MCAP any but ours."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    with open_regular(path) as file:
-        begins = file.read(len(SQLITE))
-    if begins == SQLITE:  # python-can's logger writes such files, too
-        return path.suffix == ".db3"
-    return begins.startswith((ROS1, MAGIC))
-
-
 def bag_topics(path: Path) -> list[BagTopic]:
     """The topics of a bag that hold messages."""
     found = []
     with open_bag(path) as bag:
         for name, about in sorted(bag.reader.topics.items()):
-            if not about.msgcount:
-                continue
-            kind = about.msgtype or ""
-            found.append(_describe(bag, name, kind, about.msgcount, LOOKED_AT)[0])
+            if n := about.msgcount:
+                found.append(_describe(bag, name, about.msgtype or "", n, LOOKED_AT)[0])
     return found
+
+
+def is_recording(path: Path) -> bool:
+    """Tell whether an MCAP file is a recording of ours."""
+    try:
+        return path.is_file() and path.suffix == ".mcap" and bool(Recording(path).description)
+    except (RecordingError, ConfigError):
+        return False
 
 
 def import_bag(
@@ -217,12 +116,12 @@ def import_bag(
         ConfigError: no such topic, columns that cannot be, or the extra is not installed.
         RecordingError: the bag is damaged, or holds no sample.
     """
-    if path.is_file() and path.suffix == ".mcap" and _is_ours(path):
+    if is_recording(path):
         raise ConfigError(f"{path} is a recording already: `tactile-rt replay` and run take it")
     chosen = _chosen(path, bag_topics(path), topic, columns)
     with open_bag(path) as bag:
         if chosen.type == messages.SAMPLES and not columns:
-            return _own(path, bag, chosen, output)
+            return _import_own(path, bag, chosen, output)
         chosen, paths, channels = _describe(bag, chosen.name, chosen.type, chosen.messages)
         if all(path.startswith(BESIDE) for path in paths) and not columns:
             raise RecordingError(f"{path}: no message of {chosen.name} is whole and holds a number")
@@ -270,22 +169,11 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     raise ConfigError(f"{path} has the topics {told}: {what}")
 
 
-def _is_ours(path: Path) -> bool:
-    try:
-        return bool(Recording(path).description)
-    except (RecordingError, ConfigError):
-        return False
-
-
-def _frame_of(message: Any) -> str:
-    name = getattr(getattr(message, "header", None), "frame_id", "") or "sensor"
-    return _NO_NAME.sub("_", name).strip("_") or "sensor"
-
-
 def _columns_of(kind: str, message: Any) -> str:
-    """What a message of this type is a sample of, in words; empty: only a user can tell."""
+    """Describe the columns of a known type; empty where only a user can tell."""
     if kind in KNOWN:
-        return KNOWN[kind].format(_frame_of(message))
+        frame = getattr(getattr(message, "header", None), "frame_id", "")
+        return KNOWN[kind].format(_NO_NAME.sub("_", frame).strip("_") or "sensor")
     if not NUMBERS.fullmatch(kind) or not len(message.data):
         return ""
     channels = _channels_of(message)
@@ -308,7 +196,8 @@ def _describe(
 ) -> tuple[BagTopic, list[str], int]:
     """Describe a topic, with the paths of its numbers and the channels of arrays."""
     if kind in KNOWN:  # of one size
-        found = list(islice(_whole(bag, name), 1))
+        whole = (message for _, _, message in bag.messages(name) if message is not None)
+        found = list(islice(whole, 1))
     else:
         found = [] if kind == messages.SAMPLES else bag.samples(name, most)
     names: dict[str | int, int] = {}  # in the order of the message's fields
@@ -328,10 +217,6 @@ def _describe(
 
 def _split_path(path: str) -> list[int | str]:
     return [int(s) if s.isdecimal() else s for s in path.split(".")]
-
-
-def _whole(bag: OpenBag, topic: str) -> Iterator[Any]:
-    return (message for _, _, message in bag.messages(topic) if message is not None)
 
 
 def _leaves(value: Any, at: str) -> Iterator[str]:
@@ -358,15 +243,11 @@ def _rows(
         before = times[-1:]
         times[:] = [_stamp(message) or t_ns]
         bag.back += before > times
-        if message is None:
-            yield ()
-            continue
-        if channels > 1 and _channels_of(message) not in (0, 1, channels):
+        row, missing = _row(message, steps) if message is not None else ([], 0)
+        if row and channels > 1 and _channels_of(message) not in (0, 1, channels):
             other.add(number)
-            yield ()
-            continue
-        row, missing = _row(message, steps)
-        if missing:
+            row = []
+        elif missing:
             fewer.add(number)
         yield row
     if other.n:
@@ -399,15 +280,15 @@ def _stamp(message: Any) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec) if stamp else 0
 
 
-def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
-    """Samples of ours in a bag of others: bit for bit."""
+def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
+    """Write samples of ours, in a bag of others, bit for bit."""
     account = Import(notes=bag.notes)
-    told = _array_in(bag, topic.name)
+    told = _find_array(bag, topic.name)
     chunks: list[Chunk] = []
-    offset = 0
+    read = offset = 0
     for t_ns, raw, message in bag.messages(topic.name):
+        read += 1
         if message is None:
-            account.corrupt += 1
             continue
         shape = int(message.elements), int(message.channels)
         if told is not None and shape != told.shape:
@@ -415,22 +296,18 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
                 f"{path}: its array is of {told.shape[0]} x {told.shape[1]}, "
                 f"{topic.name} of {shape[0]} x {shape[1]}"
             )
-        try:
-            chunk = decode_samples(messages.unstamped(bytes(raw)), shape)
-        except ValueError:
-            account.corrupt += 1
-            continue
-        if chunks and chunk.values.shape[1:] != chunks[0].values.shape[1:]:
-            account.corrupt += 1
-            continue
-        offset = offset if chunks else (_stamp(message) or t_ns) - int(chunk.t_ns[-1])
-        chunks.append(chunk)
-        account.intact += 1
+        with suppress(ValueError):
+            chunk = decode_samples(messages.unstamped(raw), shape)
+            if not chunks:
+                offset = (_stamp(message) or t_ns) - int(chunk.t_ns[-1])
+            if not chunks or chunk.values.shape[1:] == chunks[0].values.shape[1:]:
+                chunks.append(chunk)
+    account.intact, account.corrupt = len(chunks), read - len(chunks)
     if not chunks:
         raise RecordingError(f"{path}: no message of {topic.name} is whole")
     whole = concatenate(chunks)
     account.missing = int((np.diff(whole.seq) - 1).clip(0).sum())
-    spec = told or _unnamed(path.stem, whole)
+    spec = told or _name_array(path.stem, whole)
     zero = max(0, offset if offset >= 0 else clock_of(int(whole.t_ns[0])))
     about = Description(
         spec, zero, f"{path.name}:{topic.name}",
@@ -439,27 +316,24 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
     return _count_messages(write_chunks(output, about, whole, account, str(path)), topic)
 
 
-def _array_in(bag: OpenBag, samples: str) -> ArraySpec | None:
-    """What the bag says of the array that the samples of a topic are of, if it does."""
+def _find_array(bag: OpenBag, samples: str) -> ArraySpec | None:
+    """Find what the bag says of the array of a topic of samples."""
     beside = f"{samples.rpartition('/')[0]}/{ARRAY}"
     if beside not in bag.reader.topics or bag.reader.topics[beside].msgtype != messages.ARRAY:
         return None
     for _, raw, _ in bag.messages(beside):
-        try:
-            return messages.array_of(bytes(raw))
-        except (ValueError, TypeError, KeyError):
-            continue
+        with suppress(ValueError, TypeError, KeyError):
+            return messages.array_of(raw)
     return None
 
 
-def _unnamed(name: str, chunk: Chunk) -> ArraySpec:
-    """An array of which only its shape and rate are known."""
+def _name_array(name: str, chunk: Chunk) -> ArraySpec:
+    """Describe an array of which only its shape and rate are known."""
     _, elements, channels = chunk.values.shape
     steps = np.diff(chunk.t_ns)
     rate = NS_PER_S / float(np.median(steps)) if len(steps) else 1.0
-    spec = ArraySpec(
+    return ArraySpec(
         name, tuple(f"T{k}" for k in range(elements)), tuple((0, k) for k in range(elements)),
         ((0.0, 0.0, 0.0),) * elements, ((1.0, 0.0, 0.0, 0.0),) * elements,
-        tuple(f"c{k}" for k in range(channels)), ("1",) * channels, 1.0, "mount",
+        tuple(f"c{k}" for k in range(channels)), ("1",) * channels, float(f"{rate:.6g}"), "mount",
     )  # fmt: skip
-    return replace(spec, rate_hz=float(f"{rate:.6g}"))

@@ -74,7 +74,7 @@ def import_wire(
             account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
-        _count(log, codec, decoded, account)
+        _count(log, decoded, account)
 
     write_whole(output, fill)
     measure_samples(account, output)
@@ -100,7 +100,7 @@ def import_wire(
     return account
 
 
-def _count(log: LineLog, codec: Codec[Any], decoded: "_Decoded", account: Import) -> None:
+def _count(log: LineLog, decoded: "_Decoded", account: Import) -> None:
     """Count what the file held, and how much of it was read."""
     account.unit = {"raw": "bytes", "blf": "objects", "db": "frames"}.get(log.form, "lines")
     account.total, account.read = log.total, log.frames
@@ -173,10 +173,8 @@ class _Decoded:
         )
         self._count: int | None = None  # of the newest sample
         codec.commands(Command.START)  # some note what they have asked for
-        packets = log.packets()
-        if log.form in ("raw", "terminal"):  # which begin with their first line
-            packets = _lead(packets, getattr(codec, "line_end", b""))
-        packets = _cut_last(packets)
+        lines = log.form in ("raw", "terminal")  # which begin with their first line
+        packets = _cut_last(log.packets(), getattr(codec, "line_end", b"") if lines else b"")
         waiting: list[tuple[Any, int | None, Samples | None]] = []
         for packet, t_ns in packets:
             waiting.append((packet, t_ns, self._take(packet, t_ns)))
@@ -194,9 +192,9 @@ class _Decoded:
         self.timed = self._stamped = bool(waiting) and waiting[0][1] is not None
         self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
         self._stamper = Stamper(codec, codec.spec, stats)
-        own_clock = not self._stamped and codec.tick_ns is not None
-        if own_clock and codec.tick_ns is not None:
-            self.timed = True
+        own_clock = False
+        if not self._stamped and codec.tick_ns is not None:
+            self.timed = own_clock = True
             self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         self._period_ns = NS_PER_S / codec.spec.rate_hz
         self._passed = 0.0  # periods, where the log has no times
@@ -250,17 +248,14 @@ class _Decoded:
         return ahead if n <= ahead <= 1 << (bits - 1) else n
 
 
-def _lead(packets: Iterator[tuple[Any, int | None]], lead: bytes) -> Iterator[Any]:
-    """Put bytes before the first packet."""
-    for k, (packet, t_ns) in enumerate(packets):
-        yield packet if k else lead + packet, t_ns
-
-
-def _cut_last(packets: Iterator[tuple[Any, int | None]]) -> Iterator[tuple[Any, int | None]]:
-    """Cut the last packets into bytes, which show where the last sample ends."""
+def _cut_last(
+    packets: Iterator[tuple[Any, int | None]], lead: bytes
+) -> Iterator[tuple[Any, int | None]]:
+    """Put bytes before the packets, and cut the last ones into single bytes."""
     last: deque[tuple[Any, int | None]] = deque()
     for packet, t_ns in packets:
-        last.append((packet, t_ns))
+        last.append((lead + packet if lead else packet, t_ns))
+        lead = b""
         if len(last) > LAST or not isinstance(packet, bytes):
             yield last.popleft()
     for packet, t_ns in last:

@@ -80,22 +80,16 @@ def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
 
 def _counts(manifest: SweepManifest, card: Card) -> str:
     splits = tuple(card.sweeps)
-    rows = [
-        (
-            category,
-            *(
-                f"{card.objects[s][category]} / {card.sweeps[s][category]}"
-                if category in card.sweeps[s]
-                else "-"
-                for s in splits
-            ),
-        )
-        for category in (*manifest.categories, *manifest.withheld)
-    ]
+
+    def count(split: str, category: str) -> str:
+        objects, sweeps = card.objects[split], card.sweeps[split]
+        return f"{objects[category]} / {sweeps[category]}" if category in sweeps else "-"
+
+    named = (*manifest.categories, *manifest.withheld)
+    rows = [(category, *(count(s, category) for s in splits)) for category in named]
     total = [f"{sum(card.objects[s].values())} / {sum(card.sweeps[s].values())}" for s in splits]
-    return "Objects / sweeps of each category in each split:\n\n" + _table(
-        ("category", *splits), [*rows, ("all", *total)]
-    )
+    table = _table(("category", *splits), [*rows, ("all", *total)])
+    return f"Objects / sweeps of each category in each split:\n\n{table}"
 
 
 def _skipped(card: Card) -> str:
@@ -132,16 +126,9 @@ def _amount(value: float, card: Card) -> str:
 def _coverage(card: Card, spec: ArraySpec) -> str:
     rows, columns = spec.grid_shape
     cells = {cell: card.coverage[name] for cell, name in zip(spec.grid, spec.elements, strict=True)}
-    return _table(
-        ("row", *(str(c) for c in range(columns))),
-        [
-            (
-                r,
-                *(f"{100 * cells[r, c]:.0f}" if (r, c) in cells else "" for c in range(columns)),
-            )
-            for r in range(rows)
-        ],
-    )
+    shown = {cell: f"{100 * share:.0f}" for cell, share in cells.items()}
+    lines = [(r, *(shown.get((r, c), "") for c in range(columns))) for r in range(rows)]
+    return _table(("row", *map(str, range(columns))), lines)
 
 
 def _separability(found: list[Separability]) -> str:

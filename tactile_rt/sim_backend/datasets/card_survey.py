@@ -257,8 +257,5 @@ def _accuracy(train: Features, test: Features, classes: tuple[str, ...], fit: Fi
     """Mean over classes of the share of test sweeps that are decided rightly."""
     chosen = np.concatenate([np.flatnonzero(train.categories == c)[:PER_CLASS] for c in classes])
     predict = fit(train.values[chosen], train.categories[chosen], PENALTY)
-    right = []
-    for c in classes:
-        sweeps = test.values[test.categories == c]
-        right.append(float((predict(sweeps) == c).mean()))
+    right = [(predict(test.values[test.categories == c]) == c).mean() for c in classes]
     return float(np.mean(right))

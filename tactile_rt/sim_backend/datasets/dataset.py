@@ -49,6 +49,8 @@ LOOKS = 3  # for contacts in each stored sample's period
 SPARE = 2  # stored samples simulated beyond the last, which the resampler's kernel needs
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 
+Floats = NDArray[np.float32]
+
 
 def describe_set(recipe: SweepRecipe) -> SweepManifest:
     """The set that a recipe makes.
@@ -170,9 +172,9 @@ class SweepRecord:
         values: The (sample, element, channel) loads of the sweep, SI.
     """
 
-    values: NDArray[np.float32]
+    values: Floats
     parameters: dict[str, float]
-    contacts: NDArray[np.float32] | None = None
+    contacts: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -211,13 +213,8 @@ def _write(folder: Path, name: str, records: Sequence[SweepRecord], target: Tact
     }
     parameters["geometry"] = np.repeat(fingerprint(target), len(records))
     contacts = [r.contacts for r in records if r.contacts is not None]
-    write_object(
-        folder,
-        name,
-        np.stack([r.values for r in records]),
-        parameters,
-        np.stack(contacts) if contacts else None,
-    )
+    values, truth = np.stack([r.values for r in records]), np.stack(contacts) if contacts else None
+    write_object(folder, name, values, parameters, truth)
 
 
 def fingerprint(target: TactileObject) -> str:
@@ -296,7 +293,7 @@ def _simulated(
 
 def _sensed(
     recipe: SweepRecipe, target: TactileObject, index: int, loads: NDArray[np.float64]
-) -> NDArray[np.float32]:
+) -> Floats:
     """(sample, element, channel) what the array's sensor, and the recipe's, make of the loads.
 
     Noise, offset and drift that the array's description tells of are left to training, which draws
@@ -336,7 +333,7 @@ def _chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
     return Chunk(seq, t_ns, values, np.ones(values.shape[:2], dtype=np.bool_))
 
 
-def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> NDArray[np.float32]:
+def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> Floats:
     """(sample, element, channel): what the live stream's own resampler makes of it.
 
     Or, where the recipe says so, the last sample by the time of each output.
@@ -344,7 +341,7 @@ def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> NDArray[np.
     if recipe.every_nth:
         due_ns = chunk.t_ns[0] + recipe.period_ns * np.arange(1, recipe.samples + 1)
         at = np.searchsorted(chunk.t_ns, due_ns, side="right") - 1
-        taken: NDArray[np.float32] = chunk.values[at]
+        taken: Floats = chunk.values[at]
         return taken
     outputs = Resampler(recipe.period_ns, rate_hz).push(chunk)
     values = np.zeros((recipe.samples, *chunk.values.shape[1:]), dtype=np.float32)

@@ -18,7 +18,7 @@ from multiprocessing.context import SpawnProcess
 from typing import Any
 
 from tactile_rt.core.errors import ConfigError, TactileError
-from tactile_rt.core.packages import lacking
+from tactile_rt.core.packages import require_extra
 
 __all__ = ["ENGINES", "Outcome", "Work", "run_processes", "run_ray"]
 
@@ -149,17 +149,14 @@ def run_ray(
     Raises:
         ConfigError: Ray is not installed, or there is no cluster at the address.
     """
-    try:
+    with require_extra("this needs", "cluster"):
         import ray
-    except ModuleNotFoundError as error:
-        raise lacking("this needs", "cluster", error) from None
     started = not ray.is_initialized()
     if started:
         _join_cluster(ray, address, processes)
-    cluster: Any = ray  # whose functions have no types
     try:
         at_once = processes or max(
-            int(sum(n["Resources"].get("CPU", 0) for n in cluster.nodes() if n["Alive"])), 1
+            int(sum(n["Resources"].get("CPU", 0) for n in ray.nodes() if n["Alive"])), 1
         )
         task = ray.remote(num_cpus=1, max_retries=TRIES - 1)(_call)
         stored = ray.put(work)

@@ -13,13 +13,7 @@ import numpy as np
 
 from tactile_rt.core.errors import RecordingError, name_some
 from tactile_rt.core.files import check_no_pointer, write_whole
-from tactile_rt.sets.manifest import (
-    MANIFEST,
-    SKIPPED,
-    SweepManifest,
-    has_object,
-    object_path,
-)
+from tactile_rt.sets.manifest import MANIFEST, SKIPPED, SweepManifest, has_object, object_path
 from tactile_rt.sets.objects import read_skipped
 
 __all__ = ["SUMS", "Tally", "check_sums", "remove_leftovers", "tally", "write_sums", "written_sum"]
@@ -40,12 +34,12 @@ class Tally:
     @property
     def shortcomings(self) -> str:
         """What is to be told beside the number of sweeps; nothing if all is well."""
-        parts = [
-            *([f"{self.misses} miss the array"] if self.misses else []),
-            *([f"{self.unstable} could not be simulated"] if self.unstable else []),
-            *([f"{self.skipped} objects could not be made ({SKIPPED})"] if self.skipped else []),
-        ]
-        return ", ".join(parts)
+        told = {
+            f"{self.misses} miss the array": self.misses,
+            f"{self.unstable} could not be simulated": self.unstable,
+            f"{self.skipped} objects could not be made ({SKIPPED})": self.skipped,
+        }
+        return ", ".join(text for text, count in told.items() if count)
 
 
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:

@@ -37,13 +37,10 @@ class ShapeObjects:
     @cached_property
     def categories(self) -> tuple[str, ...]:
         """Names of the classes, in the order of their labels."""
-        _check(
-            self.choice.categories,
-            (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.added_categories()),
-        )
+        known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.added_categories())
+        _check(self.choice.categories, known)
         unknown = (*self.choice.withheld, *self.choice.outliers)
-        known = (c for c in shapes.CATEGORIES if c not in unknown)
-        return self.choice.categories or tuple(known)
+        return self.choice.categories or tuple(c for c in shapes.CATEGORIES if c not in unknown)
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
@@ -84,7 +81,7 @@ class ShapeObjects:
         """Category of every object whose name does not tell it."""
         if not self._prefix:
             return {}
-        names = (name for names in self.split.values() for name in names)
+        names = chain.from_iterable(self.split.values())
         return {name: name[len(self._prefix) : name.rindex("-")] for name in names}
 
     @property
@@ -122,9 +119,8 @@ class MeshObjects:
 
     @cached_property
     def _set(self) -> "ObjectSet":
-        from tactile_rt.sim_backend.objects.object_sets import (
-            open_objects,  # what cuts meshes is slow to import
-        )
+        # Here: what cuts meshes is slow to import.
+        from tactile_rt.sim_backend.objects.object_sets import open_objects
 
         return open_objects(Path(self.choice.source), self.choice.mesh)
 
@@ -200,22 +196,15 @@ class MeshObjects:
         count = self.choice.per_withheld or None
         for key, categories in ((WITHHELD, self.withheld), (OUTLIERS, self.choice.outliers)):
             if categories:
-                split[key] = tuple(
-                    name
-                    for category in categories
-                    for group in self._by_category[category][:count]
-                    for name in group
-                )
+                chosen = (self._by_category[category][:count] for category in categories)
+                split[key] = tuple(chain.from_iterable(chain.from_iterable(chosen)))
         return split
 
     @property
     def category_of(self) -> dict[str, str]:
         """Category of every object."""
-        return {
-            name: self._set.categories[self._names[name]]
-            for names in self.split.values()
-            for name in names
-        }
+        names = chain.from_iterable(self.split.values())
+        return {name: self._set.categories[self._names[name]] for name in names}
 
     @property
     def skipped(self) -> dict[str, str]:

@@ -23,7 +23,7 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, explain_errors
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.mesh_formats import MOST_NODES, check_number, load_meshes
@@ -135,10 +135,8 @@ def _check_supported(scene: Any) -> None:
     """Refuse what of a glTF the mesh library would leave out or misread."""
     for required in scene.get("extensionsRequired", ()):
         if not HARMLESS.match(required):
-            how = "`gltfpack -noq -i IN -o OUT` writes it without" if "meshopt" in required else ""
-            raise ValueError(
-                f"it needs {required}, which is not supported" + f"; {how}" * bool(how)
-            )
+            how = "; `gltfpack -noq -i IN -o OUT` writes it without" * ("meshopt" in required)
+            raise ValueError(f"it needs {required}, which is not supported{how}")
     if any("EXT_mesh_gpu_instancing" in n.get("extensions", ()) for n in scene.get("nodes", ())):
         raise ValueError("its nodes have copies by EXT_mesh_gpu_instancing")
     for primitive in (p for mesh in scene.get("meshes", ()) for p in mesh["primitives"]):
@@ -244,17 +242,14 @@ def _join(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
 def _part(path: Path, up: str) -> trimesh.Trimesh:
     check_mesh_file(path)
     suffix = path.suffix.lower()
-    try:
-        meshes = READERS[suffix](path, path.read_bytes())
-    except ConfigError:
-        raise
-    except Exception as error:  # the parsers raise whatever their format trips over
-        reason = " ".join(str(error).split()) or type(error).__name__
-        if isinstance(error, ImportError):  # what guesses at encodings is not installed
-            reason = "cut short, or neither binary as it should be nor UTF-8 text"
-        raise ConfigError(
-            f"{path}: cannot be read as {suffix} ({reason[:120]}); export it again"
-        ) from error
+    before, after = f"{path}: cannot be read as {suffix} (", "); export it again"
+    with explain_errors(ConfigError, before, after, most=120):
+        try:
+            meshes = READERS[suffix](path, path.read_bytes())
+        except ImportError:  # what guesses at encodings is not installed
+            raise ValueError(
+                "cut short, or neither binary as it should be nor UTF-8 text"
+            ) from None
     number = sum(len(mesh.faces) for mesh in meshes)
     check_number(path, number)
     if not number:

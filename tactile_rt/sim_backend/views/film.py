@@ -26,17 +26,7 @@ from tactile_rt.sim_backend.views.footage import Camera, Footage, framing
 from tactile_rt.sim_backend.views.sheet import ForceScale, Sheet, scene_size
 from tactile_rt.sim_backend.world import OBJECT_BIT
 
-__all__ = [
-    "IMAGES",
-    "VIDEOS",
-    "Dressed",
-    "Film",
-    "Stage",
-    "camera_of",
-    "check_suffix",
-    "write_image",
-    "write_video",
-]
+__all__ = ["IMAGES", "Film", "Stage", "camera_of", "check_suffix", "write_image", "write_video"]
 
 OBJECT, HEAD = (0.62, 0.74, 0.82, 1.0), (0.86, 0.81, 0.76, 1.0)
 FINE = 2  # drawn finer by this factor, then averaged
@@ -46,6 +36,12 @@ THIN, BASE, SHAFT = 0.0018, 0.006, 0.005
 ROOM = 10  # half the side of what is around everything, in the camera's distance and more
 MOST_GEOMS = 20_000
 DOT, ARROW = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ARROW
+IMAGES = (".png", ".jpg")
+VIDEOS = (".mp4",)
+QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 the usual
+
+Floats = NDArray[Any]
+Pixels = NDArray[np.uint8]
 
 
 class Dressed:
@@ -124,11 +120,7 @@ def _add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
 
 
 def _add(
-    scene: mujoco.MjvScene,
-    kind: mujoco.mjtGeom,
-    size: NDArray[np.float64],
-    place: NDArray[np.float64],
-    rgba: NDArray[np.float32],
+    scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size: Floats, place: Floats, rgba: Floats
 ) -> mujoco.MjvGeom:
     geom = scene.geoms[scene.ngeom]
     mujoco.mjv_initGeom(geom, kind, size, place, np.eye(3).ravel(), rgba)
@@ -233,13 +225,6 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoc
     raise ConfigError(
         f"no OpenGL to draw with ({why}): install libegl1 and libgl1-mesa-dri, or set MUJOCO_GL"
     )
-
-
-IMAGES = (".png", ".jpg")
-VIDEOS = (".mp4",)
-QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 the usual
-
-Pixels = NDArray[np.uint8]
 
 
 def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:

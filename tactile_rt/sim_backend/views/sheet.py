@@ -108,8 +108,8 @@ class Sheet:
         camera: Camera,
         scale: ForceScale,
         title: str,
-        detail: str = "",
-        pixels: int = 1280,
+        detail: str,
+        pixels: int,
     ) -> None:
         self._footage = footage
         self.size = _scaled_size(pixels)
@@ -139,13 +139,8 @@ class Sheet:
         traces = figure.add_axes((0.06, 0.085, 0.925, 0.165))
         draw_traces(traces, footage.times_ms, 1e3 * footage.forces, footage.spec.elements)
         self._cursor = traces.axvline(0, color=INK, lw=1.3)
-        clock: dict[str, Any] = {
-            "ha": "right",
-            "va": "center",
-            "fontsize": 14,
-            "family": "monospace",
-        }
-        self._clock = figure.text(0.985, 0.945, "", color=INK, **clock)
+        self._clock = figure.text(0.985, 0.945, "", color=INK, fontsize=14, family="monospace")
+        self._clock.set(ha="right", va="center")
         for artist in (self._scene, *self._legend, self._cursor, self._clock):
             artist.set_animated(True)
         self._canvas.draw()
@@ -239,12 +234,8 @@ class ForceMap:
         small = float(np.clip(0.18 * cell_pt, 5.5, 8))
         for (cx, cy), name in zip(self._centres, spec.elements, strict=True):
             cell = Rectangle((cx - 0.47, cy - 0.47), 0.94, 0.94, facecolor=EMPTY)
-            head: dict[str, Any] = {
-                "arrowstyle": "-|>",
-                "mutation_scale": 0.2 * cell_pt,
-                "visible": False,
-            }
-            arrow = FancyArrowPatch((cx, cy), (cx, cy), lw=0.035 * cell_pt, **head)
+            arrow = FancyArrowPatch((cx, cy), (cx, cy), arrowstyle="-|>", lw=0.035 * cell_pt)
+            arrow.set(mutation_scale=0.2 * cell_pt, visible=False)
             label = axes.text(cx - 0.41, cy - 0.42, name, va="top", fontsize=small, color="0.6")
             axes.add_patch(cell)
             axes.add_patch(arrow)

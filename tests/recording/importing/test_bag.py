@@ -8,7 +8,8 @@ import pytest
 from tactile_rt.core.errors import ConfigError, RecordingError, TactileError
 from tactile_rt.core.stream import concatenate
 from tactile_rt.recording import Recording
-from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag
+from tactile_rt.recording.importing.bag import bag_topics, import_bag
+from tactile_rt.recording.importing.bag_file import is_bag
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import schema_text
