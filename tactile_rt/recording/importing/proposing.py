@@ -16,12 +16,7 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 from tactile_rt.recording.importing.table import read_samples
 
-__all__ = [
-    "ProposedColumns",
-    "propose_columns",
-    "propose_fields",
-    "propose_line_columns",
-]
+__all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line_columns"]
 
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
