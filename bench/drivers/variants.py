@@ -32,7 +32,7 @@ TOLD = re.compile(r"[1-9]\d* (?:corrupt|missing)")
 
 
 class Judgement(NamedTuple):
-    """What came of a file: one of `VERDICTS`, and what was said, or how what was read differs."""
+    """A verdict on a file, one of `VERDICTS`, and what was said, or how what was read differs."""
 
     verdict: str
     said: str
