@@ -529,12 +529,12 @@ def make_recordings(folder: Path) -> Iterator[Variant]:
 
 def all_variants(folder: Path, kinds: Sequence[str] = ()) -> Iterator[Variant]:
     """Yield every variant of some kinds, or of all."""
-    changes = {"table": change_table, "lines": change_terminal, "can": change_bus}
-    changes["mesh"] = change_mesh
-    for kind, change in changes.items():
-        if not kinds or kind in kinds:
+    changes = {"table": change_table, "lines": change_terminal, "can": change_bus,
+               "mesh": change_mesh}
+    makers = {"bag": make_bags, "neural": make_sessions, "mcap": make_recordings}
+    for kind in kinds or (*changes, *makers):
+        if kind in makers:
+            yield from makers[kind](folder)
+        else:
             for b in make_meshes() if kind == "mesh" else make_texts(folder, kind):
-                yield from change(b, random.Random(b.base))
-    for kind, make in {"bag": make_bags, "neural": make_sessions, "mcap": make_recordings}.items():
-        if not kinds or kind in kinds:
-            yield from make(folder)
+                yield from changes[kind](b, random.Random(b.base))

@@ -48,7 +48,7 @@ SILENT_S = 60.0  # without a spike of any unit: not recorded
 
 
 class Reading(NamedTuple):
-    """A session of neurons from a file; `response` is None without contacts to tell it by."""
+    """A session of neurons from a file; `response` is None without contacts."""
 
     session: NeuralSession
     notes: list[str]
