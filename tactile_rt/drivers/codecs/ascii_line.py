@@ -285,7 +285,7 @@ class AsciiLine(SerialCodec):
         """Numbers by their names: a sample is whole when all have come, and over when one comes
         again, or that of the first column, with which each begins."""
         assert self._names is not None
-        if rest := self._names.cut_glued(text):
+        while rest := self._names.cut_glued(text):
             self.complaint = f"line {quoted(text)} breaks off in a number, and another begins"
             self._refuse()
             text = rest

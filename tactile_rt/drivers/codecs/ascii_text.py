@@ -89,7 +89,7 @@ class Names:
         self._patterns = {place: _pattern(name) for name, place in names.items()}
         known = "|".join(map(re.escape, names))
         then = rf"(?=[{{\"']*({known})[\"']?\s*[:=])"
-        self._glued = re.compile(rf"(?<![\w.])({known}){_BETWEEN}{NUMBER}{then}")
+        self._glued = re.compile(rf"(?<![\w.])({known}){_BETWEEN}(?>{NUMBER}){then}")
 
     def find(self, line: str) -> dict[int, float]:
         """The numbers of a line, by their places: NaN where a name stands before none."""
@@ -113,9 +113,10 @@ class Names:
 
     def cut_glued(self, line: str) -> str:
         """Return what follows where a sample broke off and another begins; empty: nowhere."""
-        places, found = self._names, self._glued.finditer(line)
-        ends = [one.end() for one in found if places[one[2]] <= places[one[1]]]
-        return line[ends[-1] :] if ends else ""
+        for found in self._glued.finditer(line):
+            if self._names[found[2]] <= self._names[found[1]]:
+                return line[found.end() :]
+        return ""
 
 
 ABSENT: Final = object()
