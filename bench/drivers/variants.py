@@ -32,7 +32,7 @@ TOLD = re.compile(r"[1-9]\d* (?:corrupt|missing)")
 
 
 class Judgement(NamedTuple):
-    """What came of a file: one of `VERDICTS`, and what was said, or how what was read differs."""
+    """A verdict on a file, one of `VERDICTS`, and what was said, or how what was read differs."""
 
     verdict: str
     said: str
@@ -151,16 +151,15 @@ def _heard(times: Any, values: Any) -> tuple[Any, Any]:
     return times[kept] - times[kept][:1], values[kept]
 
 
-def sort_variants(kinds: Sequence[str] = (), every: int = 1) -> list[tuple[Variant, Judgement]]:
-    """Read variants of some kinds, or of all; every so many of them."""
+def sort_variants(kinds: Sequence[str] = ()) -> list[tuple[Variant, Judgement]]:
+    """Read variants of some kinds, or of all."""
     found = []
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder
         for k, variant in enumerate(all_variants(Path(folder), kinds)):
-            if k % every == 0:
-                place = Path(folder) / str(k)
-                place.mkdir()
-                found.append((variant, sort_variant(variant, place)))
+            place = Path(folder) / str(k)
+            place.mkdir()
+            found.append((variant, sort_variant(variant, place)))
     return found
 
 

@@ -48,7 +48,7 @@ SILENT_S = 60.0  # without a spike of any unit: not recorded
 
 
 class Reading(NamedTuple):
-    """What a file holds; of `response` to contact, None without contacts to tell by."""
+    """A session of neurons from a file; `response` is None without contacts."""
 
     session: NeuralSession
     notes: list[str]

@@ -10,10 +10,11 @@ anywhere and hold lines that are none: what can be read is, and `notes` say what
 import gzip
 import logging
 import zlib
+from codecs import getincrementaldecoder
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from io import BufferedReader, RawIOBase, TextIOWrapper
-from itertools import pairwise
+from itertools import islice, pairwise, tee, zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
@@ -36,11 +37,9 @@ from tactile_rt.drivers.log_lines import (
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "Occurrences", "open_log_file", "read_log"]
 
-SERIAL_FORMS: Final = ("raw", "hex", "terminal")
 CAN_FORMS: Final = ("candump", "slcan", "gvret", "asc", "blf", "trc", "csv", "db")
 BINARY: Final = ("blf", "db")
-FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
-PIECE: Final = 256
+FORMS: Final = ("raw", "hex", "terminal", *CAN_FORMS)
 HEAD: Final = 16_384  # bytes that tell the form
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
 BLF: Final = b"LOGG"
@@ -104,7 +103,7 @@ class LineLog:
     def __init__(self, path: Path, form: str, bus: str = "") -> None:
         self.path, self.form, self._bus = path, form, bus
         self.wire = "can" if form in CAN_FORMS else "serial"
-        self.piece = PIECE
+        self.piece = 256
         self.notes: list[str] = []
         self.buses: Counter[str] = Counter()
         self.names: Mapping[str, tuple[int, bool]] = {}
@@ -122,7 +121,8 @@ class LineLog:
         number = errors = 0
         read = self._raw if self.form == "raw" else self._text
         with open_log_file(self.path) as file:
-            for bus, packet, t_ns in (self._binary if self.form in BINARY else read)(file):
+            reads = (self._binary if self.form in BINARY else read)(file)
+            for bus, packet, t_ns in _count_days(reads) if self.form == "terminal" else reads:
                 self.frames += 1
                 if not packet:
                     errors += 1
@@ -153,9 +153,14 @@ class LineLog:
             )
 
     def _raw(self, file: BufferedReader) -> Iterator[Read]:
+        """Read bytes; those of text in UTF-16, of which most is ASCII, as UTF-8."""
+        head, decode = _head(self.path), getincrementaldecoder("utf-16")("replace").decode
+        text = head.decode("utf-16", "replace") if _encoding(head) == "utf-16" else ""
+        plain = sum(c.isascii() and (c.isprintable() or c.isspace()) for c in text)
         while piece := file.read(self.piece):
-            self.total += len(piece)
-            yield "", piece, None
+            if data := decode(piece).encode() if plain > MOSTLY * len(text) else piece:
+                self.total += len(data)
+                yield "", data, None
 
     def _text(self, file: BufferedReader) -> Iterator[Read]:
         """Read lines of text, and note those that are none of its form."""
@@ -175,8 +180,6 @@ class LineLog:
                 bus, packet, t_ns = found
                 if packet is None:
                     continue
-                if self.form == "terminal" and t_ns is not None:  # on after midnight
-                    now = t_ns = t_ns + DAY_NS * max(0, -((t_ns - now + DAY_NS // 4) // DAY_NS))
                 if apart:
                     t_ns = now = now + (t_ns or 0)
                 yield bus, packet, t_ns
@@ -307,6 +310,19 @@ def _encoding(head: bytes) -> str:
 def _lines(head: bytes) -> list[str]:
     lines = [x for x in head.decode(_encoding(head), "replace").splitlines() if x.strip()]
     return lines[:-1] if len(head) == HEAD else lines  # the last one was cut
+
+
+def _count_days(reads: Iterator[Read]) -> Iterator[Read]:
+    """Count times of day on after midnight; a lone one that is wrong goes back."""
+    now, (reads, ahead) = 0, tee(reads)
+    for read, after in zip_longest(reads, islice(ahead, 1, None)):
+        t_ns, then = (  # a day later where it is more than half a day before
+            t + DAY_NS * max(0, -((t - now + DAY_NS // 2) // DAY_NS))
+            for t in (read[2] or 0, (after or read)[2] or 0)
+        )
+        wrong = 0 < now <= then < t_ns - DAY_NS // 24
+        now = now if wrong else t_ns
+        yield *read[:2], now - wrong
 
 
 def _parse(parse: Callable[[str], Found], line: str) -> tuple[Found, str]:

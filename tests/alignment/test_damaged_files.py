@@ -1,5 +1,9 @@
-"""Recordings of which a bit is wrong: read, or refused in a line that names the file."""
+"""Recordings of which a bit is wrong: read, or refused in a line that names the file.
 
+Spikes and trials that cannot be averaged are left out and named, or the session is refused.
+"""
+
+import re
 from collections import Counter
 
 import numpy as np
@@ -7,11 +11,11 @@ import pytest
 
 from tactile_rt.alignment.clock import CLOCKS
 from tactile_rt.alignment.neural import read_published
-from tactile_rt.alignment.nwb import WINDOWS, read_session
+from tactile_rt.alignment.nwb import WINDOWS, read_nwb, read_session
 from tactile_rt.core.errors import ConfigError
 from tests.helpers.nwb_sessions import write_session
 
-pytest.importorskip("h5py", reason="h5py reads the files")
+h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 
 
 def nwb_bytes(folder):
@@ -77,3 +81,140 @@ def test_a_file_that_ends_early_is_refused_in_a_line(tmp_path, made, read, name)
         with pytest.raises(ConfigError, match=name) as error:
             read(tmp_path / name, 0)
         assert "\n" not in str(error.value)
+
+
+UNITS, TRIALS = 4, 30
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    path = tmp_path_factory.mktemp("spikes") / "whole.nwb"
+    rng = np.random.default_rng(4)
+    return write_session(path, rng, rng.uniform(4, 12, (6, UNITS)), trials=TRIALS)
+
+
+def units_of(change, *which):
+    """Change the spike times of some units, whose number of spikes may change."""
+
+    def changed(file):
+        ends = file["units/spike_times_index"][()]
+        parts = np.split(file["units/spike_times"][()], ends[:-1])
+        parts = [change(t) if k in which else t for k, t in enumerate(parts)]
+        del file["units/spike_times"], file["units/spike_times_index"]
+        file["units/spike_times"] = np.concatenate(parts)
+        file["units/spike_times_index"] = np.cumsum([len(t) for t in parts])
+
+    return changed
+
+
+def trials(**columns):
+    def changed(file):
+        for name, change in columns.items():
+            data = file[f"intervals/trials/{name}"]
+            data[:TRIALS] = change(data[:TRIALS])
+
+    return changed
+
+
+def same_as_first(file):
+    first = file["units/spike_times"][: file["units/spike_times_index"][0]]
+    units_of(lambda t: first, 2)(file)
+
+
+def put(index, value):
+    def changed(values):
+        values[index] = value
+        return values
+
+    return changed
+
+
+def reset(times):
+    half = len(times) // 2
+    return np.r_[times[:half], times[half:] - times[half] + 0.01]
+
+
+UNUSABLE = {  # what the note says, and the units and trials that are left
+    "reset": (units_of(reset, 1), r"1 of 4 units left out \(1\): their spike times go back", 3, 30),
+    "backwards": (units_of(lambda t: t[::-1], 0, 3), r"2 of 4 .*\(0, 3\).*go back", 2, 30),
+    "negative": (units_of(lambda t: t - 5000, 0, 1), r"\(0, 1\): their spikes end before", 2, 30),
+    "late": (units_of(lambda t: t + 5000, 2), r"\(2\): their spikes lie outside", 3, 30),
+    "ms": (units_of(lambda t: 1e3 * t, 2), r"\(2\): their spikes lie .* ms", 3, 30),
+    "half away": (
+        units_of(lambda t: np.where(np.arange(len(t)) < len(t) / 2, t - 5000, t), 3),
+        r"\(3\): their spikes lie outside", 3, 30,
+    ),
+    "a spike away": (
+        units_of(lambda t: np.r_[t, 1e6], 1), r"1 spikes far from .* \(unit 1\)", 4, 30
+    ),
+    "a few before": (
+        units_of(lambda t: np.r_[-0.5, -0.3, t], 1), r"2 spikes .* before 0 s \(unit 1\)", 4, 30
+    ),
+    "doubled": (units_of(lambda t: np.repeat(t, 2), 1), r"spikes counted once.* \(unit 1\)", 4, 30),
+    "no spikes": (units_of(lambda t: t[:0], 1, 2), r"2 of 4 units left out \(1, 2\): no sp", 2, 30),
+    "no times": (
+        units_of(lambda t: t * np.nan, 1), r"spikes left out: .* no times \(unit 1\)", 3, 30
+    ),
+    "the same unit": (same_as_first, r"1 of 4 .*\(2\): the spikes of unit 0 again", 3, 30),
+    "spikes end": (
+        units_of(lambda t: t[t < 100], *range(UNITS)), r"\(24, .*\): no unit has a", 4, 24
+    ),
+    "a trial at 0": (trials(start_time=put(20, 0.0)), r"1 of 30 .*\(20\): start_time goes", 4, 29),
+    "a trial early": (
+        trials(start_time=put(20, 5.0), choice_time=put(20, 7.0)), r"\(20\): start_time goes", 4, 29
+    ),
+    "a trial too long": (
+        trials(choice_time=put(7, 190.0)), r"\(7\): start_time goes", 4, 29
+    ),
+    "no length": (
+        trials(choice_time=lambda t: put(4, t[4] - 3)(t)), r"\(4\): (no contact|choice)", 4, 29
+    ),
+    "no time": (trials(start_time=put([3, 9], np.nan)), r"\(3, 9\): choice_time is not", 4, 28),
+    "trials reset": (
+        trials(start_time=lambda t: np.r_[t[:15], t[15:] - t[15] + 7],
+               choice_time=lambda t: np.r_[t[:15], t[15:] - 6.5 * 15 + 1]),
+        r"\(15, 16, 17, 18, 19, \.\.\.\): start_time goes back", 4, 15,
+    ),
+}  # fmt: skip
+
+
+def changed_copy(session, folder, change):
+    path = folder / "odd.nwb"
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_what_cannot_be_averaged_is_left_out_and_named(session, tmp_path, name):
+    change, note, units, left = UNUSABLE[name]
+    made = read_session(changed_copy(session, tmp_path, change))
+    whole = read_session(session)
+    assert not whole.notes and whole.session.rates.shape == (TRIALS, UNITS)
+    assert [n for n in made.notes if re.search("^session odd: .*" + note, n)], made.notes
+    assert made.session.rates.shape == (left, units)
+    rows = np.isin(whole.session.begin, made.session.begin)
+    kept = np.isin(whole.session.depth, made.session.depth)
+    if rows.sum() == left and name not in ("spikes end", "a few before"):
+        np.testing.assert_array_equal(made.session.rates, whole.session.rates[rows][:, kept])
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (units_of(reset, *range(UNITS)), "no unit can be used; .*4 of 4 .* go back"),
+        (units_of(lambda t: 1e3 * t, *range(UNITS)), "no unit can be used; .* ms"),
+        (units_of(lambda t: t[:0], *range(UNITS)), "no unit can be used; .* no spikes"),
+        (units_of(lambda t: t[(t - 5.91) % 6.5 > 4], *range(UNITS)), "none of 4 units has a spike"),
+        (trials(start_time=lambda t: 0 * t), "no trial is left .* start_time goes back|choice"),
+        (trials(choice_time=lambda t: t * np.nan), "no trial is left .* choice_time is not"),
+    ],
+)
+def test_a_session_of_which_nothing_is_left_is_refused(session, tmp_path, change, why):
+    path = changed_copy(session, tmp_path, change)
+    with pytest.raises(ConfigError, match=why) as refused:
+        read_session(path)
+    assert len(str(refused.value).removeprefix(str(path))) < 220
+    readings, notes = read_nwb([session, path])
+    assert len(readings) == 1 and notes[0].startswith("session odd left out: ")

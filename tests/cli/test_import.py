@@ -5,6 +5,7 @@ import pytest
 from bench.drivers.fuzzing import wire_of
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording import Recording
+from tests.helpers.dbc_mappings import map_signal
 
 
 @pytest.fixture
@@ -88,19 +89,6 @@ BU_: FT
 BO_ 416 Force: 4 FT
  SG_ Fx : 7|16@0- (0.01,0) [-327|327] "N" FT
 """
-MAPPING = """dbc = "f.dbc"
-name = "ft"
-rate_hz = 100.0
-[[channel]]
-name = "fx"
-unit = "N"
-[[element]]
-name = "S"
-grid = [0, 0]
-position_m = [0.0, 0.0, 0.0]
-orientation = [1.0, 0.0, 0.0, 0.0]
-signals = { fx = "Force.Fx" }
-"""
 
 
 @pytest.fixture
@@ -113,7 +101,7 @@ def bus(tmp_path, monkeypatch):
     good[40:50] = [ODD.format(k=40)]
     (tmp_path / "odd.log").write_text("".join(good))
     (tmp_path / "f.dbc").write_text(DBC)
-    (tmp_path / "f.toml").write_text(MAPPING)
+    (tmp_path / "f.toml").write_text(map_signal("f.dbc", "fx", "Force.Fx"))
     return tmp_path
 
 

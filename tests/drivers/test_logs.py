@@ -201,6 +201,16 @@ def test_times_never_go_back(tmp_path):
     ]
 
 
+@pytest.mark.parametrize("wrong", ["03:00:00", "15:00:00", "23:00:00"])
+def test_a_lone_wrong_time_of_day_is_no_midnight(tmp_path, wrong):
+    path = tmp_path / "day.txt"
+    days = ("20:59:59", wrong, "21:00:00", "23:59:59", "00:00:01")
+    path.write_text("".join(f"{day}.000 -> 1,2\n" for day in days))
+    log = read_log(path)
+    times = [75_599, 75_599, 75_600, 86_399, 86_401]
+    assert [t // 10**9 for _, t in log.packets()] == times and "1 times go back" in log.notes[0]
+
+
 def test_what_is_no_file_or_form_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no file"):
         read_log(tmp_path / "none")

@@ -285,6 +285,10 @@ class AsciiLine(SerialCodec):
         """Numbers by their names: a sample is whole when all have come, and over when one comes
         again, or that of the first column, with which each begins."""
         assert self._names is not None
+        while rest := self._names.cut_glued(text):
+            self.complaint = f"line {quoted(text)} breaks off in a number, and another begins"
+            self._refuse()
+            text = rest
         found = self._names.find(text)
         if not found:
             if _WORDS.fullmatch(text):

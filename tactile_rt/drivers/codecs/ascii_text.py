@@ -40,6 +40,7 @@ _NOTHING: Final = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;])")  # between two comma
 _BRACKETS: Final = str.maketrans(dict.fromkeys("()[]{}<>\"'|", " "))
 _SEPARATORS: Final = re.compile(r"[\s,;]+")
 _ARROW: Final = re.compile(r"[-=]>")
+_BETWEEN: Final = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"  # a name and its number
 _SIGNS: Final = frozenset("=:/~#*")
 
 
@@ -86,6 +87,9 @@ class Names:
     def __init__(self, names: Mapping[str, int]) -> None:
         self._names = names
         self._patterns = {place: _pattern(name) for name, place in names.items()}
+        known = "|".join(map(re.escape, names))
+        then = rf"(?=[{{\"']*({known})[\"']?\s*[:=])"
+        self._glued = re.compile(rf"(?<![\w.])({known}){_BETWEEN}(?>{NUMBER}){then}")
 
     def find(self, line: str) -> dict[int, float]:
         """The numbers of a line, by their places: NaN where a name stands before none."""
@@ -106,6 +110,13 @@ class Names:
             for place, pattern in self._patterns.items()
             if (found := pattern.search(text))
         }
+
+    def cut_glued(self, line: str) -> str:
+        """Return what follows where a sample broke off and another begins; empty: nowhere."""
+        for found in self._glued.finditer(line):
+            if self._names[found[2]] <= self._names[found[1]]:
+                return line[found.end() :]
+        return ""
 
 
 ABSENT: Final = object()
@@ -138,10 +149,9 @@ def _pattern(name: str) -> re.Pattern[str]:
     if not (base and place.isdecimal()):
         base, place = name, "0"
     before = r"(?<![\w.])" if base[:1].isalnum() or base[:1] == "_" else ""
-    between = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"
     value = r"[^\s,;:=\[\](){}|\"']+"
     return re.compile(
-        before + re.escape(base) + between + rf"(?:{value}\s*[,;\s]\s*){{{int(place)}}}({value})"
+        before + re.escape(base) + _BETWEEN + rf"(?:{value}\s*[,;\s]\s*){{{int(place)}}}({value})"
     )
 
 

@@ -222,6 +222,9 @@ def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvF
     else:  # without names, words may stand in the first rows, too
         known = ((k, c) for k, c in numeric if len(c) == width)
         first = next((k for k, c in known if usual and _is_number(c[usual[0]])), first)
+        begins = [k for k, _ in rows[:2]]
+        if begins[1:] == [first] and len(rows[0][1]) < width and all(map(_is_number, rows[0][1])):
+            first = begins[0]  # the end of a row that was cut
     lines = sum(k >= (below_names if names else first) for k, _ in rows)
     if often < ENOUGH * lines:
         return []

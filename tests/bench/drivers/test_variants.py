@@ -68,7 +68,14 @@ def test_there_are_many_and_no_two_are_one(variants):
 
 TABLES = ("comma", "decimal comma", "dates over New Year", "milliseconds")
 CHANGES = ("as it is", "a row missing", "CRLF at line ends", "UTF-16", "a column less", "head lost")
-OTHERS = ("candump -l: as it is", "asc: a row missing", "recording: cut at 60%", "asc: empty")
+GLUED = ("labels of two lines, sniffed: two rows in one", "Label: value, sniffed: two rows in one")
+ONES = (
+    "asc: empty",
+    "labels of two lines, sniffed: UTF-16",
+    "tab, no head: begins in a row",
+    *GLUED,
+)
+OTHERS = ("candump -l: as it is", "asc: a row missing", "recording: cut at 60%", *ONES)
 
 
 @pytest.mark.parametrize("name", [*(f"{b}: {c}" for b in TABLES for c in CHANGES), *OTHERS])
