@@ -21,7 +21,6 @@ from tactile_rt.classifier.model_file import read_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.settings import no_such, read_text, split_url
-from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.sets.sensor_faults import LARGEST
@@ -32,13 +31,12 @@ from tactile_rt.sim_backend.arrays.files import (
     read_animals,
     robot_text,
 )
-from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, added_categories
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance, usual_size
-from tactile_rt.sim_backend.transducer import device_spec, sensor_of
+from tactile_rt.sim_backend.transducer import device_spec, sensor_drift, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
 
 __all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
@@ -204,7 +202,7 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         "usual": f"{size:g}",
         "slow": slow,
         "fast": fast,
-        "offset": f"{_wandering(animals):.2g}",
+        "offset": f"{min(sensor_drift(animals, SweepRecipe.period_ms), LARGEST):.2g}",
         "profiles": ", ".join(PROFILES),
         "whiskers": str(len(spec.elements)),
         "link": f"/tmp/{name}",
@@ -222,17 +220,6 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
             (folder / name).unlink(missing_ok=True)
         raise
     return Project(folder)
-
-
-def _wandering(animals: tuple[WhiskerArray, ...]) -> float:
-    """The drift of an array's sensor, in units of the rated noise of the network's samples."""
-    sensor = sensor_of(animals)
-    if sensor is None:
-        return 0.0
-    period_ms = max(SweepRecipe.period_ms, 1e3 / sensor.rate_hz)
-    noise = channel_limits(device_spec(animals), sensor, round(period_ms * 1e6)).noise
-    most = max(c.drift / float(n) for c, n in zip(sensor.channels, noise, strict=True))
-    return min(most, LARGEST)
 
 
 def _described(array: str, folder: Path) -> str:

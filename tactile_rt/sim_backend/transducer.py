@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.core.stream.sensor_spec import FIELD, MagnetSpec, SensorSpec
+from tactile_rt.core.stream.sensor_spec import FIELD, MagnetSpec, SensorSpec, channel_limits
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.world import SAMPLE_MS, world_spec
 
-__all__ = ["FASTEST_HZ", "Transducer", "device_spec", "dipole_field", "sensor_of"]
+__all__ = ["FASTEST_HZ", "Transducer", "device_spec", "dipole_field", "sensor_drift", "sensor_of"]
 
 FORCES_MOMENTS = 6
 MU0_4PI = 1e-7  # of the vacuum's permeability, T m / A
@@ -75,6 +75,16 @@ def device_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
         units=tuple(c.unit for c in sensor.channels),
         rate_hz=sensor.rate_hz,
     )
+
+
+def sensor_drift(animals: Sequence[WhiskerArray], period_ms: float) -> float:
+    """Return the largest drift of a channel over its rated noise, of samples so far apart, ms."""
+    sensor = sensor_of(animals)
+    if sensor is None:
+        return 0.0
+    period_ns = round(max(period_ms, 1e3 / sensor.rate_hz) * 1e6)
+    noise = channel_limits(device_spec(animals), sensor, period_ns).noise
+    return max(c.drift / float(n) for c, n in zip(sensor.channels, noise, strict=True))
 
 
 class Transducer:
