@@ -78,7 +78,11 @@ def device_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
 
 
 def sensor_drift(animals: Sequence[WhiskerArray], period_ms: float) -> float:
-    """Return the largest drift of a channel over its rated noise, of samples so far apart, ms."""
+    """Return the largest drift of a channel over its rated noise.
+
+    Args:
+        period_ms: the period of the samples that carry the noise, ms.
+    """
     sensor = sensor_of(animals)
     if sensor is None:
         return 0.0

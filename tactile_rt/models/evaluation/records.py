@@ -6,13 +6,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
     from tactile_rt.models.evaluation.measures import Interval
 
-__all__ = ["Record", "as_dicts", "as_table", "record_share", "write"]
+__all__ = ["Record", "as_dicts", "as_table", "record_share", "show", "write"]
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
@@ -68,6 +69,11 @@ def as_table(records: list[Record]) -> Table:
 def as_dicts(records: list[Record]) -> list[dict[str, Any]]:
     """Records as JSON has them, each with whether it meets its bar."""
     return [{**asdict(r), "met": r.met} for r in records]
+
+
+def show(records: list[Record], console: Console) -> None:
+    """Print records as a table."""
+    console.print(as_table(records))
 
 
 def write(records: list[Record], path: Path) -> None:
