@@ -74,6 +74,8 @@ clean:
 $(VENV)/.sim: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable '.[sim]'
+	@echo "Compiling the simulator, once on this machine: about half a minute"
+	$(BIN)/python -c "from tactile_rt.sim_backend.source import compile_simulator as c; c()"
 	touch $@
 
 $(VENV)/.dev: pyproject.toml $(PINS)

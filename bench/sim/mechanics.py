@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.sim.beams import BeamErrors, beams, flat, measure
+from bench.sim.beams import ARRAYS, BeamErrors, beams, flat, measure
+from bench.sim.motion import HELD_MS, SLOW_MM_S, hold, release, slow_friction, strike
 from bench.sim.pegs import SLIDE_MM_S, Press, press, presses
 from bench.sim.ringing import release_error, rod_ring
 from tactile_rt.models.evaluation.records import Record
@@ -32,7 +33,7 @@ def mechanics(quick: bool) -> list[Record]:
         records += _array(key)
     for key in ("accurate", "dataset", "realtime"):
         records += _pegs(key, quick)
-    return records + _ringing(names)
+    return records + _ringing(names) + _motion(quick)
 
 
 def _worst(errors: dict[str, BeamErrors], of: Callable[[BeamErrors], float]) -> tuple[float, str]:
@@ -97,6 +98,49 @@ def _ringing(names: tuple[str, ...]) -> list[Record]:
                 Record(f"sim.{key}.{what}", scale * values[name], unit, limit, anchor,
                        f"worst of {len(values)} whiskers: {name}; {how}; "
                        f"median {scale * float(np.median(list(values.values()))):.3g}")
+            )  # fmt: skip
+    return records
+
+
+def _motion(quick: bool) -> list[Record]:
+    """Tips let go, touches that are held, weight, and fast plates, in every profile."""
+    known = beams()
+    heard = [n for n in known if known[n].resonance_hz < HEARD_HZ]
+    robot = [f"robot {w.name}" for w in load_array(str(ARRAYS / "robot.toml")).whiskers]
+    some = ["A3", "C2", "robot A0"] if quick else [*heard, *robot]
+    struck = ["C2", "E5", "A4"] if quick else [*known, *robot]
+    shares, speeds = (
+        ((0.05,), (3.0,)) if quick else ((0.001, 0.02, 0.05, 0.1), (0.1, 0.5, 1.0, 3.0))
+    )
+    records = []
+    for key, swing, hit in (("realtime", 3, 10), ("dataset", 1, 5), ("accurate", 0.3, 3)):
+        profile = PROFILES[key]
+        let_go = {(n, s): release(flat(n), profile, s) for n in some for s in shares}
+        held = {}
+        for n in some:
+            for axis in (0, 2):
+                force = hold(flat(n), profile, axis)
+                early = force[-HELD_MS + 50]
+                held[n, "xyz"[axis]] = np.linalg.norm(force[-1] - early) / np.linalg.norm(early)
+        plates = {(n, v): strike(flat(n), profile, v, 0.7) for n in struck for v in speeds}
+        slow = {(n, v): slow_friction(flat(n), profile, v) for n in some[:6] for v in SLOW_MM_S}
+        for what, unit, bar, values, anchor, how in (
+            ("swing_error", "%", f"<= {swing:g}", {c: 100 * e for c, (e, _) in let_go.items()},
+             "40 links in steps of 0.025 ms", "base moment, 60 ms after a tip is let go"),
+            ("swing_undershoot", "%", "<= 5", {c: 100 * abs(u - 1) for c, (_, u) in let_go.items()},
+             "40 links in steps of 0.025 ms", "first undershoot after a tip is let go"),
+            ("held_change", "%", "<= 2", {c: 100 * e for c, e in held.items()},
+             "dry friction holds for ever", "force from 0.05 s to 10 s after a peg came to rest"),
+            ("slow_error", "%", "<= 3", {c: 100 * e for c, e in slow.items()},
+             "dry friction does not depend on speed", "95 % of the force on slow ways, to 3 mm/s"),
+            ("strike_error", "%", f"<= {hit:g}", {c: 100 * e for c, e in plates.items()},
+             "20 links in steps of 0.002 ms", "impulse on the base as a 0.2 mm plate goes by"),
+        ):  # fmt: skip
+            case = max(values, key=lambda c: values[c])
+            records.append(
+                Record(f"sim.{key}.{what}", float(values[case]), unit, bar, anchor,
+                       f"{how}; worst of {len(values)}: {case[0]} at {case[1]}; "
+                       f"median {float(np.median(list(values.values()))):.2g}")
             )  # fmt: skip
     return records
 

@@ -50,7 +50,7 @@ def doctor(
 
     check_output(udev)
     ports = serial_ports()
-    findings = diagnose(ports, can_buses())
+    findings = [*diagnose(ports, can_buses()), *_look_at_simulator()]
     alone = told_as_json(findings, json)
     console = Console(stderr=alone, soft_wrap=True, highlight=False)
     for finding in () if alone else findings:
@@ -65,6 +65,22 @@ def doctor(
         )
     if not all(f.good for f in findings):
         raise typer.Exit(1)
+
+
+def _look_at_simulator() -> list[Any]:
+    """Say whether the simulator is compiled, where it can be."""
+    from importlib.util import find_spec
+
+    from tactile_rt.drivers.discovery import Finding
+
+    if not all(map(find_spec, ("numba", "mujoco", "trimesh"))):
+        return []
+    from tactile_rt.sim_backend.rods.compiled import is_kept
+    from tactile_rt.sim_backend.rods.stepping import advance
+
+    kept = is_kept(advance)
+    says = "compiled" if kept else "not compiled yet: its first use on this machine takes a minute"
+    return [Finding("simulator", True, says)]
 
 
 @app.command(epilog="tactile-rt codecs xela")

@@ -136,6 +136,7 @@ def export_checkpoint(
             "unseen_objects": list(manifests[0].split["test"]),
             "trained_objects": trained_objects(manifests, saved),
             "tactile_rt": VERSION,
+            "engine": manifest.versions.get("engine", "1"),  # of the simulated sweeps
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on
             "onnx": onnx.__version__,
             "onnxruntime": onnxruntime.__version__,

@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
@@ -50,6 +50,7 @@ __all__ = [
     "Pass",
     "SimOptions",
     "SimSource",
+    "compile_simulator",
 ]
 
 log = logging.getLogger("tactile_rt.sim_backend")
@@ -174,8 +175,9 @@ class SimOptions(PacedOptions, Randomisation):
         size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
             see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
-            shake_hz: The parameters of every sweep, see `sweep.Sweep`; left out, it is level, as
-            fast at once and not shaken.
+            shake_hz, gravity_x_g, gravity_y_g, gravity_z_g, tilt_deg, tilt_axis_deg, tilt_ms: The
+            parameters of every sweep, see `sweep.Sweep`; left out, it is level, as fast at once and
+            not shaken.
     """
 
     objects: str = ""
@@ -197,6 +199,12 @@ class SimOptions(PacedOptions, Randomisation):
     surface_friction: float | None = None
     shake_g: float | None = None
     shake_hz: float | None = None
+    gravity_x_g: float | None = None
+    gravity_y_g: float | None = None
+    gravity_z_g: float | None = None
+    tilt_deg: float | None = None
+    tilt_axis_deg: float | None = None
+    tilt_ms: float | None = None
 
     def __post_init__(self) -> None:
         PacedOptions.__post_init__(self)
@@ -260,7 +268,8 @@ class SimSource(PacedSource):
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
-        _warm_up()
+        self._told_wedged: set[str] = set()
+        compile_simulator()
 
     @staticmethod
     def check(array: str, options: SimOptions) -> ArraySpec:
@@ -303,6 +312,13 @@ class SimSource(PacedSource):
                 turns = self._simulation.turns().astype(np.float32)
                 values = np.concatenate([values, turns], axis=2)
             self._left -= n
+            if wedged := self._simulation.wedged - self._told_wedged:
+                self._told_wedged |= wedged
+                log.warning(
+                    "no room for whiskers %s in %s: their loads depend on the profile",
+                    name_some(sorted(wedged), 8),
+                    self.passes[-1].name,
+                )
             if not self._left and contacts[-1, :, 0].any():
                 self._left = DRAGGED_SAMPLES
         return self._stamp(values, start_ns)
@@ -337,9 +353,8 @@ class SimSource(PacedSource):
 
 
 @cache
-def _warm_up() -> None:
-    """Have compiled what steps a sweep: a stream would stand still for half a minute, and whoever
-    wants to leave would wait for it."""
+def compile_simulator() -> None:
+    """Compile what steps a sweep, so that no stream waits for it."""
     target, rng = promised_object(next(iter(CATEGORIES)))(), np.random.default_rng(0)
     mouse = load_animals("mouse")
     _, sweep = draw_simulation(rng, mouse, target, PROFILES["realtime"], draw_sweep)

@@ -20,6 +20,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
 __all__ = [
+    "EARTH",
     "NOTHING",
     "Sweep",
     "centrelines",
@@ -36,11 +37,12 @@ SPACING_MM = 0.25
 TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off the centreline
 PASSED_BY_MM = 0.5  # a miss by less is simulated
 
+EARTH = 9.80665  # m/s^2
 Floats = NDArray[np.float64]
 NOTHING: Mapping[str, float] = MappingProxyType({})
 LIMITS = {
     "size_mm": (1e-3, 1e4),
-    "speed_mm_s": (1e-3, 1e4),
+    "speed_mm_s": (1e-3, 3e3),  # faster, a step of the simulation would be too long
     "gap_mm": (0.0, 1e4),
     "heading_deg": (-60.0, 60.0),  # beyond, it comes at the head itself
     "climb_deg": (-60.0, 60.0),
@@ -49,6 +51,10 @@ LIMITS = {
     "surface_friction": (0.0, 10.0),
     "shake_g": (0.0, 5.0),
     "shake_hz": (0.1, 200.0),  # samples are a millisecond apart
+    **dict.fromkeys(("gravity_x_g", "gravity_y_g", "gravity_z_g"), (-5.0, 5.0)),
+    "tilt_deg": (-180.0, 180.0),
+    "tilt_axis_deg": (-180.0, 180.0),
+    "tilt_ms": (0.0, 1e5),
 }
 
 
@@ -193,6 +199,13 @@ class Sweep:
         shake_g: The amplitude of the acceleration with which the head is shaken along (1, 1, 1), as
             a robot's that walks or flies, in multiples of the Earth's (9.80665 m/s^2).
         shake_hz: The frequency of that, Hz.
+        gravity_x_g, gravity_y_g, gravity_z_g: The gravity that is added to that of the array's
+            description, in the world, in multiples of the Earth's.
+        tilt_deg: The angle by which the head, and all that is described in the world with it, is
+            tilted after the tare, degrees. Loads are those above the tare, so that the weight of
+            the whiskers shows.
+        tilt_axis_deg: The direction of the axis of that tilt in the x-y plane, from x, degrees.
+        tilt_ms: The time that the tilt takes, from the start of the sweep; 0: it is tilted before.
     """
 
     size_mm: float = 40.0
@@ -210,6 +223,12 @@ class Sweep:
     surface_friction: float = 1.0
     shake_g: float = 0.0
     shake_hz: float = 30.0
+    gravity_x_g: float = 0.0
+    gravity_y_g: float = 0.0
+    gravity_z_g: float = 0.0
+    tilt_deg: float = 0.0
+    tilt_axis_deg: float = 0.0
+    tilt_ms: float = 0.0
 
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
@@ -230,6 +249,18 @@ class Sweep:
         """(3, 3) rotation into a frame in which the object's way is along -y."""
         heading, climb = np.radians((self.heading_deg, self.climb_deg))
         return rotation("x", climb) @ rotation("z", -heading)
+
+    def gravity(self, described: Sequence[float], tilt: float = 0.0) -> Floats:
+        """Compute gravity in the world, m/s^2, with a share of the tilt.
+
+        Args:
+            described: (3,) that of the array's description, m/s^2.
+        """
+        added = np.array([self.gravity_x_g, self.gravity_y_g, self.gravity_z_g]) * EARTH
+        axis = rotation("z", np.radians(self.tilt_axis_deg))
+        # The world turns with the head, so that gravity turns the other way.
+        back = axis @ rotation("x", -np.radians(self.tilt_deg) * tilt) @ axis.T
+        return np.asarray(back @ (described + added))
 
 
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, link_nodes
 from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sweep import (
+    EARTH,
     Sweep,
     centrelines,
     draw_sweep,
@@ -31,8 +32,8 @@ TOO_MUCH = 1.1  # a damping ratio so many times the wanted one is told
 FINER = ("dataset", "accurate")
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
-G = 9.80665e-3  # mm/ms^2
 SHAKEN_IN_MS = 50.0  # in which shaking grows to its whole
+WEDGED_MM, WEDGED_MS = 0.02, 25  # deeper and longer a whisker overlaps only without room
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
 Floats = NDArray[np.float64]
 
@@ -71,9 +72,9 @@ def _off(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, flo
 
 def check_sweep(sweep: Sweep, profile: Profile) -> None:
     """Raise a `ConfigError` if the profile's engine cannot step such a sweep."""
-    for name in ("head_moves", "shake_g"):
+    for name in ("head_moves", "shake_g", "gravity_x_g", "gravity_y_g", "gravity_z_g", "tilt_deg"):
         if getattr(sweep, name) and engine_of(profile) == "mujoco":
-            raise ConfigError(f"{name}: MuJoCo's world has a head that stands still")
+            raise ConfigError(f"{name}: MuJoCo's world has no weight and a head that stands still")
 
 
 class World(Protocol):
@@ -122,6 +123,8 @@ class SweepSimulation:
         touches: False when the object passes without meeting any resting whisker.
         duration_ms: The simulated time after which the object has passed where all whiskers rest,
             ms; it may still drag one along.
+        wedged: The names of whiskers that had no room between parts of the object: their loads
+            depend on the profile.
     """
 
     def __init__(
@@ -137,6 +140,11 @@ class SweepSimulation:
         animals = tuple(_on_surface(animal, sweep.surface_friction) for animal in animals)
         whiskers = [w for animal in animals for w in animal.whiskers]
         straight = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
+        rods = engine_of(profile) == "rods"
+        level = sweep.gravity(animals[0].gravity) * 1e-3 * rods  # mm/ms^2; MuJoCo's has none
+        gravity = level if sweep.tilt_ms else sweep.gravity(animals[0].gravity, 1.0) * 1e-3 * rods
+        if gravity.any():
+            straight = _bend_by_weight(straight, animals, profile, gravity)
         outward = faces_right(animals, straight)
         # All that follows is in the frame in which the object goes along -y.
         across = sweep.across
@@ -155,7 +163,9 @@ class SweepSimulation:
             way = FAR_MM + front - max(line[:, 1].max() for line in lines)
         start[1] += sweep.gap_mm - way
         self.reached = int(met.sum())
-        self._simulated = np.flatnonzero(met | whole | bool(sweep.shake_g))
+        tilted = bool(level.any() and sweep.tilt_deg)
+        shakes = bool(sweep.shake_g or (sweep.head_moves and sweep.ramp_ms))
+        self._simulated = np.flatnonzero(met | whole | tilted | shakes)
         self._elements = len(whiskers)
         self._animals, self._profile = animals, profile
         felt = [whiskers[i] for i in self._simulated]
@@ -168,24 +178,33 @@ class SweepSimulation:
             trimesh.Trimesh(turned[i], target.pieces[i].faces, process=False) for i in kept
         ]
         self._sweep, self._start, self._ahead = sweep, across.T @ start, across.T @ (0, -1, 0)
-        self._samples = 0
-        self._world: World
-        if engine_of(profile) == "rods":
-            # Where it is missing, MuJoCo steps the array.
-            from tactile_rt.sim_backend.rods.world import Piece, RodWorld
-
-            steps = round(SAMPLE_MS / profile.timestep_ms)
-            roots = _roots(animals)[self._simulated]
-            parts = [Piece.of(piece) for piece in self._pieces]
-            self._world = RodWorld(felt, roots, parts, profile.links, steps)
-        else:
-            self._world = MujocoWorld(self.model, felt, profile, self._start)
-
+        self._samples, self._felt = 0, felt
+        self._level, self._gravity = level, gravity
+        self._tare: Floats | float = 0.0  # loads of the whiskers' weight before a tilt, N and N m
+        self._tilts = tilted and bool(sweep.tilt_ms)
+        self._turned, self.wedged = np.zeros((0, len(whiskers), 2)), set[str]()
+        self._overlapping = np.zeros(len(felt), dtype=np.int64)
         rear = start[1] + max(points[:, 1].max() for points in shape)
         last = min(line[:, 1].min() for line in lines)
         # with a ramp it has gone half as far by its end
         whole = (rear - last + CLEAR_MM) / (sweep.speed_mm_s * 1e-3)
         self.duration_ms = float(whole + sweep.ramp_ms / 2)
+
+    @cached_property
+    def _world(self) -> World:
+        """Step the whiskers; made with the first sample, not for a rejected draw."""
+        profile = self._profile
+        if engine_of(profile) != "rods":
+            return MujocoWorld(self.model, self._felt, profile, self._start)
+        from tactile_rt.sim_backend.rods.world import Piece, RodWorld
+
+        parts = [Piece.of(piece) for piece in self._pieces]
+        roots = _roots(self._animals)[self._simulated]
+        steps = round(SAMPLE_MS / profile.timestep_ms)
+        if self._gravity.any():
+            level = RodWorld(self._felt, roots, (), profile.links, steps, self._level)
+            self._tare = level.rest_loads()
+        return RodWorld(self._felt, roots, parts, profile.links, steps, self._gravity)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -222,12 +241,25 @@ class SweepSimulation:
         """
         loads = np.zeros((samples, self._elements, 6))
         contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))
-        way = self._place(self._samples + np.arange(samples + 1))
+        first = self._samples
+        way = self._place(first + np.arange(samples + 1))
+        self._turned = np.zeros((samples, self._elements, 2))
         self._samples += samples
         if len(self._simulated):
-            found = self._world.advance(way, every, self._shaken(samples))
-            loads[:, self._simulated], contacts[:, self._simulated] = found
+            found = self._world.advance(way, every, self._shaken(first, samples))
+            loads[:, self._simulated] = found[0] - self._tare
+            contacts[:, self._simulated] = found[1]
+            if len(self._world.turns):  # MuJoCo's bases do not give
+                self._turned[:, self._simulated] = self._world.turns
+            self._note_wedged(getattr(self._world, "overlap", np.zeros((0, 0))))
         return loads, contacts
+
+    def _note_wedged(self, overlap: Floats) -> None:
+        for sample in overlap > WEDGED_MM:  # (whisker,) each
+            self._overlapping = np.where(sample, self._overlapping + 1, 0)
+            self.wedged |= {
+                self._felt[i].name for i in np.flatnonzero(self._overlapping > WEDGED_MS)
+            }
 
     def _place(self, samples: NDArray[np.int64]) -> Floats:
         """(n, 3) where the object is after so many samples, mm, from the head."""
@@ -239,14 +271,13 @@ class SweepSimulation:
         place: Floats = self._start + (self._sweep.speed_mm_s * 1e-3 * way)[:, None] * self._ahead
         return place
 
-    def _shaken(self, samples: int) -> Floats | None:
-        """(n, 3) acceleration of the head in the samples just begun, mm/ms^2; None: it has none."""
+    def _shaken(self, first: int, samples: int) -> Floats | None:
+        """(n, 3) acceleration of the head from sample `first` on, mm/ms^2; None: it has none."""
         sweep, ramp = self._sweep, self._sweep.ramp_ms
-        first = (self._samples - samples) * SAMPLE_MS
-        moves = bool(sweep.head_moves) and first < ramp
-        if not moves and not sweep.shake_g:
+        moves = bool(sweep.head_moves) and first * SAMPLE_MS < ramp
+        if not (moves or sweep.shake_g or self._tilts):
             return None
-        times = first + (np.arange(samples) + 0.5) * SAMPLE_MS
+        times = (first + np.arange(samples) + 0.5) * SAMPLE_MS
         shaken = np.zeros((samples, 3))
         if moves:
             x = np.minimum(times / ramp, 1.0)
@@ -255,7 +286,12 @@ class SweepSimulation:
         if sweep.shake_g:
             grown = np.minimum(times / SHAKEN_IN_MS, 1.0)
             wave = grown * np.sin(2 * np.pi * sweep.shake_hz * 1e-3 * times)
-            shaken += np.outer(sweep.shake_g * G * wave, np.ones(3) / np.sqrt(3))
+            shaken += np.outer(sweep.shake_g * EARTH * 1e-3 * wave, np.ones(3) / np.sqrt(3))
+        if self._tilts:  # what gravity is more than at the tare
+            x = np.minimum(times / sweep.tilt_ms, 1.0)
+            described = self._animals[0].gravity
+            turned = [sweep.gravity(described, share) * 1e-3 for share in x**2 * (3 - 2 * x)]
+            shaken -= np.array(turned) - self._level
         return shaken
 
     def turns(self) -> Floats:
@@ -263,10 +299,7 @@ class SweepSimulation:
 
         Of the samples of the last `advance`, means; zero of mounts that do not give.
         """
-        found = self._world.turns
-        turns = np.zeros((len(found), self._elements, 2))
-        turns[:, self._simulated] = found
-        return turns
+        return self._turned
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""
@@ -300,6 +333,23 @@ def _beside(
     nearest = shape[:, 0].min() if right else shape[:, 0].max()
     x = face + (sweep.distance_mm if right else -sweep.distance_mm) - nearest
     return np.array([x, FAR_MM, sweep.height_mm])
+
+
+def _bend_by_weight(
+    lines: Sequence[Floats], animals: Sequence[WhiskerArray], profile: Profile, gravity: Floats
+) -> list[Floats]:
+    """Bend lines (point, 3) of whiskers at rest by their weight, mm."""
+    from tactile_rt.sim_backend.rods.world import RodWorld
+
+    whiskers = [w for animal in animals for w in animal.whiskers]
+    steps = round(SAMPLE_MS / profile.timestep_ms)
+    world = RodWorld(whiskers, _roots(animals), (), profile.links, steps, gravity)
+    bent = []
+    for whisker, line, sag in zip(whiskers, lines, world.sag, strict=True):
+        s = np.linspace(0, whisker.length, len(line))
+        nodes = link_nodes(whisker, profile.links)
+        bent.append(line + np.stack([np.interp(s, nodes, sag[:, k]) for k in range(3)], axis=1))
+    return bent
 
 
 def _on_surface(animal: WhiskerArray, friction: float) -> WhiskerArray:

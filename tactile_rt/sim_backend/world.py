@@ -28,6 +28,7 @@ from tactile_rt.sim_backend.arrays.whiskers import (
 
 __all__ = [
     "CHANNELS",
+    "ENGINE",
     "JAMMED",
     "MOUNT",
     "PROFILES",
@@ -48,6 +49,7 @@ __all__ = [
 CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 SAMPLE_MS = 1.0  # output period: 1 kHz
+ENGINE = "2"  # version of `rods`: the numbers of another one differ
 JAMMED = (
     "the simulation has become unstable: a whisker jams that is too stiff for this profile; "
     "sweep at a larger distance, or at a finer profile"

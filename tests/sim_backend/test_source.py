@@ -276,7 +276,7 @@ def test_what_is_compiled_is_so_before_the_clock_begins(monkeypatch) -> None:
         return sweep, made
 
     monkeypatch.setattr(source_module, "draw_simulation", told)
-    source_module._warm_up.cache_clear()
+    source_module.compile_simulator.cache_clear()
     SimSource("mouse", SimOptions(objects="mug")).close()
     fast(objects="mug").close()
     assert asked == [1]

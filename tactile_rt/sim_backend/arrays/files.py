@@ -5,6 +5,7 @@ see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML:
 
     name = "robot"             # the file's name if left out
     mirror = true              # adds the left side
+    gravity_m_s2 = [0.0, 0.0, -9.80665]    # in the world; if left out: whiskers have no weight
     [mount]                    # if left out: unturned, the mean base point at the world's origin
     position_mm = [0.0, 0.0, 0.0]
     roll_pitch_yaw_rad = [0.0, 0.0, 0.0]
@@ -28,6 +29,7 @@ import csv
 import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -114,6 +116,10 @@ SPECIES: dict[str, Callable[[], tuple[Whisker, ...]]] = {
 }
 
 
+ANIMALS = (*SPECIES, *(f"{animal}-{side}" for animal in SPECIES for side in SIDES))
+
+
+@cache
 def species_array(name: str) -> WhiskerArray:
     """The array of an animal: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ...
 
@@ -124,9 +130,8 @@ def species_array(name: str) -> WhiskerArray:
     points is where the mouse's is.
     """
     animal, _, side = name.partition("-")
-    known = [*SPECIES, *(f"{a}-{s}" for a in SPECIES for s in SIDES)]
-    if name not in known:
-        known += [*ROBOTS, *packages.added_names(packages.ARRAYS)]
+    if name not in ANIMALS:
+        known = [*ANIMALS, *ROBOTS, *packages.added_names(packages.ARRAYS)]
         near = difflib.get_close_matches(name, known, 1)
         raise ConfigError(
             f"no simulated array {name!r}: "
@@ -172,6 +177,7 @@ class _Sensor(msgspec.Struct, forbid_unknown_fields=True):
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     name: str = ""
     mirror: bool = False
+    gravity_m_s2: Point = ORIGIN
     mount: _Mount | None = None
     sensor: _Sensor | None = None
     defaults: dict[str, Any] = {}
@@ -199,6 +205,8 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
         return read_animals(path)
     if name in ROBOTS:
         return read_animals(Path(f"{name}.toml"), robot_text(name))
+    if name in ANIMALS:  # without a look at what is installed
+        return (species_array(name),)
     file = packages.added(packages.ARRAYS, name)
     return (species_array(name),) if file is None else read_animals(Path(file))
 
@@ -227,10 +235,12 @@ def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
     if file.animal:
-        if any((file.name, file.mirror, file.mount, file.sensor, file.defaults)):
+        if any(
+            (file.name, file.mirror, any(file.gravity_m_s2), file.mount, file.sensor, file.defaults)
+        ):
             raise ConfigError(
                 f"{path}: beside [[animal]] tables there is nothing else; name, mirror, "
-                f"mount, sensor and defaults belong in the file of an array"
+                f"gravity_m_s2, mount, sensor and defaults belong in the file of an array"
             )
         animals = [_animal(path, animal) for animal in file.animal]
         try:
@@ -250,7 +260,10 @@ def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
     made = _distinct(path, whiskers)
     mount = _mount(path, file.mount) if file.mount else centred_mount(made)
     name = file.name or path.stem
-    array = WhiskerArray(name, made, mount, _sensor(nodes, file.sensor))
+    try:
+        array = WhiskerArray(name, made, mount, _sensor(nodes, file.sensor), file.gravity_m_s2)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     return (both_sides(array, name) if file.mirror else array,)
 
 

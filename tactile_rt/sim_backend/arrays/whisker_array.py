@@ -18,6 +18,7 @@ from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 __all__ = ["MOUNT", "Mount", "WhiskerArray", "both_sides", "centred_mount", "mirrored", "place"]
 
 Point = tuple[float, float, float]
+MOST_GRAVITY = 50.0  # m/s^2; more is a slip of the pen
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ class WhiskerArray:
     Attributes:
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
         sensor: What reads the whiskers; None: the base loads are read as they are.
+        gravity: The gravity where the array is mounted, in the world, m/s^2; zeros: its whiskers
+            have no weight. Loads are those above a tare there.
 
     Raises:
         ConfigError: no whiskers, or two of one name or in one cell of the grid.
@@ -66,10 +69,15 @@ class WhiskerArray:
     whiskers: tuple[Whisker, ...]
     mount: Mount = MOUNT
     sensor: SensorSpec | None = field(default=None, hash=False)
+    gravity: Point = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not self.whiskers:
             raise ConfigError(f"array {self.name}: has no whiskers; give at least one")
+        if not all(abs(g) <= MOST_GRAVITY for g in self.gravity):
+            raise ConfigError(
+                f"array {self.name}: gravity_m_s2 must be within +-{MOST_GRAVITY:g} m/s^2"
+            )
         names: dict[object, str] = {}
         for w in self.whiskers:
             for key, what in ((w.name, "name"), ((w.row, w.column), "cell of the grid")):
@@ -116,10 +124,12 @@ def place(arrays: Sequence[WhiskerArray]) -> tuple[WhiskerArray, ...]:
     grid follow below those of the animals before it. A single animal keeps its names.
 
     Raises:
-        ConfigError: two in the same pose.
+        ConfigError: two in the same pose, or under different gravity.
     """
     if len(arrays) == 1:
         return (arrays[0],)
+    if len({array.gravity for array in arrays}) > 1:
+        raise ConfigError("the arrays of one world must have the same gravity_m_s2, or none")
     for k, array in enumerate(arrays):
         if array.mount in [a.mount for a in arrays[:k]]:
             raise ConfigError(f"animal {k + 1} ({array.name}) stands in another; move its mount")

@@ -9,7 +9,7 @@ import hashlib
 import os
 from collections.abc import Generator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
+from tactile_rt.sim_backend.world import ENGINE, PROFILES, SAMPLE_MS
 
 __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
 
@@ -80,6 +80,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
         category_of=objects.category_of,
         versions={
             "tactile_rt": VERSION,
+            "engine": ENGINE,
             **{p: version(p) for p in packages},
             "whiskers": hashlib.sha256(morphology.encode()).hexdigest()[:16],
         },
@@ -201,9 +202,13 @@ class _Work:
         _write(self.folder, name, records, target)
         return None
 
-    @cached_property
+    @property
     def _objects(self) -> ShapeObjects | MeshObjects:
-        return choose_objects(self.recipe.objects)
+        return _objects_once(self.recipe.objects)
+
+
+# Once in a process: Ray hands each task a work of its own.
+_objects_once = lru_cache(maxsize=1)(choose_objects)
 
 
 def _write(folder: Path, name: str, records: Sequence[SweepRecord], target: TactileObject) -> None:
@@ -234,9 +239,10 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
 
     Returns:
         (sample, element, channel) values, SI, and the parameters of `sweep.Sweep` with `draw`, the
-        sweep's number among those of its combination, `touches`, 0 when it misses the array, and
-        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then. With
-        contacts if the recipe asks for them: they are the truth, whatever the sensors make of it.
+        sweep's number among those of its combination, `touches`, 0 when it misses the array,
+        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then, and
+        `wedged`, how many whiskers had no room, see `SweepSimulation`. With contacts if the recipe
+        asks for them: they are the truth, whatever the sensors make of it.
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
     ideal = load_animals(recipe.array)
@@ -258,6 +264,7 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         "draw": recipe.sweeps.draw_index(index),
         "touches": float(simulation.touches),
         "unstable": float(simulation.touches and made is None),
+        "wedged": float(len(simulation.wedged)),
     }
     elements = sum(len(animal.whiskers) for animal in ideal)
     loads, felt = made or (np.zeros((0, elements, len(LOADS))),) * 2

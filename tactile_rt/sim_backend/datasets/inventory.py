@@ -29,6 +29,7 @@ class Tally:
     sweeps: int = 0
     misses: int = 0
     unstable: int = 0
+    wedged: int = 0
     skipped: int = 0
 
     @property
@@ -37,6 +38,7 @@ class Tally:
         told = {
             f"{self.misses} miss the array": self.misses,
             f"{self.unstable} could not be simulated": self.unstable,
+            f"{self.wedged} leave no room for a whisker": self.wedged,
             f"{self.skipped} objects could not be made ({SKIPPED})": self.skipped,
         }
         return ", ".join(text for text, count in told.items() if count)
@@ -45,7 +47,7 @@ class Tally:
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
     """Count what there is of these objects."""
     there = [name for name in names if has_object(folder, name)]
-    misses = unstable = 0
+    misses = unstable = wedged = 0
     for name in there:
         path = object_path(folder, name)
         check_no_pointer(path)
@@ -54,12 +56,13 @@ def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
                 known = set(arrays.files)
                 misses += int((~arrays["touches"]).sum()) if "touches" in known else 0
                 unstable += int(arrays["unstable"].sum()) if "unstable" in known else 0
+                wedged += int((arrays["wedged"] > 0).sum()) if "wedged" in known else 0
         except Exception as error:  # numpy and zipfile raise a dozen unrelated types
             reason = str(error) or type(error).__name__
             raise RecordingError(
                 f"{path} is damaged ({reason}): delete it and sweep again"
             ) from None
-    return Tally(len(there) * sweeps, misses, unstable, len(read_skipped(folder)))
+    return Tally(len(there) * sweeps, misses, unstable, wedged, len(read_skipped(folder)))
 
 
 def remove_leftovers(folder: Path) -> None:

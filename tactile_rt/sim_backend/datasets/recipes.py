@@ -231,6 +231,12 @@ class SweepChoice:
     surface_friction: Choice = 1.0
     shake_g: Choice = 0.0
     shake_hz: Choice = 30.0
+    gravity_x_g: Choice = 0.0
+    gravity_y_g: Choice = 0.0
+    gravity_z_g: Choice = 0.0
+    tilt_deg: Choice = 0.0
+    tilt_axis_deg: Choice = 0.0
+    tilt_ms: Choice = 0.0
     draws: int = 1
     held_out_draws: int = 0
     least_whiskers: int = 1

@@ -22,6 +22,7 @@ __all__ = [
     "inertial_forces",
     "mass_matrix",
     "place",
+    "place_at",
     "solve_back",
     "solve_forth",
     "solve_many_forth",
@@ -99,6 +100,16 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
                 frames[b, i, 2] = z
         for i in range(3):
             nodes[b + 1, i] = nodes[b, i] + frames[b, i, 0] * length[b]
+
+
+@compiled
+def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
+    """Fill in where a chain on a (4, 3) base is: its point and frame."""
+    for i in range(3):
+        pose.nodes[0, i] = root[0, i]
+        for k in range(3):
+            pose.frames[0, i, k] = root[1 + i, k]
+    place(chain, q, pose)
 
 
 @compiled

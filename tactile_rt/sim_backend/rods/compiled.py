@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import caching
 
-__all__ = ["compiled"]
+__all__ = ["compiled", "is_kept"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -96,3 +96,9 @@ def compiled(function: Function) -> Function:
     except RuntimeError:  # no folder to keep it in
         _tell_once()
     return cast(Function, made)
+
+
+def is_kept(function: Callable[..., Any]) -> bool:
+    """Return True if other processes find this version of a function compiled."""
+    cache: Any = getattr(function, "_cache", None)
+    return isinstance(cache, _Kept) and bool(cache._cache_file._load_index())

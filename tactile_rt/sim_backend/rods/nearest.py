@@ -94,7 +94,9 @@ def _weights(simplex: A, count: int, weights: A, w: A) -> float:
 
 
 @compiled
-def nearest(a: A, b: A, corners: A, faces: A, known: A, work: A, found: A) -> None:
+def nearest(
+    a: A, b: A, corners: A, faces: A, beside: A, beside_at: A, known: A, work: A, found: A
+) -> None:
     """Distance of a segment from a convex piece, both in the piece's frame.
 
     Args:
@@ -102,6 +104,9 @@ def nearest(a: A, b: A, corners: A, faces: A, known: A, work: A, found: A) -> No
         corners: (corner, 3) mm.
         faces: (face, 4) outward normals and offsets, for a segment that overlaps the piece; none:
             the piece is a point or a line.
+        beside: the numbers of the corners to which an edge leads from each, one corner after the
+            other, and `beside_at` (corner + 1,) where each one's begin; without any, all corners
+            are tried.
         known: (4,) pairs of a corner and an end between which the nearest points lie, each twice
             the corner, plus one for b; from -1 on unknown. The last call's, if little has moved
             since, or -1; filled.
@@ -142,10 +147,22 @@ def nearest(a: A, b: A, corners: A, faces: A, known: A, work: A, found: A) -> No
         onto_a = p0 * a[0] + p1 * a[1] + p2 * a[2]
         onto_b = p0 * b[0] + p1 * b[1] + p2 * b[2]
         far, furthest = 0, -np.inf
-        for c in range(len(corners)):
-            onto = p0 * corners[c, 0] + p1 * corners[c, 1] + p2 * corners[c, 2]
-            if onto > furthest:
-                furthest, far = onto, c
+        if beside_at[-1] == beside_at[0]:
+            for c in range(len(corners)):
+                onto = p0 * corners[c, 0] + p1 * corners[c, 1] + p2 * corners[c, 2]
+                if onto > furthest:
+                    furthest, far = onto, c
+        else:  # uphill along the edges: on a convex body no other top is in the way
+            at = known[0] // 2
+            while at >= 0:
+                far, at = at, -1
+                onto = p0 * corners[far, 0] + p1 * corners[far, 1] + p2 * corners[far, 2]
+                furthest = max(furthest, onto)
+                for k in range(beside_at[far], beside_at[far + 1]):
+                    c = beside[k]
+                    onto = p0 * corners[c, 0] + p1 * corners[c, 1] + p2 * corners[c, 2]
+                    if onto > furthest:
+                        furthest, at = onto, c
         if square - (min(onto_a, onto_b) - furthest) <= 1e-12 * square:
             break
         pair = 2 * far + (0 if onto_a < onto_b else 1)

@@ -23,6 +23,7 @@ __all__ = ["Scratch", "scratch", "step"]
 
 A = Any
 OUT_SWEEPS = 30
+GIVES_MM = 1e-4  # how far what holds a contact gives way before it slides
 
 
 @compiled
@@ -96,7 +97,7 @@ def scratch(links: int, n: int) -> Scratch:
 def step(
     h: float,
     fresh: bool,
-    matched: bool,
+    level: int,
     chain: Chain,
     q: A,
     v: A,
@@ -133,12 +134,12 @@ def step(
     inertial_forces(chain, pose, v, move, base, pushed, room.forces, free, wrench)
     if fresh:
         # The added mass is that of the whisker at rest: bent far, the sum may be less than nothing.
-        for share in range(int(matched), -1, -1):
+        for share in range(1, -1, -1):
             mass_matrix(chain, pose, room.cube, mass)
             for i in range(n):
                 for j in range(i + 1):
-                    mass[i, j] += share * chain.added[i, j]
-                    lower[i, j] = mass[i, j] + h * chain.damping[i, j]
+                    mass[i, j] += share * chain.added[i, level, j]
+                    lower[i, j] = mass[i, j] + h * chain.damping[i, level, j]
                 lower[i, i] += h * h * stiffness[i]
             if factor(lower, n):
                 break
@@ -186,6 +187,10 @@ def step(
                     s += reply[k, i] * move[k]
                 free[i] = s
             free[3 * c] += max(gaps[c], 0.0) / h
+            # What holds a contact that sticks has given way so far already, see `friction`.
+            link = link_of[segments[c]]
+            free[3 * c + 1] += last[link, 4] / h
+            free[3 * c + 2] += last[link, 5] / h
         for i in range(3 * count):
             for j in range(3 * count):
                 response[i, j] = 0.0
@@ -202,6 +207,9 @@ def step(
         impulses(count, response, free, friction, drag, found)
         most = 0
         for c in range(count):
+            link = link_of[segments[c]]
+            last[link, 4], last[link, 5] = 0.0, 0.0
+        for c in range(count):
             felt[0] += found[3 * c] / h
             if found[3 * c] > found[3 * most]:
                 most = c
@@ -210,6 +218,14 @@ def step(
                 last[link, 3] = drag[c]
                 for i in range(3):
                     last[link, i] = found[3 * c + i] / h
+                if found[3 * c] > 0.0:
+                    s1, s2 = free[3 * c + 1], free[3 * c + 2]
+                    for j in range(3 * count):
+                        s1 += response[3 * c + 1, j] * found[j]
+                        s2 += response[3 * c + 2, j] * found[j]
+                    size = h * math.sqrt(s1 * s1 + s2 * s2)
+                    given = h if size <= GIVES_MM else h * GIVES_MM / size
+                    last[link, 4], last[link, 5] = s1 * given, s2 * given
             f0, f1, f2 = 0.0, 0.0, 0.0
             for i in range(3 * c, 3 * c + 3):
                 if found[i] != 0.0:

@@ -25,6 +25,9 @@ Floats = NDArray[np.float64]
 SAG_MM = 7e-4  # how far the chord of a segment may be from the resting curve
 FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should
 SAMPLE_MS = 1.0
+FINE_LINKS, TRUE_MODES = 40, 6  # a chain as good as the whisker itself, in so many modes
+LEVELS = 8  # how often a step can be halved, see `stepping`, and the whole step
+SMOOTH_HZ = 200.0  # faster whiskers take steps in proportion
 HEARD_HZ = 500.0  # resonances above are beyond what samples at 1 kHz can hold
 
 
@@ -60,64 +63,105 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
     """
     s = link_nodes(whisker, links)
     nodes = whisker.centreline(s)
-    chords = np.diff(nodes, axis=0)
-    headings = np.arctan2(chords[:, 1], chords[:, 0])
-    turns = np.diff(headings, prepend=headings[0])
-    turn = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    length = np.linalg.norm(chords, axis=1)
-    inertia = np.array([link_inertia(whisker, a, b) for a, b in pairwise(s)])
-    cell = whisker.length / links
-    k = [joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(links)]
-    stiffness = np.repeat(k, 2)
-    none = np.zeros((0, 0))
-    chain = Chain(1, turn, length, inertia, stiffness, none, none, whisker.friction)
-    omegas, _ = _modes(chain_mass(chain), stiffness)
-    damping = 2 * whisker.damping_ratio / omegas[0] * stiffness
-    if whisker.mount_stiffness:
-        stiffness = np.concatenate([[whisker.mount_stiffness * 1e6] * 2, stiffness])
-        damping = np.concatenate([[whisker.mount_damping * 1e9] * 2, damping])
-        chain = chain._replace(clamped=0, stiffness=stiffness)
+    chain, damping, heading = _elastic(whisker, links)
     mass = chain_mass(chain)
-    omegas, shapes = _modes(mass, stiffness)
-    ratios = damping @ shapes**2 / (2 * omegas)  # of each mode
-    steps, resonance_hz = steps_per_sample, float(omegas[0] / (2 * np.pi) * 1e3)
+    slow, shapes = _modes(mass, chain.stiffness)
+    ratios = damping @ shapes**2 / (2 * slow)  # of each mode
+    # The chain's modes are to be as fast as those of the whisker itself.
+    omegas = slow.copy()
+    fine, _, _ = _elastic(whisker, FINE_LINKS)
+    known, _ = _modes(chain_mass(fine), fine.stiffness)
+    omegas[:TRUE_MODES] = known[:TRUE_MODES]
+    first = int(omegas.argmin())
+    ratios *= omegas / slow * (slow[first] / omegas[first])
+    softer = (slow / omegas) ** 2
+    steps, resonance_hz = steps_per_sample, float(omegas[first] / (2 * np.pi) * 1e3)
     found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
-    while found[0][1] < 0 and resonance_hz < HEARD_HZ and steps < FINEST * steps_per_sample:
+    while (
+        (found[first][1] < 0 or resonance_hz * steps_per_sample > SMOOTH_HZ * steps)
+        and resonance_hz < HEARD_HZ
+        and steps < FINEST * steps_per_sample
+    ):
         steps *= 2
         found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
-    ratio = float(ratios[0])
-    if found[0][1] < 0:  # more than is wanted without any: what backward Euler leaves
-        decay = math.log1p((omegas[0] * SAMPLE_MS / steps) ** 2) / 2
-        ratio = decay / math.hypot(decay, math.atan(omegas[0] * SAMPLE_MS / steps))
-    # Mode by mode; the modes are those of the whisker at rest.
-    heavier = np.array([m if beta >= 0 else 1.0 for m, beta in found])
-    drags = np.array([max(beta, 0.0) for _, beta in found]) * omegas**2
-    onto = mass @ shapes
+    ratio = float(ratios[first])
+    if found[first][1] < 0:  # more than is wanted without any: what backward Euler leaves
+        turn = omegas[first] * SAMPLE_MS / steps
+        decay = math.log1p(turn**2) / 2
+        ratio = decay / math.hypot(decay, math.atan(turn))
+    # Mode by mode, for every length of a step; the modes are those of the whisker at rest.
+    onto, heavy, damped = mass @ shapes, [], []
+    for level in range(LEVELS):
+        h = SAMPLE_MS / steps / 2**level
+        found = [matched(w, z, h) for w, z in zip(omegas, ratios, strict=True)]
+        heavier = np.array([m if beta >= 0 else 1.0 for m, beta in found]) * softer
+        drags = np.array([max(beta, 0.0) for _, beta in found]) * slow**2
+        heavy.append((onto * (heavier - 1)) @ onto.T)
+        damped.append((onto * drags) @ onto.T)
     # What cannot move cannot be kept clear of anything: the object passes through a clamped link.
     free = range(chain.clamped, links + 1)
-    pieces = [_segments(whisker, i, s, nodes, headings[i]) for i in free]
+    pieces = [_segments(whisker, i, s, nodes, heading[i]) for i in free]
     return Rod(
         steps_per_sample=steps,
         resonance_hz=resonance_hz,
-        wanted_ratio=float(ratios[0]),
+        wanted_ratio=float(ratios[first]),
         damping_ratio=ratio,
-        chain=chain._replace(
-            added=(onto * (heavier - 1)) @ onto.T, damping=(onto * drags) @ onto.T
-        ),
+        chain=chain._replace(added=np.stack(heavy, axis=1), damping=np.stack(damped, axis=1)),
         segments=Segments(
             np.repeat(np.array(free), [len(p[0]) for p in pieces]),
             *(np.concatenate(each) for each in zip(*pieces, strict=True)),
         ),
-        to_element=rotation("z", -headings[0]),
+        to_element=rotation("z", -heading[0]),
     )
 
 
+def _elastic(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
+    """Cut a whisker into cells.
+
+    Returns:
+        The chain without added masses and damping, the damping of each joint that is in proportion
+        to stiffness (uN m ms / rad), and the links' headings at rest (rad).
+    """
+    s = link_nodes(whisker, links)
+    chords = np.diff(whisker.centreline(s), axis=0)
+    headings = np.arctan2(chords[:, 1], chords[:, 0])
+    turns = np.diff(headings, prepend=headings[0])
+    cell = whisker.length / links
+    k = [joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(links)]
+    none = np.zeros((0, 0, 0))
+    chain = Chain(
+        clamped=1,
+        turn=np.stack([np.cos(turns), np.sin(turns)], axis=1),
+        length=np.linalg.norm(chords, axis=1),
+        inertia=np.array([link_inertia(whisker, a, b) for a, b in pairwise(s)]),
+        stiffness=np.repeat(k, 2),
+        added=none,
+        damping=none,
+        friction=whisker.friction,
+    )
+    omegas, _ = _modes(chain_mass(chain), chain.stiffness)
+    damping = 2 * whisker.damping_ratio / omegas.min() * chain.stiffness
+    if whisker.mount_stiffness:
+        stiffness = np.concatenate([[whisker.mount_stiffness * 1e6] * 2, chain.stiffness])
+        damping = np.concatenate([[whisker.mount_damping * 1e9] * 2, damping])
+        chain = chain._replace(clamped=0, stiffness=stiffness)
+    return chain, damping, headings
+
+
 def _modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
-    """Angular frequencies (mode,), rad/ms, slowest first; shapes (joint, mode) of unit mass."""
-    root = np.sqrt(stiffness)
-    inverse_squares, shapes = np.linalg.eigh(mass / np.outer(root, root))
-    omegas = 1 / np.sqrt(np.maximum(inverse_squares[::-1], 1e-300))
-    return omegas, shapes[:, ::-1] / root[:, None] * omegas
+    """Find the modes of a chain at rest, in and out of plane.
+
+    Returns:
+        Angular frequencies (mode,), rad/ms, slowest first in each plane; shapes (joint, mode) of
+        unit mass.
+    """
+    omegas, shapes = np.empty(len(stiffness)), np.zeros((len(stiffness), len(stiffness)))
+    for plane in (slice(0, None, 2), slice(1, None, 2)):
+        root = np.sqrt(stiffness[plane])
+        squares, own = np.linalg.eigh(mass[plane, plane] / np.outer(root, root))
+        omegas[plane] = 1 / np.sqrt(np.maximum(squares[::-1], 1e-300))
+        shapes[plane, plane] = own[:, ::-1] / root[:, None] * omegas[plane]
+    return omegas, shapes
 
 
 def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:

@@ -8,7 +8,9 @@ A step is implicit in stiffness and damping (backward Euler in the joint angles)
 for every place where a link is nearest to a piece of the object, within `NEAR_MM`, touching or not
 (Moreau 1988; Stewart and Trinkle 1996). What overlaps all the same, because a tip flew further
 than that, is moved out without being given a velocity. A step in which a node would move further
-than `LEAP_MM` is done again in parts.
+than `LEAP_MM` near the object is done again in parts, and one in which the object moves far begins
+in parts; masses and damping are matched to each length of a step, see `rod.matched`. Near its rest
+and away from everything a whisker moves on by a whole sample at once, see `resting`.
 """
 
 import math
@@ -16,9 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactile_rt.sim_backend.rods.chains import Chain, Pose, place
+from tactile_rt.sim_backend.rods.chains import Chain, Pose, place_at
 from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.one_step import scratch, step
+from tactile_rt.sim_backend.rods.resting import LITTLE, move_on
 from tactile_rt.sim_backend.rods.touching import (
     MOST_CONTACTS,
     NEAR_MM,
@@ -35,23 +38,33 @@ __all__ = ["RodState", "RowBounds", "advance"]
 A = Any
 LEAP_MM = 0.1  # further no node moves in one step, or it is divided
 MOST_PARTS = 8
-WILD_MM, WILDEST_PARTS = 20.0, 64  # a leap so far is a step that failed: many more parts
+HASTE_MM = 0.16  # over the number of links: further no object moves in a step near a whisker
+MOST_IN_HASTE = 128
+WILD_MM, WILDEST_PARTS = 20.0, 512  # a leap so far is a step that failed: many more parts
 SAMPLE_MS = 1.0
+BENT = 0.01  # of a whisker's length that its nodes move before its mass matrix is made anew
+LOOK_MM = 2.0  # nearer, places are looked at anew where that may spare steps
 STILL = 1e-9  # rad and rad/ms: a whisker at rest that nothing is near need not be stepped
 
 
 class RodState(NamedTuple):
-    """What a whisker carries on from step to step.
+    """What a whisker carries on from step to step, and how it rests.
 
     Attributes:
         q, v: (degree of freedom,) angles and their rates, rad and rad/ms.
-        last: (link, 4) the contact force on each link, normal and tangential (mN), and its drag, to
-            begin from.
+        last: (link, 6) the contact force on each link, normal and tangential (mN), and its drag, to
+            begin from; how far what holds a contact has given way, see `friction`, mm.
+        rest: (degree of freedom,) angles at rest, bent by its weight, rad.
+        weight: (whisker, 6) force (mN) and moment (uN m) that hold it at rest.
+        answers: How it moves on in a sample, near rest, see `resting.linearise`.
     """
 
     q: A
     v: A
     last: A
+    rest: A
+    weight: A
+    answers: A
 
 
 class RowBounds(NamedTuple):
@@ -60,6 +73,7 @@ class RowBounds(NamedTuple):
     links: A
     joints: A
     segments: A
+    answers: A
 
 
 @compiled
@@ -73,6 +87,8 @@ def advance(
     seen: Seen,
     roots: A,
     bases: A,
+    quiet: bool,
+    gravity: A,
     way: A,
     loads: A,
     contacts: A,
@@ -86,13 +102,15 @@ def advance(
             first link at rest, at the beginning of each sample; 1: it does not turn.
         bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1: the same of all.
             During a sample a frame turns with its base's angular velocity.
+        quiet: whether the bases do nothing but carry the whiskers' weight.
+        gravity: (3,) mm/ms^2, which `bases` has as an acceleration against it.
         way: (sample + 1, 3) where the object is at the beginning of each sample and at the end of
             the last, mm; straight in between.
         loads: (whisker, sample, 6) zeros, filled: means of force (mN) and moment (uN m) on the
             base, in the world.
-        contacts: (whisker, sample, 5) zeros, filled: share of the time in contact, mean normal
-            force (mN), mean of normal force times arc length (uN m), and of a base that gives the
-            mean turns about the element's y and z (rad).
+        contacts: (whisker, sample, 6) zeros, filled: share of the time in contact, mean normal
+            force (mN), mean of normal force times arc length (uN m), of a base that gives the mean
+            turns about the element's y and z (rad), and how deep it overlaps with the object, mm.
 
     Returns:
         How many steps were computed; negative if the numbers are not finite any more.
@@ -122,7 +140,14 @@ def advance(
                 segments.arcs[segment],
             ),
             thing,
-            RodState(state.q[joint], state.v[joint], state.last[link]),
+            RodState(
+                state.q[joint],
+                state.v[joint],
+                state.last[link],
+                state.rest[joint],
+                state.weight[w : w + 1],
+                state.answers[rows.answers[w] : rows.answers[w + 1]],
+            ),
             Seen(
                 seen.travelled[w],
                 seen.reach[segment],
@@ -132,6 +157,8 @@ def advance(
             ),
             roots[w],
             bases[w if len(bases) > 1 else 0],
+            quiet,
+            gravity,
             way,
             loads[w],
             contacts[w],
@@ -152,23 +179,26 @@ def _advance(
     seen: Seen,
     root: A,
     bases: A,
+    quiet: bool,
+    gravity: A,
     way: A,
     loads: A,
     contacts: A,
 ) -> int:
     """`advance` of one whisker."""
-    q, v, last = state
+    q, v, last, rest, weight, answers = state
     travelled, soonest = seen.travelled, seen.soonest
     links, n = len(chain.length), len(q)
     h = SAMPLE_MS / steps_per_sample
-    quiet = not bases.any()
     reach = chain.length.sum()
-    if quiet and not _moves(q, v):  # perhaps nothing comes near it in all this time
+    if quiet and not _moves(q, v, rest):  # perhaps nothing comes near it in all this time
         whole = 0.0
         for sample in range(len(way) - 1):
             whole += _distance(way, sample)
         if soonest.min() - travelled[0] - whole >= NEAR_MM:
             travelled[0] += whole
+            for i in range(6):
+                loads[:, i] -= weight[0, i]
             return 0
     pose = Pose(np.empty((links + 1, 3)), np.empty((links, 3, 3)), np.empty((n, 3)))
     near = Contacts(
@@ -181,27 +211,47 @@ def _advance(
     room, old, total = scratch(links, n), np.empty((links + 1, 3)), np.empty(6)
     ends, now = np.empty((len(segments.link), 2, 3)), np.empty((len(segments.link), 6))
     q0, v0, surface, centre = np.empty(n), np.empty(n), np.empty(3), np.empty(3)
+    last0 = np.empty((links, 6))
+    since = 0.0
     done, made = 0, 0.0  # for which length of a step the mass matrix is
     here = root[0].copy()
-    placed = False
-    for at in range((len(way) - 1) * steps_per_sample):
+    placed, little = False, np.empty(2 * n + 3)
+    at = -1
+    while at < (len(way) - 1) * steps_per_sample - 1:
+        at += 1
         sample, within = at // steps_per_sample, at % steps_per_sample
         moves = _distance(way, sample) / steps_per_sample
         for i in range(3):
             surface[i] = (way[sample + 1, i] - way[sample, i]) / SAMPLE_MS
         if within == 0:
             made = 0.0
-        if quiet and soonest.min() - travelled[0] >= NEAR_MM and not _moves(q, v):
+        if quiet and soonest.min() - travelled[0] >= NEAR_MM + moves and not _moves(q, v, rest):
             travelled[0] += moves
-            q[:] = 0.0
+            q[:] = rest
             v[:] = 0.0
+            for i in range(6):
+                loads[sample, i] -= weight[0, i] / steps_per_sample
             placed = False
             continue
         base = bases[sample if len(bases) > 1 else 0]
         began = root[sample if len(root) > 1 else 0]
+        if within == 0 and len(answers) and (quiet or not (base[1].any() or base[3].any())):
+            clear = NEAR_MM + moves * steps_per_sample + 4.0 * LITTLE * reach
+            if NEAR_MM <= soonest.min() - travelled[0] < clear:  # look further, to know for longer
+                _turned(began, base, 0.0, here)
+                place_at(here, chain, q, pose)
+                find_near(pose, segments, thing, way[sample], LOOK_MM, seen, ends, now, near)
+            free = soonest.min() - travelled[0] - NEAR_MM - moves * steps_per_sample
+            felt = loads[sample], contacts[sample]
+            gone = move_on(free / reach, state, began, base[2] + gravity, little, felt)
+            if gone >= 0.0:
+                travelled[0] += moves * steps_per_sample + 1.1 * reach * gone
+                at += steps_per_sample - 1
+                placed = False
+                continue
         if not placed:
             _turned(began, base, h * within, here)
-            _place(here, chain, q, pose)
+            place_at(here, chain, q, pose)
             placed = True
         parts, start = 1, travelled[0]
         swing = 0.0  # how far the base takes the tip
@@ -211,23 +261,31 @@ def _advance(
         if soonest.min() - start < NEAR_MM + moves + 1.1 * swing:
             while parts < MOST_PARTS and swing > parts * LEAP_MM:
                 parts *= 2
+            while parts < MOST_IN_HASTE and moves * links > parts * HASTE_MM:
+                parts *= 2
         q0[:] = q
         v0[:] = v
+        last0[:] = last
         while True:
             furthest = 0.0
             total[:] = 0.0
-            touching, force, lever = 0.0, 0.0, 0.0
+            touching, force, lever, deepest = 0.0, 0.0, 0.0, 0.0
+            level = 0
+            while 1 << level < parts and level + 1 < chain.added.shape[1]:
+                level += 1
             for part in range(parts):
                 for i in range(3):
                     centre[i] = way[sample, i] + surface[i] * (h * (within + part / parts))
                 count = 0
                 if soonest.min() - travelled[0] < NEAR_MM:
-                    count = find_near(pose, segments, thing, centre, seen, ends, now, near)
-                # Matched masses are those for whole steps; what leaps is better off with its own.
+                    count = find_near(pose, segments, thing, centre, NEAR_MM, seen, ends, now, near)
+                fresh = h / parts != made or since > BENT * reach
+                if fresh:
+                    since = 0.0
                 step(
                     h / parts,
-                    h / parts != made,
-                    parts == 1,
+                    fresh,
+                    level,
                     chain,
                     q,
                     v,
@@ -244,13 +302,16 @@ def _advance(
                 done += 1
                 old[:] = pose.nodes
                 _turned(began, base, h * (within + (part + 1) / parts), here)
-                _place(here, chain, q, pose)
+                place_at(here, chain, q, pose)
                 moved = _furthest(old, pose.nodes)
+                since += moved
                 if not moved <= furthest:  # also where it is no number
                     furthest = moved
                 travelled[0] += moves / parts + 1.1 * moved
                 for i in range(6):
                     total[i] += room.wrench[i]
+                for c in range(count):
+                    deepest = max(deepest, -near.gaps[c])
                 if count and room.felt[0] > 0.0:
                     most = int(room.felt[1])
                     arcs, t = segments.arcs[near.segments[most]], near.places[most]
@@ -263,11 +324,11 @@ def _advance(
             if not wild and (furthest <= LEAP_MM or parts >= MOST_PARTS):
                 break
             # what swings through air leaps as far as it likes
-            if not wild and swing > 0.0 and soonest.min() - travelled[0] >= NEAR_MM:
+            if not wild and soonest.min() - travelled[0] >= NEAR_MM:
                 break
             # again, in parts
             if wild:
-                parts *= MOST_PARTS
+                parts *= 8
                 travelled[0] = start
                 last[:] = 0.0
                 forget(seen)
@@ -278,14 +339,17 @@ def _advance(
                 travelled[0] += travelled[0] - start  # and all the way back
             q[:] = q0
             v[:] = v0
+            if not wild:
+                last[:] = last0
             _turned(began, base, h * within, here)
-            _place(here, chain, q, pose)
-        weight = 1.0 / (parts * steps_per_sample)
+            place_at(here, chain, q, pose)
+        share = 1.0 / (parts * steps_per_sample)
         for i in range(6):
-            loads[sample, i] -= total[i] * weight
-        contacts[sample, 0] += touching * weight
-        contacts[sample, 1] += force * weight
-        contacts[sample, 2] += lever * weight
+            loads[sample, i] -= total[i] * share
+        contacts[sample, 0] += touching * share
+        contacts[sample, 1] += force * share
+        contacts[sample, 2] += lever * share
+        contacts[sample, 5] = max(contacts[sample, 5], deepest)
         if not chain.clamped:
             contacts[sample, 3] += q[0] / steps_per_sample
             contacts[sample, 4] += q[1] / steps_per_sample
@@ -293,9 +357,9 @@ def _advance(
 
 
 @compiled
-def _moves(q: A, v: A) -> bool:
+def _moves(q: A, v: A, rest: A) -> bool:
     for i in range(len(q)):
-        if not (abs(q[i]) <= STILL and abs(v[i]) <= STILL):
+        if not (abs(q[i] - rest[i]) <= STILL and abs(v[i]) <= STILL):
             return True
     return False
 
@@ -337,12 +401,3 @@ def _turned(root: A, base: A, t: float, here: A) -> None:
         here[1, k] = u * c + (y * w - z * v) * s + x * onto
         here[2, k] = v * c + (z * u - x * w) * s + y * onto
         here[3, k] = w * c + (x * v - y * u) * s + z * onto
-
-
-@compiled
-def _place(root: A, chain: Chain, q: A, pose: Pose) -> None:
-    for i in range(3):
-        pose.nodes[0, i] = root[0, i]
-        for k in range(3):
-            pose.frames[0, i, k] = root[1 + i, k]
-    place(chain, q, pose)

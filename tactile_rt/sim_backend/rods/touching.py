@@ -57,6 +57,9 @@ class Object(NamedTuple):
         faces: (face, 4) outward normals and offsets.
         face_at: (piece + 1,) numbers at which the faces of each piece begin.
         rounding: (piece,) the radius by which each is grown, mm.
+        beside: The corners to which an edge leads from each corner, numbered in its piece, see
+            `nearest`; of pieces with few corners none.
+        beside_at: (corner + 1,) numbers at which those of each corner begin.
     """
 
     corners: A
@@ -64,6 +67,8 @@ class Object(NamedTuple):
     faces: A
     face_at: A
     rounding: A
+    beside: A
+    beside_at: A
 
 
 class Seen(NamedTuple):
@@ -130,6 +135,7 @@ def find_near(
     segments: Segments,
     thing: Object,
     centre: A,
+    within: float,
     seen: Seen,
     ends: A,
     now: A,
@@ -144,6 +150,7 @@ def find_near(
 
     Args:
         centre: (3,) where the object is, mm.
+        within: how near segments are looked at anew: `NEAR_MM`, or more to know for longer.
         ends: (segment, 2, 3) scratch.
         now: (segment, 6) scratch: gap, place, direction, and whether it is more than a bound.
     """
@@ -156,12 +163,12 @@ def find_near(
     for s in range(number):
         ends[s, 0, 0] = np.inf  # not known
     for p in range(len(rounding)):
-        if seen.soonest[p] - travelled >= NEAR_MM:
+        if seen.soonest[p] - travelled >= within:
             continue
         first, last = number, -1
         for s in range(number):
             now[s, 0] = np.inf
-            if reach[s, p] - travelled >= NEAR_MM:
+            if reach[s, p] - travelled >= within:
                 continue
             if ends[s, 0, 0] == np.inf:
                 link = segments.link[s]
@@ -178,7 +185,7 @@ def find_near(
             if travelled - planes[s, p, 4] > STALE_MM and bound < CLOSE_MM:
                 bound = -np.inf
             reach[s, p] = bound + travelled
-            if bound < NEAR_MM:
+            if bound < within:
                 now[s, 0], now[s, 5] = bound, 0.0
                 first, last = min(first, s), s
         again = last >= 0
@@ -192,6 +199,8 @@ def find_near(
                     ends[s, 1],
                     thing.corners[corner_at[p] : corner_at[p + 1]],
                     thing.faces[face_at[p] : face_at[p + 1]],
+                    thing.beside,
+                    thing.beside_at[corner_at[p] : corner_at[p + 1] + 1],
                     seen.known[s, p],
                     scratch,
                     found,

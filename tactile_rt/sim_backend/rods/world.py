@@ -1,18 +1,21 @@
 """An array and an object, stepped whisker by whisker."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
-from tactile_rt.core.errors import SourceError
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
-from tactile_rt.sim_backend.rods.rod import make_rod
+from tactile_rt.sim_backend.rods.resting import linearise, settle
+from tactile_rt.sim_backend.rods.rod import Rod, make_rod
 from tactile_rt.sim_backend.rods.stepping import RodState, RowBounds, advance
 from tactile_rt.sim_backend.rods.touching import Object, Segments, unseen
 from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
@@ -20,6 +23,10 @@ from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 __all__ = ["Piece", "RodWorld"]
 
 Floats = NDArray[np.float64]
+
+WEIGHTLESS, NONE = np.zeros(3), np.zeros(0, np.int64)
+FASTEST = 3.01  # mm/ms, or m/s
+FEW_CORNERS = 64  # of so few it costs less to try them all
 
 _cut = lru_cache(maxsize=512)(make_rod)  # 10 ms each, and the same whiskers meet many objects
 
@@ -32,21 +39,30 @@ class Piece:
         corners: The (corner, 3) corners, mm, about the object's place.
         faces: The (face, 4) outward normals and offsets of the hull; none of a point or a line.
         rounding: The radius by which the hull is grown, mm.
+        beside: The corners to which an edge leads from each; empty: of few corners all are tried.
     """
 
     corners: Floats
     faces: Floats
     rounding: float = 0.0
+    beside: Sequence[NDArray[np.int64]] = ()
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> "Piece":
         """The piece that a convex mesh is."""
         normals = np.asarray(mesh.face_normals, dtype=np.float64)
         offsets = np.einsum("fi,fi->f", normals, mesh.triangles[:, 0])
-        return cls(
-            np.array(mesh.vertices, dtype=np.float64),
-            np.concatenate([normals, offsets[:, None]], axis=1),
-        )
+        faces = np.concatenate([normals, offsets[:, None]], axis=1)
+        corners = np.array(mesh.vertices, dtype=np.float64)
+        if len(corners) <= FEW_CORNERS:
+            return cls(corners, faces)
+        hull = ConvexHull(corners)  # without corners that are none, or are there twice
+        number = np.full(len(corners), -1)
+        number[hull.vertices] = np.arange(len(hull.vertices))
+        edges = number[np.concatenate([hull.simplices[:, [i, i - 1]] for i in range(3)])]
+        edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+        begins = np.searchsorted(edges[:, 0], np.arange(1, len(hull.vertices)))
+        return cls(corners[hull.vertices], faces, 0.0, np.split(edges[:, 1], begins))
 
 
 class RodWorld:
@@ -56,11 +72,18 @@ class RodWorld:
         roots: (whisker, 4, 3) base point (mm) and, in the rows after it, the element's frame in the
             world.
         steps_per_sample: the fewest steps in a sample of 1 ms.
+        gravity: (3,) in the world, mm/ms^2; the whiskers begin at rest under their weight.
+
+    Raises:
+        ConfigError: a whisker is too soft to carry itself.
 
     Attributes:
         angles: The (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
         turns: The (sample, whisker, 2) turns of bases that give in the samples of the last
             `advance`, means, about the element's y and z, rad.
+        sag: How far gravity moves the (link + 1, 3) nodes of each whisker, mm.
+        overlap: The (sample, whisker) depth to which each overlaps with the object in those
+            samples, mm; next to nothing but where a whisker is wedged.
     """
 
     def __init__(
@@ -70,9 +93,13 @@ class RodWorld:
         pieces: Sequence[Piece],
         links: int,
         steps_per_sample: int,
+        gravity: Floats = WEIGHTLESS,
     ) -> None:
-        self.rods = rods = [_cut(w, links, steps_per_sample) for w in whiskers]
+        self.rods = rods = [_cut_rod(w, links, steps_per_sample) for w in whiskers]
         self.angles, self.turns = np.zeros(0), np.zeros((0, len(rods), 2))
+        self.overlap = np.zeros((0, len(rods)))
+        self._gravity, self._weights = gravity, np.zeros((len(rods), 6))
+        self.sag: list[Floats] = []
         if not rods:
             return
         self._bases, self._frames = roots[:, :1], roots[:, 1:]
@@ -82,9 +109,25 @@ class RodWorld:
             _begins([c.length for c in chains]),
             _begins([c.stiffness for c in chains]),
             _begins([s.link for s in segments]),
+            np.zeros(len(rods) + 1, np.int64),
         )
-        links, joints, parts = (int(each[-1]) for each in rows)
-        self.angles = np.zeros(joints)
+        cells = links
+        links, joints, parts, _ = (int(each[-1]) for each in rows)
+        rest, answers = np.zeros(joints), []
+        for i, (rod, at) in enumerate(zip(rods, rows.joints, strict=False)):
+            nodes = np.zeros((2, len(rod.chain.length) + 1, 3))
+            angles = rest[at : at + len(rod.chain.stiffness)]
+            if gravity.any():
+                root = np.concatenate([roots[i, :1], roots[i, 1:] @ rod.to_element.T])
+                if not settle(rod.chain, root, gravity, angles, self._weights[i], nodes):
+                    name = whiskers[i].name
+                    raise ConfigError(f"whisker {name} is too soft to carry its own weight")
+                answers.append(_linearise(rod, root[1:].T @ gravity, angles))
+            else:
+                answers.append(_answers(_shape_of(whiskers[i]), cells, steps_per_sample))
+            self.sag.append(nodes[1] - nodes[0])
+        rows = rows._replace(answers=_begins(answers))
+        self.angles = rest.copy()
         self._advance = partial(
             advance,
             np.array([r.steps_per_sample for r in rods]),
@@ -97,10 +140,23 @@ class RodWorld:
                 np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
                 _begins([p.faces for p in pieces]),
                 np.array([p.rounding for p in pieces]),
+                np.concatenate([NONE, *(b for p in pieces for b in p.beside)]),
+                _begins([b for p in pieces for b in p.beside or [NONE] * len(p.corners)]),
             ),
-            RodState(self.angles, np.zeros(joints), np.zeros((links, 4))),
+            RodState(
+                self.angles,
+                np.zeros(joints),
+                np.zeros((links, 6)),
+                rest,
+                self._weights,
+                _stacked(answers),
+            ),
             unseen(len(rods), parts, len(pieces)),
         )
+
+    def rest_loads(self) -> Floats:
+        """Compute the (whisker, 6) base loads of whiskers that nothing but gravity bends."""
+        return _in_elements(-self._weights, self._frames)
 
     def advance(
         self,
@@ -121,66 +177,83 @@ class RodWorld:
                 None: they are where they were when this was made.
         """
         samples = len(way) - 1
+        fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0.0)
+        if fastest > FASTEST:
+            raise ConfigError(f"the object moves at {fastest:.3g} m/s; at most {FASTEST:g} m/s")
         if not self.rods:
             return np.zeros((samples, 0, 6)), np.zeros((samples, 0, 3))
         loads = np.zeros((len(self.rods), samples, 6))
-        contacts = np.zeros((len(self.rods), samples, 5))
-        frames, middle = (
-            self._frames[:, None],
-            self._frames[:, None],
-        )  # (whisker, sample or 1, 3, 3)
-        bases = np.zeros((1, 1 if shaken is None and turning is None else samples, 4, 3))
+        contacts = np.zeros((len(self.rods), samples, 6))
+        frames = middle = self._frames[:, None]  # (whisker, sample or 1, 3, 3)
+        moves = shaken is not None or turning is not None
+        bases = np.zeros((1, samples if moves else 1, 4, 3))
         if turning is not None:
             rates = _rates(turning)
             bases = np.zeros((len(self.rods), samples, 4, 3))
             bases[:, :, 1] = rates[:, 1:-1]
             bases[:, :, 3] = (rates[:, 2:] - rates[:, :-2]) / 2
             frames = turning[1:-2].swapaxes(0, 1)
-            middle = _turns(rates[:, 1:-1] / 2) @ frames
+            half = rates[:, 1:-1] * SAMPLE_MS / 2
+            turned = Rotation.from_rotvec(half.reshape(-1, 3)).as_matrix()
+            middle = turned.reshape(frames.shape) @ frames
         if shaken is not None:
             bases[:, :, 2] = shaken
+        bases[:, :, 2] -= self._gravity
         roots = np.empty((*frames.shape[:2], 4, 3))
         roots[:, :, 0] = self._bases
         roots[:, :, 1:] = frames @ self._to_links[:, None]
-        done = self._advance(roots, bases, np.ascontiguousarray(way), loads, contacts)
+        done = self._advance(
+            roots, bases, not moves, self._gravity, np.ascontiguousarray(way), loads, contacts
+        )
         if done < 0:
             raise SourceError(JAMMED)
         # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
-        felt = np.zeros_like(loads)
-        for k in range(3):
-            felt[..., :3] += loads[..., k, None] * middle[..., k, :] * 1e-3
-            felt[..., 3:] += loads[..., 3 + k, None] * middle[..., k, :] * 1e-6
-        self.turns = contacts[..., 3:].swapaxes(0, 1)
+        felt = _in_elements(loads, middle)
+        self.turns = contacts[..., 3:5].swapaxes(0, 1)
+        self.overlap = contacts[..., 5].swapaxes(0, 1)
         return felt.swapaxes(0, 1), contacts[..., :3].swapaxes(0, 1) * (1.0, 1e-3, 1e-6)
+
+
+def _cut_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
+    """`make_rod`, once for all whiskers of one shape and material."""
+    rod = _cut(_shape_of(whisker), links, steps_per_sample)
+    return replace(rod, chain=rod.chain._replace(friction=whisker.friction))
+
+
+def _linearise(rod: Rod, gravity: Floats, rest: Floats) -> Floats:
+    n = len(rest)
+    answers = np.empty((2 * n + 6 + 2 * (rod.chain.clamped == 0), 2 * n + 3))
+    linearise(rod.steps_per_sample, rod.chain, gravity, rest, answers)
+    return answers
+
+
+@lru_cache(maxsize=512)
+def _answers(shape: Whisker, links: int, steps_per_sample: int) -> Floats:
+    """`resting.linearise` of a whisker without weight."""
+    rod = _cut(shape, links, steps_per_sample)
+    return _linearise(rod, WEIGHTLESS, np.zeros(len(rod.chain.stiffness)))
+
+
+def _shape_of(whisker: Whisker) -> Whisker:
+    """The whisker of this shape and material, wherever it stands and whatever it touches."""
+    here = (0.0, 0.0, 0.0)
+    return replace(whisker, name="any", row=0, column=0, base=here, angles=here, friction=0.0)
+
+
+def _in_elements(loads: Floats, frames: Floats) -> Floats:
+    """Turn loads of the world, mN and uN m, into frames, N and N m."""
+    felt = np.zeros_like(loads)
+    for k in range(3):
+        felt[..., :3] += loads[..., k, None] * frames[..., k, :] * 1e-3
+        felt[..., 3:] += loads[..., 3 + k, None] * frames[..., k, :] * 1e-6
+    return felt
 
 
 def _rates(frames: Floats) -> Floats:
     """(whisker, sample, 3) angular velocities, rad/ms, from frames (sample + 1, whisker, 3, 3)."""
     step = (frames[1:] @ frames[:-1].swapaxes(-1, -2)).swapaxes(0, 1)
-    axis = np.stack(
-        [step[..., k, j] - step[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=-1
-    )
-    sine = np.linalg.norm(axis, axis=-1, keepdims=True) / 2
-    # of a small angle, the ratio to its sine is 1
-    ratio = np.arcsin(np.minimum(sine, 1.0)) / np.maximum(sine, 1e-12)
-    rates: Floats = axis / 2 * np.where(sine < 1e-9, 1.0, ratio) / SAMPLE_MS
-    return rates
-
-
-def _turns(rates: Floats) -> Floats:
-    """(..., 3, 3) rotations after a sample at angular velocities (..., 3), rad/ms."""
-    by = rates * SAMPLE_MS
-    angle = np.linalg.norm(by, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(by, -1, 0)
-    o = np.zeros_like(x)
-    cross = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(*x.shape, 3, 3)
-    small = np.maximum(angle, 1e-12)
-    turns: Floats = (
-        np.eye(3)
-        + np.sinc(angle / np.pi) * cross
-        + (1 - np.cos(angle)) / small**2 * (cross @ cross)
-    )
-    return turns
+    turns = Rotation.from_matrix(step.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(turns.reshape(step.shape[:-1]) / SAMPLE_MS)
 
 
 def _stacked(each: Sequence[Any]) -> NDArray[Any]:
@@ -188,8 +261,8 @@ def _stacked(each: Sequence[Any]) -> NDArray[Any]:
     if np.ndim(each[0]) == 0:
         return np.array(each)
     wide = max(rows.shape[-1] for rows in each)
-    if np.ndim(each[0]) == 2:
-        each = [np.pad(rows, ((0, 0), (0, wide - rows.shape[1]))) for rows in each]
+    if kept := [(0, 0)] * (np.ndim(each[0]) - 1):
+        each = [np.pad(rows, (*kept, (0, wide - rows.shape[-1]))) for rows in each]
     return np.concatenate(each)
 
 

@@ -24,7 +24,8 @@ def found_by(
 ) -> np.ndarray:
     found = np.empty(6)
     known = np.full(4, -1) if known is None else known
-    nearest(a, b, corners, faces, known, np.empty(WORK), found)
+    none = np.zeros(0, np.int64), np.zeros(len(corners) + 1, np.int64)
+    nearest(a, b, corners, faces, *none, known, np.empty(WORK), found)
     return found
 
 

@@ -19,7 +19,7 @@ from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, make_object
 from tactile_rt.sim_backend.rods.chains import Pose, place
 from tactile_rt.sim_backend.rods.rod import make_rod
-from tactile_rt.sim_backend.rods.touching import Contacts, Object, find_near, unseen
+from tactile_rt.sim_backend.rods.touching import NEAR_MM, Contacts, Object, find_near, unseen
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
@@ -292,8 +292,9 @@ def test_a_gap_is_that_of_the_curve_and_not_of_its_chords(name: str, side: int) 
         across = side * np.array([-ahead[1], ahead[0], 0.0]) / np.linalg.norm(ahead)
         centre = line[at] + across * (1.0 + radii[at] + 0.05)
         thing = Object(
-            np.zeros((1, 3)), np.array([0, 1]), np.zeros((0, 4)), np.array([0, 0]), np.ones(1)
-        )
+            np.zeros((1, 3)), np.array([0, 1]), np.zeros((0, 4)), np.array([0, 0]), np.ones(1),
+            np.zeros(0, np.int64), np.zeros(2, np.int64),
+        )  # fmt: skip
         number = len(rod.segments.link)
         whole = unseen(1, number, 1)
         seen = whole._replace(travelled=whole.travelled[0], soonest=whole.soonest[0])
@@ -302,6 +303,6 @@ def test_a_gap_is_that_of_the_curve_and_not_of_its_chords(name: str, side: int) 
             np.zeros(8),
         )  # fmt: skip
         ends, now = np.empty((number, 2, 3)), np.empty((number, 6))
-        count = find_near(pose, rod.segments, thing, centre, seen, ends, now, near)
+        count = find_near(pose, rod.segments, thing, centre, NEAR_MM, seen, ends, now, near)
         wanted = (np.linalg.norm(line - centre, axis=1) - radii).min() - 1.0
         assert count >= 1 and near.gaps[:count].min() == pytest.approx(wanted, abs=5e-5)
