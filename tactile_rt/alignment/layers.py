@@ -50,13 +50,9 @@ def table(value: object) -> Mapping[str, object]:
 
 
 def first_difference(trace: NDArray[np.float32]) -> int:
-    """First step at which the stimuli differ: none has reached a layer before.
+    """Find the first step of (6, step, unit) at which stimuli differ; 0 if none.
 
-    Args:
-        trace: (6, step, unit).
-
-    Returns:
-        0 for a layer in which they never differ.
+    Before that step no stimulus has reached the layer.
     """
     spread = np.ptp(trace, axis=0).max(axis=1, initial=0.0)
     differs = spread > SAME * np.abs(trace).max(initial=0.0)

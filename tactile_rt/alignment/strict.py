@@ -269,11 +269,7 @@ def _consistency(
 
 
 def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:
-    """Moments of responses (..., 6, unit).
-
-    Args:
-        counted: (..., unit) which units count; default: all.
-    """
+    """Sum responses (..., 6, unit) over the units, or those `counted` (..., unit)."""
     if counted is None:
         units = np.full(patterns.shape[:-2], float(patterns.shape[-1]))
     else:

@@ -181,11 +181,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_text(*names: Path | None) -> None:
-    """Refuse names of files that cannot stand in another file.
-
-    Raises:
-        ConfigError: one has bytes that are no UTF-8.
-    """
+    """Refuse names of files that are no UTF-8, which cannot stand in another file."""
     for name in filter(None, names):
         try:
             str(name).encode()
@@ -194,12 +190,7 @@ def check_text(*names: Path | None) -> None:
 
 
 def check_named_once(file: Path) -> None:
-    """Refuse to write a file that the command line names for something else, too, be it within a
-    URL.
-
-    Raises:
-        ConfigError: more than one word names it.
-    """
+    """Refuse to write a file that two words of the command line name, see `_files`."""
     where = file.resolve()
     if sum(where in _files(word) for word in sys.argv[1:]) > 1:
         raise ConfigError(f"{file} is another file of this command: name a new one")
@@ -212,21 +203,13 @@ def _files(word: str) -> set[Path]:
 
 
 def check_is_mcap(file: Path) -> None:
-    """Refuse a recording's name that would say that it is something else.
-
-    Raises:
-        ConfigError: it does not end in ``.mcap``.
-    """
+    """Refuse a recording's name that does not end in ``.mcap``."""
     if file.suffix != ".mcap":
         raise ConfigError(f"{file}: a recording is a .mcap; `tactile-rt convert` makes others")
 
 
 def check_new(file: Path, force: bool) -> None:
     """Refuse to write over a file that is there, that is read, or that is just being recorded.
-
-    Args:
-        file: the file to write.
-        force: whether one that is there is to be replaced.
 
     Raises:
         ConfigError: as `check_output`; it is there, and not to be replaced; the command line names

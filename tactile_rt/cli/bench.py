@@ -70,11 +70,7 @@ def bench(
 
 
 def _rig(area: str, module: str = "area") -> Any:
-    """The module that measures an area, or some of it.
-
-    Raises:
-        ConfigError: This install has none: it is no checkout.
-    """
+    """Import the module that measures an area, or some of it, from the checkout."""
     if not (CHECKOUT / "bench" / area / "area.py").is_file():  # a `bench` of others may be there
         raise ConfigError(
             f"bench {area} measures from a checkout (pip install --editable): "

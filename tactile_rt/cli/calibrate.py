@@ -196,11 +196,7 @@ def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArrayS
 
 
 def _find_raw(source: "Source", url: str) -> "tuple[Source, Calibration | None]":
-    """Return the source of raw samples below a calibrated one, and the calibration.
-
-    Raises:
-        ConfigError: the samples were calibrated before they were recorded.
-    """
+    """Return the source of raw samples below a calibrated one, and the calibration."""
     from tactile_rt.calibration import CalibratedSource
 
     known = None

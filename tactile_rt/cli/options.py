@@ -45,11 +45,7 @@ def _check_json(file: Path | None) -> Path | None:
 
 
 def set_option(help: str) -> Any:
-    """Return the option ``--set KEY=VALUE`` of a command, which may be given again.
-
-    Args:
-        help: of what, with an example.
-    """
+    """Return the option ``--set KEY=VALUE`` of a command, which may be given again."""
     return typer.Option("--set", metavar="KEY=VALUE", help=f"{help}; may be repeated.")
 
 

@@ -90,11 +90,7 @@ def write_set(
 
 
 def check_shares(shares: Sequence[float]) -> None:
-    """Refuse shares by which objects cannot be split.
-
-    Raises:
-        ConfigError: not one for each split, a negative one, or nothing to train on.
-    """
+    """Refuse shares that are not one for each split, negative, or nothing to train on."""
     whole = len(shares) == len(SPLITS) and all(s >= 0 for s in shares) and sum(shares) < inf
     if not whole or not shares[0]:
         raise ConfigError(

@@ -168,11 +168,7 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
 
 
 def check_appendable(path: Path) -> None:
-    """Whether `append_label` can add to a file that is there.
-
-    Raises:
-        ConfigError: it has other columns.
-    """
+    """Refuse a file that `append_label` cannot add to, since it has other columns."""
     with open_regular(path) as file:
         columns = _cells(file.readline(LONGEST_LINE))
     if columns != COLUMNS:

@@ -84,11 +84,7 @@ def last_ns(data: bytes) -> int:
 
 
 def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
-    """The chunk in a message.
-
-    Args:
-        shape: (element, channel) of the array.
-    """
+    """Return the chunk in a message of an array of this shape, (element, channel)."""
     elements, channels = shape
     n = samples_in(data)
     values_at = 4 + 16 + 16 * n + 12
@@ -131,12 +127,7 @@ def encode_packet(packet: Packet, wire: str) -> bytes:
 
 
 def is_samples(data: bytes, shape: tuple[int, int]) -> bool:
-    """Return whether data can be samples of this shape, by its length and beginning.
-
-    Args:
-        data: the message, without its header.
-        shape: (element, channel) of the array.
-    """
+    """Return whether data, by length and beginning, can be samples of shape (element, channel)."""
     if len(data) < 8 or data[:4] != _CDR:
         return False
     n, (elements, channels) = samples_in(data), shape

@@ -182,11 +182,7 @@ MOST_KEPT = 10_000  # rows of numbers, of which quantiles are taken
 
 
 def import_pyarrow() -> tuple[Any, Any]:
-    """Import ``pyarrow`` and ``pyarrow.parquet``.
-
-    Raises:
-        ConfigError: The extra is not installed.
-    """
+    """Import ``pyarrow`` and ``pyarrow.parquet``, or name the extra that is missing."""
     with require_extra("LeRobot datasets need", "lerobot"):
         import pyarrow
         import pyarrow.parquet

@@ -89,13 +89,9 @@ def means_of(sessions: tuple[NeuralSession, ...], bins: int) -> Floats:
 
 
 def ceiling_of(agreements: Floats) -> float:
-    """What a perfect model reaches, from how halves agree: the root of their reliability.
+    """Return what a perfect model reaches: the root of the reliability of halves.
 
-    Args:
-        agreements: (division,) between both halves of each.
-
-    Returns:
-        NaN where the reliability is not above 0.
+    The agreements (division,) are between both halves; NaN where reliability is not above 0.
     """
     there = agreements[np.isfinite(agreements)]
     reliability = float(spearman_brown(there.mean())) if there.size else np.nan

@@ -64,14 +64,9 @@ def linear(animal: Animal) -> Measure:
 
 
 def predicted(layer: Floats, goal: Floats) -> Floats:
-    """Responses of every stimulus, predicted from the others.
+    """Predict the goal's responses to every stimulus from those to the others.
 
-    Args:
-        layer: (6, bin, feature).
-        goal: (6, bin, unit).
-
-    Returns:
-        (6, bin, unit).
+    From a layer (6, bin, feature) and a goal (6, bin, unit) to (6, bin, unit).
     """
     out = np.empty_like(goal)
     for i in range(len(goal)):

@@ -130,11 +130,7 @@ def encode(message: str, values: Mapping[str, Any]) -> bytes:
 
 
 def decode(message: str, data: bytes) -> dict[str, Any]:
-    """The values of a message.
-
-    Raises:
-        ValueError: It is not such a message.
-    """
+    """Return the values of a message; raise ValueError if it is not of this type."""
     if data[:4] != CDR:
         raise ValueError(f"{data[:4]!r} begins no message in CDR")
     try:

@@ -114,11 +114,7 @@ def event_message(text: bytes) -> bytes:
 
 
 def json_of(message: str, data: bytes) -> bytes:
-    """The line of JSON that a decision or an event was made of.
-
-    Raises:
-        ValueError: It is no such message.
-    """
+    """Return the JSON of a decision or an event, or raise ValueError."""
     text: str = cdr.decode(message, data)["json"]
     return text.encode()
 
@@ -150,11 +146,7 @@ def stamped(samples: bytes, utc_ns: int, frame: str) -> bytes:
 
 
 def unstamped(data: bytes) -> bytes:
-    """What was given to `stamped`.
-
-    Raises:
-        ValueError: It has no header.
-    """
+    """Return the samples that `stamped` took; raise ValueError if there is no header."""
     at = cdr.header_size(data)
     at += -at % 4
     many = data[at : at + 4]
@@ -198,11 +190,7 @@ def _vector(numbers: Any) -> Mapping[str, float]:
 
 
 def array_of(data: bytes) -> ArraySpec:
-    """The array that a message of `array_message` tells of.
-
-    Raises:
-        ValueError: It is no such message.
-    """
+    """Return the array of a message of `array_message`, or raise ValueError."""
     told = cdr.decode(ARRAY, data)
     poses = told["poses"]
     return ArraySpec(

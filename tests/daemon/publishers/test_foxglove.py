@@ -6,6 +6,7 @@ Frames are taken apart here by hand, scenes by protobuf with the schema that the
 import base64
 import contextlib
 import json
+import os
 import socket
 import struct
 
@@ -251,8 +252,17 @@ def test_without_subscribers_nothing_is_encoded():
         assert publisher.details()["messages"] == 0
 
 
+def lasting_port() -> int:
+    """Find a free port below those that connections of other processes are given meanwhile."""
+    for port in range(20_000 + os.getpid() % 10_000, 32_768):
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+    raise AssertionError("no port is free")
+
+
 def test_it_comes_back_after_close_and_names_a_port_that_is_taken():
-    publisher = FoxglovePublisher("fox", FoxgloveOptions(port=0))
+    publisher = FoxglovePublisher("fox", FoxgloveOptions(port=lasting_port()))
     with running(publisher, View(FORCES)):
         client = Client(publisher)
         client.subscribed()
