@@ -24,11 +24,12 @@ from tactile_rt.calibration import (
     tare,
 )
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
-from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, SourceStats, concatenate
+from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, SourceStats
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
 LOADS = ("N",) * 3 + ("N m",) * 3
+ELEMENTS = ("A0", "A1", "A2")
 GAUGES = tuple(f"s{i}" for i in range(6))
 
 
@@ -48,15 +49,15 @@ def rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, matrix.tolist()))
 
 
+def calibration_of(device: str = "d", **fields: object) -> Calibration:
+    """Make a calibration of three elements, from gauges to loads."""
+    return Calibration(device, ELEMENTS, GAUGES, ("1",) * 6, AXES, LOADS, **fields)
+
+
 def whole_calibration(rng: np.random.Generator) -> Calibration:
     """One that uses all there is."""
-    return Calibration(
+    return calibration_of(
         "bench-7",
-        ("A0", "A1", "A2"),
-        GAUGES,
-        ("1",) * 6,
-        AXES,
-        LOADS,
         gain=(1e-6, 2e-6, 3e-6, 1e-9, 2e-9, 3e-9),
         tare={"A0": tuple(rng.normal(size=6).tolist()), "A2": (1.0, -2.0, 0.0, 1e-300, 3.5, 1e22)},
         noise={"A0": (0.1,) * 6},
@@ -80,11 +81,10 @@ def test_every_element_is_its_matrix_times_raw_less_tare() -> None:
     rng = np.random.default_rng(1)
     raw = rng.normal(size=(50, 3, 6)) * 1e4
     offsets, matrices = rng.normal(size=(3, 6)) * 1e4, rng.normal(size=(3, 6, 6)) * 1e-6
-    calibration = Calibration(
-        "d", ("A0", "A1", "A2"), GAUGES, ("1",) * 6, AXES, LOADS,
+    calibration = calibration_of(
         tare={f"A{e}": tuple(offsets[e]) for e in range(3)},
         matrices={f"A{e}": rows(matrices[e]) for e in range(3)},
-    )  # fmt: skip
+    )
     chunk = chunk_of(raw)
     before = chunk.values.copy()
     made = calibration.apply(chunk)
@@ -105,10 +105,8 @@ def test_every_element_is_its_matrix_times_raw_less_tare() -> None:
 def test_a_gain_is_a_diagonal_matrix() -> None:
     raw = np.random.default_rng(4).normal(size=(7, 3, 6))
     gain = (1.0, 2.0, -3.0, 4.0, 0.5, 0.0)
-    names = ("A0", "A1", "A2")
-    by_gain = Calibration("d", names, GAUGES, ("1",) * 6, AXES, LOADS, gain=gain)
-    diagonal = {e: rows(np.diag(gain)) for e in names}
-    by_matrix = Calibration("d", names, GAUGES, ("1",) * 6, AXES, LOADS, matrices=diagonal)
+    by_gain = calibration_of(gain=gain)
+    by_matrix = calibration_of(matrices=dict.fromkeys(ELEMENTS, rows(np.diag(gain))))
     # one element's full matrix sends all of them the general way
     mixed = replace(by_gain, matrices={"A1": rows(np.ones((6, 6)))})
     expected = (raw * gain).astype(np.float32)
@@ -120,10 +118,7 @@ def test_a_gain_is_a_diagonal_matrix() -> None:
 
 
 def test_counts_without_a_matrix_are_never_valid_newtons() -> None:
-    calibration = Calibration(
-        "d", ("A0", "A1", "A2"), GAUGES, ("1",) * 6, AXES, LOADS,
-        matrices={"A1": rows(np.eye(6))},
-    )  # fmt: skip
+    calibration = calibration_of(matrices={"A1": rows(np.eye(6))})
     made = calibration.apply(chunk_of(np.ones((4, 3, 6))))
     assert made.valid.tolist() == [[False, True, False]] * 4
     assert calibration.uncalibrated == ("A0", "A2")
@@ -135,10 +130,7 @@ def test_invalid_stays_invalid_and_touches_no_neighbour() -> None:
     valid = np.isfinite(raw).all(axis=2)
     valid[4, 2] = False
     matrix = rows(np.random.default_rng(6).normal(size=(6, 6)))
-    calibration = Calibration(
-        "d", ("A0", "A1", "A2"), GAUGES, ("1",) * 6, AXES, LOADS,
-        matrices=dict.fromkeys(("A0", "A1", "A2"), matrix),
-    )  # fmt: skip
+    calibration = calibration_of(matrices=dict.fromkeys(ELEMENTS, matrix))
     made = calibration.apply(chunk_of(raw, valid))
     assert np.array_equal(made.valid, valid)
     assert np.isfinite(made.values[valid]).all()
@@ -258,9 +250,8 @@ def test_a_simulated_left_array_becomes_the_right_one() -> None:
     from tactile_rt.sim_backend.arrays.files import load_array
     from tactile_rt.sim_backend.world import array_spec
 
-    left, right = (
-        array_spec(load_array(f"mouse-{side}").whiskers, "mouse") for side in ("left", "right")
-    )
+    arrays = [load_array(f"mouse-{side}") for side in ("left", "right")]
+    left, right = (array_spec(array.whiskers, "mouse") for array in arrays)
     assert left.differences(right)
     mirrored = replace(Calibration.of("d", left), mirror=Mirror()).output_spec(left)
     assert mirrored.differences(right) == []
@@ -290,6 +281,13 @@ def test_what_name_and_unit_do_not_tell_must_be_said(channel: str, unit: str) ->
 
 
 # ---- a source
+
+
+class Silent(ArraySource):
+    """A source that gives nothing in time."""
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        return None
 
 
 class Talkative(ArraySource):
@@ -329,10 +327,6 @@ def test_a_calibrated_source_is_the_source_but_for_its_samples() -> None:
 
 
 def test_a_calibrated_source_passes_on_silence_and_may_be_copied() -> None:
-    class Silent(ArraySource):
-        def read(self, timeout: float | None = None) -> Chunk | None:
-            return None
-
     source = CalibratedSource(Silent(small_spec(), []), Calibration.of("d", small_spec()))
     assert source.read(0) is None
     assert copy.copy(source).spec == source.spec
@@ -501,11 +495,9 @@ def quiet(rng: np.random.Generator, n: int = 2000, elements: int = 4) -> np.ndar
 
 def source_of(values: np.ndarray, valid: np.ndarray | None = None) -> ArraySource:
     spec = gauge_spec(values.shape[1])
-    chunks = cut(values, spec.rate_hz)
     if valid is not None:
-        whole = replace(concatenate(chunks), valid=valid)
-        chunks = [whole]
-    return ArraySource(spec, chunks)
+        return ArraySource(spec, [chunk_of(values, valid)])
+    return ArraySource(spec, cut(values, spec.rate_hz))
 
 
 def test_a_tare_is_the_median_and_its_noise_the_standard_deviation() -> None:
@@ -584,15 +576,9 @@ def test_too_few_samples_say_how_long_it_takes() -> None:
 
 def test_a_silent_source_is_not_waited_for(monkeypatch) -> None:
     monkeypatch.setattr("tactile_rt.calibration.taring.PATIENCE_S", 0.0)
-
-    class Silent(ArraySource):
-        def read(self, timeout: float | None = None) -> Chunk | None:
-            return None
-
-    with pytest.raises(SourceError, match="no sample came"):
-        tare(Silent(small_spec(), []), 0.01)
-    with pytest.raises(SourceError, match="no sample came"):
-        tare(ArraySource(small_spec(), []), 0.01)
+    for source in (Silent(small_spec(), []), ArraySource(small_spec(), [])):
+        with pytest.raises(SourceError, match="no sample came"):
+            tare(source, 0.01)
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, np.nan, np.inf])
@@ -705,10 +691,8 @@ def test_tables_that_cannot_be_fitted_are_refused(change, what: str) -> None:
 
 def test_a_table_of_readings(tmp_path) -> None:
     path = tmp_path / "loads.csv"
-    path.write_text(
-        "\ufeff# the lab, 21 November\nraw_b, mz ,raw_a,fy\n\n1,0.5,2,-1e-3\n,,,\n3,4,5,6\n",
-        encoding="utf-8",
-    )
+    text = "\ufeff# the lab, 21 November\nraw_b, mz ,raw_a,fy\n\n1,0.5,2,-1e-3\n,,,\n3,4,5,6\n"
+    path.write_text(text, encoding="utf-8")
     table = read_loads(path)
     assert (table.axes, table.units) == (("fy", "mz"), ("N", "N m"))
     assert table.loads.tolist() == [[-1e-3, 0.5], [6, 4]]
@@ -776,6 +760,5 @@ def test_the_documented_file_is_one(tmp_path) -> None:
     calibration = load_calibration(path)
     made = calibration.apply(chunk_of(np.array([[[9123.0, -411, 952], [77, -2021, 640]]])))
     # by hand: C2 is A1 by its matrix, C1 is A0 by its gain; fx, fy and mz stay in the mirror
-    np.testing.assert_allclose(
-        made.values[0], [[0.034, 0.22, 1.1e-4], [0.1, 0, 0]], rtol=1e-4, atol=1e-7
-    )
+    expected = [[0.034, 0.22, 1.1e-4], [0.1, 0, 0]]
+    np.testing.assert_allclose(made.values[0], expected, rtol=1e-4, atol=1e-7)

@@ -36,18 +36,14 @@ from tests.helpers.touch_streams import (
     SAME_RATE,
     SIGMA,
     SPEC,
-    expected_logits,
+    fed_logits,
     push_all,
+    same,
     signal,
     stream,
 )
 
 EPISODE = STEPS * SUBSTEPS
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_model(tmp_path_factory.mktemp("model") / "tiny.onnx")
 
 
 def test_an_episode_feeds_the_model_exactly_its_windows(model: Path) -> None:
@@ -59,9 +55,7 @@ def test_an_episode_feeds_the_model_exactly_its_windows(model: Path) -> None:
     for d in decisions:
         assert d.onset_ns == onset * PERIOD_NS
         assert d.t_ns == (onset + d.step * SUBSTEPS - 1) * PERIOD_NS
-        assert logits_of(d.probabilities) == pytest.approx(
-            expected_logits(values, onset, d.step), abs=2e-6
-        )
+        assert logits_of(d.probabilities) == fed_logits(values, onset, d.step)
         assert d.probabilities.dtype == np.float32
         assert d.probabilities.sum() == pytest.approx(1, abs=1e-6)
         assert d.labels == LABELS
@@ -92,17 +86,10 @@ def test_decisions_do_not_depend_on_how_the_stream_was_cut(
 ) -> None:
     whole, expected = uncut
     edges = [0, *cuts, 300]
-    chunks = [
-        Chunk(*(getattr(whole, name)[a:b] for name in ("seq", "t_ns", "values", "valid")))
-        for a, b in itertools.pairwise(edges)
-    ]
+    chunks = [whole.select(slice(a, b)) for a, b in itertools.pairwise(edges)]
     got = push_all(Classifier(model, SAME_RATE), chunks)
     assert len(expected) == 2 * STEPS
-    assert [(d.onset_ns, d.t_ns, d.step) for d in got] == [
-        (d.onset_ns, d.t_ns, d.step) for d in expected
-    ]
-    for a, b in zip(got, expected, strict=True):
-        assert np.array_equal(a.probabilities, b.probabilities)
+    assert same(got, expected)
 
 
 def test_both_touches_of_one_chunk_are_told_with_their_times(
@@ -129,9 +116,7 @@ def test_state_is_zeroed_at_the_next_onset_and_the_baseline_is_the_new_one(model
     last = [d for d in decisions if d.onset_ns == 501 * PERIOD_NS]
     assert [d.step for d in last] == [1, 2, 3, 4]
     for d in last:
-        assert logits_of(d.probabilities) == pytest.approx(
-            expected_logits(values, 501, d.step), abs=2e-6
-        )
+        assert logits_of(d.probabilities) == fed_logits(values, 501, d.step)
 
 
 def test_after_the_final_step_a_touch_that_stays_is_no_new_episode(model: Path) -> None:
@@ -143,9 +128,7 @@ def test_an_episode_goes_on_when_the_touch_ends_early(model: Path) -> None:
     values = signal([(QUIET, QUIET + 3, 0.1)], 400)
     decisions = push_all(Classifier(model, SAME_RATE), stream(values))
     assert [d.step for d in decisions] == [1, 2, 3, 4]
-    assert logits_of(decisions[-1].probabilities) == pytest.approx(
-        expected_logits(values, QUIET + 1, STEPS), abs=2e-6
-    )
+    assert logits_of(decisions[-1].probabilities) == fed_logits(values, QUIET + 1, STEPS)
 
 
 @pytest.mark.parametrize("after", range(-1, 4))
@@ -172,9 +155,8 @@ def test_temperature_divides_the_logits(tmp_path: Path, temperature: float) -> N
     path = write_model(tmp_path / "m.onnx", temperature=temperature)
     values = signal([(QUIET, 400, 0.1)], 400)
     for d in push_all(Classifier(path, SAME_RATE), stream(values)):
-        assert logits_of(d.probabilities, temperature) == pytest.approx(
-            expected_logits(values, QUIET + 1, d.step), abs=1e-5
-        )
+        logits = logits_of(d.probabilities, temperature)
+        assert logits == fed_logits(values, QUIET + 1, d.step, 1e-5)
 
 
 def test_large_logits_do_not_overflow(model: Path) -> None:
@@ -260,9 +242,7 @@ def test_a_silence_of_seconds_within_an_episode_ends_it(model: Path) -> None:
     assert [d.step for d in decisions] == [1, 1, 2, 3, 4]
     for d in decisions[1:]:
         assert d.onset_ns == 301 * PERIOD_NS + silence_ns
-        assert logits_of(d.probabilities) == pytest.approx(
-            expected_logits(values, 301, d.step), abs=2e-6
-        )
+        assert logits_of(d.probabilities) == fed_logits(values, 301, d.step)
 
 
 # Elements that cannot be trusted

@@ -20,11 +20,6 @@ from tests.helpers.touch_streams import QUIET, SAME_RATE, expected_logits, push_
 ONSET = QUIET + 1
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_model(tmp_path_factory.mktemp("model") / "tiny.onnx")
-
-
 # Windows that slide
 
 

@@ -23,26 +23,12 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
-from tests.helpers.touch_streams import QUIET, SAME_RATE, expected_logits, push_all, signal, stream
+from tests.helpers.touch_streams import QUIET, SAME_RATE, fed_logits, push_all, same, signal, stream
 
 ONSET = QUIET + 1
 SHIPPED = load_model(shipped_model())
 FAST = SHIPPED[1].array
 SLOW = replace(FAST, rate_hz=NS_PER_S / SHIPPED[1].period_ns)
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_model(tmp_path_factory.mktemp("model") / "tiny.onnx")
-
-
-def same(got: list[Classification], expected: list[Classification]) -> bool:
-    """Bit by bit, but for how long the steps took."""
-    return [(d.onset_ns, d.t_ns, d.step, d.final) for d in got] == [
-        (d.onset_ns, d.t_ns, d.step, d.final) for d in expected
-    ] and all(
-        np.array_equal(a.probabilities, b.probabilities) for a, b in zip(got, expected, strict=True)
-    )
 
 
 def loads(n: int, seed: int = 0) -> np.ndarray:
@@ -169,9 +155,7 @@ def test_a_bad_sample_is_an_invalid_one_and_counted(model: Path, bad: float) -> 
     assert classifier.stats.bad_samples == len(struck)
     for chunk in spoilt:  # what a source gave stays as it was
         assert (chunk.values[np.isin(chunk.seq, struck), 0, 1] != 0).all()
-    assert logits_of(got[-1].probabilities) == pytest.approx(
-        expected_logits(values, 501, STEPS), abs=1e-4
-    )
+    assert logits_of(got[-1].probabilities) == fed_logits(values, 501, STEPS, 1e-4)
 
 
 def test_bad_samples_that_were_marked_are_no_news(model: Path) -> None:
@@ -221,9 +205,7 @@ def test_a_network_that_says_no_number_ends_the_episode_and_recovers(tmp_path: P
     decisions = push_all(classifier, stream(values))
     assert classifier.stats.bad_steps == 1
     assert [d.step for d in decisions] == [1, 1, 2, 3, 4]
-    assert logits_of(decisions[-1].probabilities) == pytest.approx(
-        expected_logits(values, 501, STEPS), abs=1e-4
-    )
+    assert logits_of(decisions[-1].probabilities) == fed_logits(values, 501, STEPS, 1e-4)
     sliding = Classifier(path, SAME_RATE, mode="sliding", every=2)
     values = signal([(QUIET, 300, 0.1), (QUIET + 5, QUIET + 40, 9.0)], 300)
     decisions = push_all(sliding, stream(values))
@@ -248,15 +230,10 @@ def uncut(sliding: bool) -> tuple[Chunk, list[Classification]]:
 
 @settings(max_examples=5, deadline=None)
 @given(cuts=st.sets(st.integers(1, 1199), max_size=60), sliding=st.booleans())
-def test_the_shipped_model_does_not_mind_how_the_stream_was_cut(
-    cuts: set[int], sliding: bool
-) -> None:
+def test_the_shipped_model_does_not_mind_how_the_stream_was_cut(cuts: set, sliding: bool) -> None:
     whole, expected = uncut(sliding)
     edges = [0, *sorted(cuts), 1200]
-    chunks = [
-        Chunk(*(getattr(whole, name)[a:b] for name in ("seq", "t_ns", "values", "valid")))
-        for a, b in itertools.pairwise(edges)
-    ]
+    chunks = [whole.select(slice(a, b)) for a, b in itertools.pairwise(edges)]
     options = {"mode": "sliding", "every": 11} if sliding else {}
     classifier = Classifier(shipped_model(), FAST, **options)
     assert len(expected) >= 14
@@ -288,18 +265,13 @@ def test_an_episode_cut_short_anywhere_leaves_nothing_behind(model: Path, sample
     """A silence after some samples of it, of no whole number of steps as well."""
     stop = ONSET + samples
     values = signal([(QUIET, stop, 0.1), (500, 600, 0.1)], 600)
-    chunks = [
-        replace(c, t_ns=c.t_ns + 600 * PERIOD_NS) if c.seq[0] >= stop else c
-        for c in stream(values, samples=1)
-    ]
-    decisions = [
-        d for d in push_all(Classifier(model, SAME_RATE), chunks) if d.t_ns > 700 * PERIOD_NS
-    ]
+    chunks = stream(values, samples=1)
+    late = [replace(c, t_ns=c.t_ns + 600 * PERIOD_NS) if c.seq[0] >= stop else c for c in chunks]
+    decisions = push_all(Classifier(model, SAME_RATE), late)
+    decisions = [d for d in decisions if d.t_ns > 700 * PERIOD_NS]
     assert [d.step for d in decisions] == [1, 2, 3, 4]
     for d in decisions:
-        assert logits_of(d.probabilities) == pytest.approx(
-            expected_logits(values, 501, d.step), abs=1e-5
-        )
+        assert logits_of(d.probabilities) == fed_logits(values, 501, d.step, 1e-5)
 
 
 # Memory

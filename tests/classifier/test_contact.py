@@ -66,8 +66,7 @@ def test_an_element_that_was_quiet_by_chance_is_not_believed_to_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step", "within"),
-    [(1000.0, 1), (20.0, 1), (10.0, 2), (5.0, 6), (3.5, 15)],
+    ("step", "within"), [(1000.0, 1), (20.0, 1), (10.0, 2), (5.0, 6), (3.5, 15)]
 )
 def test_a_step_of_one_channel_is_found_within_a_few_samples(step: float, within: int) -> None:
     for seed, element, channel in ((0, 0, 0), (1, 12, 3), (2, 29, 5)):

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,14 @@ from tactile_rt.classifier.model_file import (
 from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model
+
+
+def refusal(path: Path, said: str, load: Callable[[Path], object] = load_model) -> str:
+    """Load what cannot be loaded; give the error, which is one line that begins with this."""
+    with pytest.raises(ModelError, match=f"^{path}{said}") as caught:
+        load(path)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def test_the_card_comes_back_as_it_was_written(tmp_path: Path) -> None:
@@ -69,16 +78,10 @@ def test_a_batch_frozen_into_the_graph_is_refused_unless_it_is_one(tmp_path: Pat
         (b"PK\x03\x04\x00\x00", "it is a zip archive, as checkpoints are; `tactile-rt export`"),
     ],
 )
-def test_what_is_often_taken_for_a_model_is_named(
-    tmp_path: Path, content: bytes, said: str
-) -> None:
+def test_what_is_often_taken_for_a_model_is_named(tmp_path: Path, content, said: str) -> None:
     path = tmp_path / "m.onnx"
     path.write_bytes(content)
-    with pytest.raises(
-        ModelError, match=f"^{path} is not a readable ONNX model: .*{said}"
-    ) as caught:
-        load_model(path)
-    assert "\n" not in str(caught.value)
+    refusal(path, f" is not a readable ONNX model: .*{said}")
 
 
 @pytest.mark.parametrize(
@@ -95,11 +98,9 @@ def test_onnxruntime_s_reasons_are_said_without_its_source(
 ) -> None:
     monkeypatch.setattr("onnx.checker.check_model", lambda *a, **k: None)
     path = write_model(tmp_path / "m.onnx", graph)
-    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: {said}") as caught:
-        load_model(path)
-    assert "\n" not in str(caught.value)
-    assert "onnxruntime_src" not in str(caught.value)
-    assert len(str(caught.value)) < len(str(path)) + 350
+    message = refusal(path, f" is not a readable ONNX model: {said}")
+    assert "onnxruntime_src" not in message
+    assert len(message) < len(str(path)) + 350
 
 
 def test_other_names_are_found_without_running_it(
@@ -108,8 +109,7 @@ def test_other_names_are_found_without_running_it(
     monkeypatch.setattr("onnxruntime.InferenceSession", None)  # would be a TypeError
     for old, said in (("sigma", "disagree with its metadata at S, sigma"), ("logits", "`logits`")):
         path = write_model(tmp_path / "m.onnx", GRAPH.replace(old, "S"))
-        with pytest.raises(ModelError, match=f"^{path}: .*{said}"):
-            read_model(path)
+        refusal(path, f": .*{said}", read_model)
     stored = GRAPH.replace("float[B,3,2] sigma,", "float[B,3,2] sigma, int64[1] one,")
     assert read_model(write_model(tmp_path / "m.onnx", stored))[0] == CARD
 
@@ -122,10 +122,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_onnx_without_our_metadata_is_told_apart_from_damage(tmp_path: Path) -> None:
     path = write_model(tmp_path / "m.onnx", metadata="")
-    with pytest.raises(
-        ModelError, match=r"is ONNX but not a tactile_rt model: .*tactile-rt export"
-    ):
-        load_model(path)
+    refusal(path, " is ONNX but not a tactile_rt model: .*tactile-rt export")
 
 
 # The sum of two elements for a state of one.
@@ -149,7 +146,7 @@ def card_with(**fields: object) -> str:
 
 
 @pytest.mark.parametrize(
-    ("metadata", "complaint"),
+    ("metadata", "said"),
     [
         ("{", "has damaged metadata"),
         ("{}", "has metadata of version None; this release reads 3"),
@@ -162,12 +159,8 @@ def card_with(**fields: object) -> str:
         (card_with(spec="mouse"), "has damaged metadata: not an array spec"),
     ],
 )
-def test_metadata_that_cannot_be_read_says_why(
-    tmp_path: Path, metadata: str, complaint: str
-) -> None:
-    path = write_model(tmp_path / "m.onnx", metadata=metadata)
-    with pytest.raises(ModelError, match=f"^{path} {complaint}"):
-        load_model(path)
+def test_metadata_that_cannot_be_read_says_why(tmp_path: Path, metadata: str, said: str) -> None:
+    refusal(write_model(tmp_path / "m.onnx", metadata=metadata), f" {said}")
 
 
 @pytest.mark.parametrize(
@@ -186,10 +179,7 @@ def test_a_graph_that_disagrees_with_its_card_is_refused(
     tmp_path: Path, changes: dict, where: str
 ) -> None:
     path = write_model(tmp_path / "m.onnx", **changes)
-    with pytest.raises(
-        ModelError, match=f"^{path}: the graph's inputs disagree with its metadata {where}"
-    ):
-        load_model(path)
+    refusal(path, f": the graph's inputs disagree with its metadata {where}")
 
 
 def test_a_state_without_a_batch_axis_is_refused(
@@ -198,8 +188,7 @@ def test_a_state_without_a_batch_axis_is_refused(
     """Of no further axes it is like the card's but for that."""
     monkeypatch.setattr("onnx.checker.check_model", lambda *a, **k: None)
     path = write_model(tmp_path / "m.onnx", GRAPH.replace("int64[B] steps,", "int64[] steps,"))
-    with pytest.raises(ModelError, match=f"^{path}: .* disagree with its metadata at steps$"):
-        load_model(path)
+    refusal(path, ": .* disagree with its metadata at steps$")
 
 
 @pytest.mark.parametrize(
@@ -216,9 +205,7 @@ def test_a_state_without_a_batch_axis_is_refused(
 def test_outputs_that_the_card_promises_must_be_there(
     tmp_path: Path, graph: str, changes: dict, complaint: str
 ) -> None:
-    path = write_model(tmp_path / "m.onnx", graph, **changes)
-    with pytest.raises(ModelError, match=f"^{path}: {complaint}"):
-        load_model(path)
+    refusal(write_model(tmp_path / "m.onnx", graph, **changes), f": {complaint}")
 
 
 @pytest.mark.parametrize(
@@ -265,8 +252,7 @@ def test_a_card_that_cannot_be_run_is_refused_before_it_is_run(
     tmp_path: Path, changes: dict, complaint: str
 ) -> None:
     path = write_model(tmp_path / "m.onnx", **changes)
-    with pytest.raises(ModelError, match=f"^{path} has damaged metadata: {complaint}"):
-        Classifier(path, small_spec())
+    refusal(path, f" has damaged metadata: {complaint}", lambda p: Classifier(p, small_spec()))
 
 
 def test_running_a_model_writes_nothing_to_the_terminal(
@@ -275,8 +261,7 @@ def test_running_a_model_writes_nothing_to_the_terminal(
     """onnxruntime logs its failures to stderr unless told not to."""
     load_model(write_model(tmp_path / "m.onnx"))
     (tmp_path / "bad.onnx").write_bytes(b"garbage")
-    with pytest.raises(ModelError):
-        load_model(tmp_path / "bad.onnx")
+    refusal(tmp_path / "bad.onnx", "")
     assert capfd.readouterr() == ("", "")
 
 
@@ -368,8 +353,7 @@ def test_fields_that_a_later_release_adds_are_passed_over(tmp_path: Path) -> Non
 
 def test_a_window_is_loaded_only_where_one_is_wanted(tmp_path: Path) -> None:
     path = write_model(tmp_path / "m.onnx", WINDOW, kind="window", state=())
-    with pytest.raises(ModelError, match=f"^{path} is a model of kind 'window'; this needs 'step'"):
-        load_model(path)
+    refusal(path, " is a model of kind 'window'; this needs 'step'")
     session, card = load_model(path, kind="window")
     assert probe_logits(session, card).shape == (4, 5)
     fixed = WINDOW.replace("B,T", "B,7")

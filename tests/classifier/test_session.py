@@ -32,9 +32,9 @@ class Listener:
 class Device(Source):
     """A live source under the test's control: gives what is in `arriving`, else nothing in time."""
 
-    def __init__(self) -> None:
+    def __init__(self, *arriving: Chunk | Exception, live: bool = True) -> None:
         super().__init__(SPEC)
-        self.arriving: list[Chunk | Exception] = []
+        self.live, self.arriving = live, list(arriving)
         self.readers: set[str] = set()
         self.reads = 0
         self.closed_by: list[str] = []
@@ -116,14 +116,8 @@ def test_a_slow_consumer_gets_the_newest_and_every_loss_is_counted() -> None:
 def test_an_error_of_the_source_reaches_the_consumer_after_the_samples_before_it(
     error: Exception, live: bool
 ) -> None:
-    device = Device()
-    device.live = live
-    device.arriving += [*CHUNKS[:3], error]
-    listener = Listener()
-    with (
-        pytest.raises(type(error), match=str(error)),
-        Session(device, listener) as session,
-    ):
+    device, listener = Device(*CHUNKS[:3], error, live=live), Listener()
+    with pytest.raises(type(error), match=str(error)), Session(device, listener) as session:
         for _ in session:
             pass
     assert listener.seqs == list(range(12))
@@ -135,9 +129,7 @@ def test_an_error_of_the_classifier_ends_reading_at_once(live: bool) -> None:
     def fail(chunk: Chunk) -> list:
         raise ArithmeticError("no")
 
-    device = Device()
-    device.live = live
-    device.arriving += CHUNKS
+    device = Device(*CHUNKS, live=live)
     session = Session(device, Listener(fail))
     # Not even a caller who keeps the traceback keeps the thread.
     with pytest.raises(ArithmeticError) as caught:
@@ -150,9 +142,7 @@ def test_an_error_of_the_classifier_ends_reading_at_once(live: bool) -> None:
 
 @pytest.mark.parametrize("live", [False, True])
 def test_stop_from_another_thread_ends_the_iteration(live: bool) -> None:
-    device = Device()
-    device.live = live
-    device.arriving += CHUNKS[:5] if live else CHUNKS * 1000
+    device = Device(*(CHUNKS[:5] if live else CHUNKS * 1000), live=live)
     with Session(device, Listener()) as session:
         stopper = threading.Timer(0.1, session.stop)
         stopper.name = "stopper"
@@ -170,9 +160,7 @@ def test_stop_from_another_thread_ends_the_iteration(live: bool) -> None:
 
 def test_stop_from_within_the_loop_gives_nothing_more() -> None:
     for live in (False, True):
-        device = Device()
-        device.live = live
-        device.arriving += CHUNKS
+        device = Device(*CHUNKS, live=live)
         n = 0
         with Session(device, Listener()) as session:
             for _ in session:
@@ -184,8 +172,7 @@ def test_stop_from_within_the_loop_gives_nothing_more() -> None:
 
 
 def test_leaving_the_context_waits_for_the_reader_though_the_loop_is_still_open() -> None:
-    device = Device()
-    device.arriving += CHUNKS[:2]
+    device = Device(*CHUNKS[:2])
     with Session(device, Listener()) as session:
         chunks = iter(session)  # a caller who keeps the iterator
         next(chunks)
@@ -196,8 +183,7 @@ def test_leaving_the_context_waits_for_the_reader_though_the_loop_is_still_open(
 
 def test_a_session_that_was_stopped_gives_nothing_and_closes_its_source() -> None:
     for live in (False, True):
-        device = Device()
-        device.live = live
+        device = Device(live=live)
         with Session(device, Listener()) as session:
             session.stop()
             assert list(session) == []
@@ -205,8 +191,7 @@ def test_a_session_that_was_stopped_gives_nothing_and_closes_its_source() -> Non
 
 
 def test_a_live_source_is_read_in_one_other_thread() -> None:
-    device = Device()
-    device.arriving += [*CHUNKS, EndOfStream()]
+    device = Device(*CHUNKS, EndOfStream())
     with Session(device, Listener()) as session:
         assert len(list(session)) == len(CHUNKS)
     assert device.readers == {"tactile-rt-reader"}

@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,16 +11,16 @@ from hypothesis import strategies as st
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier import classifier as classifier_module
-from tactile_rt.classifier.classifier import BEHIND_S, Classification, Classifier
+from tactile_rt.classifier.classifier import BEHIND_S, Classifier
 from tactile_rt.classifier.decision_rules import Deadline
 from tactile_rt.classifier.skips import Skip, Skips
 from tactile_rt.core.errors import ConfigError
-from tests.helpers.tiny_model import PERIOD_NS, STEPS, SUBSTEPS, write_model
-from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
+from tests.helpers.tiny_model import PERIOD_NS, STEPS, SUBSTEPS
+from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, same, signal, stream
 
 TOUCHES = [(start, start + 60, 1.0) for start in range(QUIET, 900, 110)]
 VALUES = signal(TOUCHES, 950)
-FACTS = ("onset_ns", "t_ns", "step", "final", "label", "prediction_set", "coverage")
+AGES = (0.0, 0.0, 0.0, 0.01, 0.1, 0.14, 0.151, 0.3, 1.0, 2.5)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -30,18 +29,6 @@ def prompt() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(classifier_module, "time", SimpleNamespace(perf_counter=lambda: 0.0))
         yield
-
-
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_model(tmp_path_factory.mktemp("model") / "tiny.onnx")
-
-
-def same(a: list[Classification], b: list[Classification]) -> bool:
-    facts = [[tuple(getattr(d, f) for f in FACTS) for d in which] for which in (a, b)]
-    return facts[0] == facts[1] and all(
-        np.array_equal(x.probabilities, y.probabilities) for x, y in zip(a, b, strict=True)
-    )
 
 
 class Ages:
@@ -57,20 +44,15 @@ class Ages:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    ages=st.lists(
-        st.sampled_from([0.0, 0.0, 0.0, 0.01, 0.1, 0.14, 0.151, 0.3, 1.0, 2.5]),
-        min_size=3,
-        max_size=40,
-    ),
+    ages=st.lists(st.sampled_from(AGES), min_size=3, max_size=40),
     mode=st.sampled_from(["episode", "sliding"]),
     samples=st.integers(1, 40),
 )
 def test_what_was_skipped_live_and_is_skipped_again_gives_the_same_decisions(
     model: Path, ages: list[float], mode: str, samples: int
 ) -> None:
-    live = Classifier(
-        model, SAME_RATE, mode=mode, age=Ages(ages), catch_up="newest", behind_s=BEHIND_S
-    )
+    options = {"age": Ages(ages), "catch_up": "newest", "behind_s": BEHIND_S}
+    live = Classifier(model, SAME_RATE, mode=mode, **options)
     decisions = push_all(live, stream(VALUES))
     skips = list(live.skips.found)
     again = Classifier(model, SAME_RATE, mode=mode, skips=skips)
@@ -97,11 +79,7 @@ def test_a_late_episode_ends_and_the_next_onset_begins_one(model: Path) -> None:
     plain = push_all(Classifier(model, SAME_RATE), stream(VALUES))
     second = [d for d in plain if d.onset_ns == plain[STEPS].onset_ns]
     at = second[1].t_ns
-
-    def age(t_ns: int) -> float:
-        return 0.2 if t_ns == at else 0.0
-
-    live = Classifier(model, SAME_RATE, age=age, catch_up="newest")
+    live = Classifier(model, SAME_RATE, age=lambda t: 0.2 * (t == at), catch_up="newest")
     decisions = push_all(live, stream(VALUES))
     assert live.skips.found == [Skip(at, at + 200_000_000)] and live.stats.skips == 1
     assert same(decisions, [d for d in plain if d not in second[1:]])
@@ -120,9 +98,8 @@ def test_windows_that_slide_go_on_within_a_contact(model: Path) -> None:
     plain = push_all(Classifier(model, SAME_RATE, mode="sliding", every=1), stream(values))
     middle = plain[len(plain) // 2].t_ns
     skips = [Skip(middle, middle + 30 * PERIOD_NS)]
-    found = push_all(
-        Classifier(model, SAME_RATE, mode="sliding", every=1, skips=skips), stream(values)
-    )
+    skipping = Classifier(model, SAME_RATE, mode="sliding", every=1, skips=skips)
+    found = push_all(skipping, stream(values))
     after = [d for d in found if d.t_ns >= skips[0].until_ns]
     assert after and after[0].onset_ns >= skips[0].until_ns and after[0].coverage is None
     assert abs(after[-1].t_ns - plain[-1].t_ns) < SUBSTEPS * PERIOD_NS
@@ -179,10 +156,8 @@ def test_what_was_sure_in_an_episode_that_was_cut_does_not_count_in_the_next(mod
     plain = push_all(Classifier(model, SAME_RATE, sure=0.01, in_a_row=3), stream(VALUES))
     assert [d.step for d in plain if d.final] == [3] * len(TOUCHES)
     cut = Skip(plain[1].t_ns + 1, plain[1].t_ns + 10 * PERIOD_NS)
-    again = push_all(
-        Classifier(model, SAME_RATE, sure=0.01, in_a_row=3, skips=[cut]), stream(VALUES)
-    )
-    assert same(again, plain[:2] + plain[3:])
+    cutting = Classifier(model, SAME_RATE, sure=0.01, in_a_row=3, skips=[cut])
+    assert same(push_all(cutting, stream(VALUES)), plain[:2] + plain[3:])
 
 
 def test_while_something_is_touched_it_is_deciding_though_the_episode_is_skipped(

@@ -7,23 +7,14 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.classifier import Classifier
 from tests.helpers.tiny_model import CARD, PERIOD_NS, STEPS, SUBSTEPS, write_model
-from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
+from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, same, signal, stream
 
 TOUCHES = [(QUIET, QUIET + 60, 1.0), (QUIET + 160, QUIET + 220, 1.0)]
 CHUNKS = stream(signal(TOUCHES, 420))
 BETWEEN = (QUIET + 110) // 7  # chunks: after the first touch and its episode
 WITHIN = (QUIET + 5) // 7
-
-
-@pytest.fixture
-def model(tmp_path: Path) -> Path:
-    return write_model(tmp_path / "tiny.onnx")
-
-
-def facts(decisions: list[Classification]) -> list[tuple]:
-    return [(d.t_ns, d.onset_ns, d.step, d.label, d.probabilities.tobytes()) for d in decisions]
 
 
 def test_who_goes_on_decides_as_the_one_before_would_have(model: Path) -> None:
@@ -32,7 +23,7 @@ def test_who_goes_on_decides_as_the_one_before_would_have(model: Path) -> None:
     first = push_all(old, CHUNKS[:BETWEEN])
     assert not old.deciding and len(first) == STEPS
     assert new.go_on_from(old) and new.detector.ready
-    assert facts(first + push_all(new, CHUNKS[BETWEEN:])) == facts(alone)
+    assert same(first + push_all(new, CHUNKS[BETWEEN:]), alone)
     assert len(alone) == 2 * STEPS
 
 
@@ -66,9 +57,7 @@ def test_who_forgets_is_as_at_the_beginning(model: Path) -> None:
     assert classifier.deciding
     classifier.forget()
     assert not classifier.deciding and not classifier.detector.ready
-    assert facts(push_all(classifier, CHUNKS)) == facts(
-        push_all(Classifier(model, SAME_RATE), CHUNKS)
-    )
+    assert same(push_all(classifier, CHUNKS), push_all(Classifier(model, SAME_RATE), CHUNKS))
 
 
 def test_a_step_is_as_long_as_its_samples(model: Path) -> None:

@@ -37,9 +37,12 @@ from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 from tests.helpers.tiny_model import write_model
+from tests.helpers.touch_streams import same
 from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
+JSONL = '[[publisher]]\nkind = "jsonl"\noptions = {file = "out"}\n'
+OPEN_SOURCE = "tactile_rt.daemon.source_part.open_source"
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -129,6 +132,11 @@ def source(name, url):
     return f'[[source]]\nname = "{name}"\nurl = "{url}"\n'
 
 
+def model_of(file, **keys):
+    keys = "".join(f'{key} = "{value}"\n' for key, value in keys.items())
+    return f'[[model]]\n{keys}file = "{file}"\n'
+
+
 def state_of(daemon, name):
     snapshot = daemon.snapshot()
     parts = [s.part for s in (*snapshot.sources, *snapshot.models, *snapshot.consumers)]
@@ -150,9 +158,9 @@ def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
         daemon, spy = robot(
             source("left", f"{left.url}&clock=device")
             + source("right", f"{right.url}&clock=device")
-            + f'[[model]]\nsource = "left"\nfile = "{model}"\n'
-            f'[[model]]\nsource = "right"\nfile = "{model}"\n'
-            f'[[model]]\nsource = "right"\nname = "last"\nfile = "{model}"\ndecisions = "final"\n'
+            + model_of(model, source="left")
+            + model_of(model, source="right")
+            + model_of(model, source="right", name="last", decisions="final")
         )
         assert left.wait(PATIENCE_S) and right.wait(PATIENCE_S)
         until(lambda: all(len(seqs(spy, n)) == 2000 for n in ("left", "right")))
@@ -177,9 +185,7 @@ def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
     assert states["source.left"].stats.delivered == states["source.left"].samples == 2000
     assert states["source.right"].frame == "mount" and states["source.right"].device is not None
     first, second, final = snapshot.models
-    assert (first.part.name, second.part.name, final.part.name) == (
-        "model.left", "model.right", "model.last",
-    )  # fmt: skip
+    assert [m.part.name for m in snapshot.models] == ["model.left", "model.right", "model.last"]
     made = spy.of(Decision)
     assert {d.model for d in made} == {"left", "right", "last"}
     assert all(d.decision.final for d in made if d.model == "last")
@@ -207,11 +213,8 @@ def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):
         FakeSerial(touching(6000), spec=SPEC, faults=faults, pace="fast") as fake,
         FakeSerial(touching(1000), spec=SPEC) as calm,
     ):
-        daemon, spy = robot(
-            source("a", fake.url)
-            + source("calm", calm.url)
-            + f'[[model]]\nsource = "a"\nfile = "{model}"\n'
-        )
+        text = source("a", fake.url) + source("calm", calm.url) + model_of(model, source="a")
+        daemon, spy = robot(text)
         assert fake.wait(PATIENCE_S) and calm.wait(PATIENCE_S)
         until(lambda: len(seqs(spy, "calm")) == 1000)
         told = fake.emulator.log
@@ -236,24 +239,14 @@ def test_decisions_are_those_of_the_classifier_alone(robot, tmp_path, monkeypatc
     chunks = cut(touching(3000), SPEC.rate_hz, samples=7)
     alone = Classifier(model, SPEC)
     expected = [d for chunk in chunks for d in alone.push(chunk)]
-    monkeypatch.setattr(
-        "tactile_rt.daemon.source_part.open_source", lambda url, **more: ArraySource(SPEC, chunks)
-    )
+    monkeypatch.setattr(OPEN_SOURCE, lambda url, **more: ArraySource(SPEC, chunks))
     over = threading.Event()
-    daemon, spy = robot(
-        source("a", "serial:none?codec=native") + f'[[model]]\nfile = "{model}"\n',
-        on_over=over.set,
-    )
+    text = source("a", "serial:none?codec=native") + model_of(model)
+    daemon, spy = robot(text, on_over=over.set)
     assert over.wait(PATIENCE_S)
     daemon.stop()
     found = [d.decision for d in spy.of(Decision)]
-    assert [(d.t_ns, d.onset_ns, d.step, d.final, d.label) for d in found] == [
-        (d.t_ns, d.onset_ns, d.step, d.final, d.label) for d in expected
-    ]
-    assert all(
-        np.array_equal(a.probabilities, b.probabilities)
-        for a, b in zip(found, expected, strict=True)
-    )
+    assert same(found, expected)
     assert len(found) > 4 and len(seqs(spy, "a")) == 3000
     assert spy.log == ["open", "close"] and isinstance(spy.items[-1], Event)
 
@@ -297,7 +290,7 @@ def test_a_source_that_breaks_is_opened_again_and_its_counts_add_up(robot, monke
         opened.append(Breaking(SPEC, cut(touching(100), 1000.0)))
         return opened[-1]
 
-    monkeypatch.setattr("tactile_rt.daemon.source_part.open_source", open_it)
+    monkeypatch.setattr(OPEN_SOURCE, open_it)
     daemon, spy = robot(source("a", "synthetic:"))
     until(lambda: state_of(daemon, "source.a").failures > 4)
     state = daemon.snapshot().sources[0]
@@ -316,7 +309,7 @@ def test_a_model_of_another_array_has_failed_and_is_not_tried_again(robot, tmp_p
     """A native device says what it is only when it is opened: nobody could know before."""
     model = write_model(tmp_path / "m.onnx", spec=renamed("x").to_json())
     with FakeSerial(touching(60_000), spec=SPEC) as device:
-        daemon, spy = robot(source("a", device.url) + f'[[model]]\nfile = "{model}"\n')
+        daemon, spy = robot(source("a", device.url) + model_of(model))
         until(lambda: spy.told("model.a", "failed"))
         (event,) = spy.told("model.a", "failed")
         assert event.level == "error" and not spy.told("model.a", "waiting")
@@ -325,19 +318,17 @@ def test_a_model_of_another_array_has_failed_and_is_not_tried_again(robot, tmp_p
         until(lambda: len(seqs(spy, "a")) > 1000)  # many times the longest pause between tries
         state = state_of(daemon, "model.a")
         assert (state.state, state.starts, state.failures) == ("failed", 1, 1)
-        assert f"no decisions: model.a has failed: {event.reason}; acquisition goes on" in (
-            daemon.snapshot().degraded
-        )
+        said = f"no decisions: model.a has failed: {event.reason}; acquisition goes on"
+        assert said in daemon.snapshot().degraded
         # and whoever looks at the daemon is told as plainly
         metrics = exposition(daemon.snapshot()).decode()
         assert 'tactile_part_state{part="model.a",state="failed"} 1\n' in metrics
-        assert sum('part="model.a"' in x and x.endswith(" 1") for x in metrics.splitlines()
-                   if x.startswith("tactile_part_state")) == 1  # fmt: skip
+        states = [x for x in metrics.splitlines() if x.startswith("tactile_part_state")]
+        assert sum('part="model.a"' in x and x.endswith(" 1") for x in states) == 1
         console = Console(file=io.StringIO(), width=1000)
         console.print(picture(daemon.snapshot(), None))
-        shown = next(
-            x for x in console.file.getvalue().splitlines() if x.split()[:2] == ["a", "failed"]
-        )
+        lines = console.file.getvalue().splitlines()
+        shown = next(line for line in lines if line.split()[:2] == ["a", "failed"])
         assert event.reason in shown
         # Of another file it is worth a try, with or without being told.
         write_model(model)
@@ -386,9 +377,7 @@ def test_a_device_is_what_its_configuration_says(robot, tmp_path):
 
 def test_a_consumer_that_breaks_or_hangs_harms_itself_alone(robot, tmp_path):
     with FakeSerial(touching(60_000), spec=SPEC) as device:
-        daemon, spy = robot(
-            source("a", device.url) + '[[publisher]]\nkind = "jsonl"\noptions = {file = "out"}\n'
-        )
+        daemon, spy = robot(source("a", device.url) + JSONL)
         until(lambda: len(spy.items) > 10)
 
         def fail():
@@ -423,17 +412,11 @@ def test_a_consumer_that_breaks_or_hangs_harms_itself_alone(robot, tmp_path):
 def test_a_reload_disturbs_only_what_has_changed(robot, tmp_path, spy):
     model = write_model(tmp_path / "m.onnx")
     with FakeSerial(touching(60_000), spec=SPEC) as device:
-        base = source("a", device.url) + f'[[model]]\nsource = "a"\nfile = "{model}"\n'
+        base = source("a", device.url) + model_of(model, source="a")
         daemon, first = robot(base)
         until(lambda: first.of(Decision))
         models = daemon.snapshot().models[0]
-        daemon.reload(
-            configured(
-                tmp_path,
-                base + source("b", "synthetic:1x1") + '[[publisher]]\nkind = "jsonl"\n'
-                'options = {file = "out"}\n',
-            )
-        )
+        daemon.reload(configured(tmp_path, base + source("b", "synthetic:1x1") + JSONL))
         assert len(spy) == 1  # what goes on is not made again
         until(lambda: first.of(SourceChunk, "b"))
         until(lambda: '"source":"b"' in (tmp_path / "out").read_text())
@@ -467,15 +450,14 @@ def test_a_source_that_is_still_being_opened_disturbs_no_other_after_a_reload(ro
             return Late(SPEC, [], live=True)
         return open_source(url)
 
-    monkeypatch.setattr("tactile_rt.daemon.source_part.open_source", open_it)
+    monkeypatch.setattr(OPEN_SOURCE, open_it)
     daemon, spy = robot(source("a", "synthetic:1x1"))
     until(lambda: daemon._sources["a"]._opening)
     old = daemon._sources["a"]
     daemon.reload(configured(Path(daemon.snapshot().config).parent, source("a", "synthetic:2x2")))
     until(lambda: spy.of(SourceChunk, "a"))
-    assert not closed and [e.reason for e in spy.told("source.a", "stopped")] == [
-        "while it waited for its device"
-    ]
+    (stopped,) = spy.told("source.a", "stopped")
+    assert not closed and stopped.reason == "while it waited for its device"
     answers.set()
     until(lambda: closed)
     until(lambda: not old._thread.is_alive())
@@ -534,14 +516,10 @@ def test_the_wall_clock_may_jump(robot):
     clock = Stepped()
     daemon, spy = robot(source("a", "synthetic:"), clock=clock)
     until(lambda: len(spy.of(SourceChunk)) > 3)
-    clock.by = 3600 * 10**9
+    clock.by, first = 3600 * 10**9, spy.of(SourceChunk)[0]
     until(lambda: spy.told("daemon", "clock"))
     assert spy.told("daemon", "clock")[0].reason.startswith("the wall clock jumped by +3600.")
-    until(
-        lambda: (
-            spy.of(SourceChunk)[-1].utc_offset_ns - spy.of(SourceChunk)[0].utc_offset_ns > 3599e9
-        )
-    )
+    until(lambda: spy.of(SourceChunk)[-1].utc_offset_ns - first.utc_offset_ns > 3599e9)
     assert daemon.snapshot().clock_steps == 1
     t_ns = np.concatenate([s.chunk.t_ns for s in spy.of(SourceChunk)])
     assert (np.diff(t_ns) > 0).all()

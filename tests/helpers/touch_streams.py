@@ -1,6 +1,9 @@
 """Streams of touches for the tiny model, and what it must say of them."""
 
+from typing import Any
+
 import numpy as np
+import pytest
 
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.stream import NS_PER_S, Chunk
@@ -11,6 +14,7 @@ SPEC = small_spec()
 SAME_RATE = small_spec(rate_hz=NS_PER_S / PERIOD_NS)
 QUIET = 130  # samples before the first touch: more than a baseline holds
 SIGMA = 2e-3
+FACTS = ("onset_ns", "t_ns", "step", "final", "label", "prediction_set", "coverage")
 
 
 def signal(touches: list[tuple[int, int, float]], n: int, seed: int = 0) -> np.ndarray:
@@ -30,6 +34,14 @@ def push_all(classifier: Classifier, chunks: list[Chunk]) -> list[Classification
     return [decision for chunk in chunks for decision in classifier.push(chunk)]
 
 
+def same(a: list[Classification], b: list[Classification]) -> bool:
+    """Compare decisions bit by bit, but for how long the steps took."""
+    facts = [[tuple(getattr(d, f) for f in FACTS) for d in which] for which in (a, b)]
+    return facts[0] == facts[1] and all(
+        np.array_equal(x.probabilities, y.probabilities) for x, y in zip(a, b, strict=True)
+    )
+
+
 def expected_logits(values: np.ndarray, onset: int, step: int) -> np.ndarray:
     """What the tiny model says in a step (from 1) if it was fed right; onset indexes `values`.
 
@@ -41,3 +53,8 @@ def expected_logits(values: np.ndarray, onset: int, step: int) -> np.ndarray:
     deviation = window - baseline.mean()
     sigma = max(baseline.std(ddof=1), CARD.floor[0])
     return np.array([0, step, deviation.sum(), deviation[-1], sigma])
+
+
+def fed_logits(values: np.ndarray, onset: int, step: int, within: float = 2e-6) -> Any:
+    """Return `expected_logits` as a pytest.approx to compare with."""
+    return pytest.approx(expected_logits(values, onset, step), abs=within)

@@ -86,6 +86,10 @@ def plan(data: Path, tmp_path: Path) -> Path:
     return path
 
 
+def replace_in(plan: Path, old: str, new: str) -> None:
+    plan.write_text(plan.read_text().replace(old, new))
+
+
 def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
     assert shipped_grids() == ("wide24", "wide24-full")
     grid = read_grid("wide24")
@@ -146,7 +150,7 @@ def test_the_page_of_results_is_what_was_found() -> None:
     ],
 )
 def test_a_slip_in_a_grid_is_named(plan: Path, old: str, new: str, said: str) -> None:
-    plan.write_text(plan.read_text().replace(old, new))
+    replace_in(plan, old, new)
     with pytest.raises(ConfigError) as error:
         read_grid(plan)
     assert str(plan) in str(error.value)
@@ -155,16 +159,13 @@ def test_a_slip_in_a_grid_is_named(plan: Path, old: str, new: str, said: str) ->
 
 
 def test_a_grid_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError, match=r"no grid none\.toml: name a TOML file, or one of wide24"
-    ):
+    said = r"no grid none\.toml: name a TOML file, or one of wide24"
+    with pytest.raises(ConfigError, match=said):
         read_grid("none.toml")
 
 
-def test_a_grid_is_done_once_and_told(
-    plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    grid, folder = read_grid(plan), tmp_path / "out"
+def test_a_grid_is_done_once_and_told(plan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, folder = read_grid(plan), plan.parent / "out"
     names = [task.name for task in grid.tasks()]
     assert names == ["svm", *["gru", "random gru"] * 2, *["gru simclr image"] * 2]
 
@@ -182,25 +183,21 @@ def test_a_grid_is_done_once_and_told(
     run_grid(grid, folder, report=tell)
     assert [name for name, *_ in told] == names, "nothing twice, nothing left out"
     assert [(done, total) for _, done, total in told] == [(k, 7) for k in range(1, 8)]
-    assert (
-        kept.items() <= {p: p.stat().st_mtime_ns for p in (folder / "outcomes").iterdir()}.items()
-    )
+    after = {p: p.stat().st_mtime_ns for p in (folder / "outcomes").iterdir()}
+    assert kept.items() <= after.items()
     monkeypatch.setattr(pool, "Workbench", None)
     run_grid(grid, folder)  # nothing is left to do
 
     # Touches of other whiskers: a machine tells them apart at once.
     svm = read_outcome(grid, folder, grid.tasks()[0])
-    assert svm is not None
-    assert svm.right().tolist() == [True] * 16  # 8 objects, 2 sweeps of each
+    assert svm is not None and svm.right().tolist() == [True] * 16  # 8 objects, 2 sweeps of each
     found = gather(grid, folder)
     assert (found.objects, found.sweeps, found.classes) == (8, 16, 2)
     assert [row.name for row in found.rows] == ["svm", "gru", "gru simclr image"]
     assert [row.seeds for row in found.rows] == [1, 2, 2]
     gru = found.rows[1]
-    assert gru.top5 is not None
-    assert gru.top5.value == 1.0  # of two classes
-    assert gru.random is not None
-    assert gru.random == found.rows[2].random, "of one network"
+    assert gru.top5 is not None and gru.top5.value == 1.0  # of two classes
+    assert gru.random is not None and gru.random == found.rows[2].random, "of one network"
     assert gru.parameters > 1000
 
     write_results(found, folder)
@@ -221,8 +218,7 @@ def test_a_grid_is_done_once_and_told(
     assert [p.updates for p in outcome.growth] == [1, 2]
     assert outcome.chosen == max(outcome.growth, key=lambda p: p.score)
     second = read_outcome(grid, folder, msgspec.structs.replace(first, seed=1))
-    assert second is not None
-    assert second.chosen is not None
+    assert second is not None and second.chosen is not None
     assert (second.trials, second.growth) == ((), ()), "tuned by the first seed"
     assert second.chosen.updates == outcome.chosen.updates
 
@@ -231,10 +227,8 @@ def test_a_grid_is_done_once_and_told(
         run_grid(changed, folder)
 
 
-def test_a_network_that_diverges_is_an_outcome(
-    plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    grid, folder = read_grid(plan), tmp_path / "out"
+def test_a_network_that_diverges_is_an_outcome(plan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    grid, folder = read_grid(plan), plan.parent / "out"
     bench = begun(plan, folder)
 
     def diverge(*_: object, **__: object) -> Path:
@@ -257,14 +251,12 @@ def begun(plan: Path, folder: Path) -> Workbench:
     return Workbench(grid, folder)
 
 
-def test_a_training_of_other_settings_is_not_taken_for_one_of_these(
-    plan: Path, tmp_path: Path
-) -> None:
-    folder = tmp_path / "out"
+def test_a_training_of_other_settings_is_not_taken_for_one_of_these(plan: Path) -> None:
+    folder = plan.parent / "out"
     bench = begun(plan, folder)
     task = bench.grid.tasks()[1]
     bench.do(task)
-    plan.write_text(plan.read_text().replace("batch = 4", "batch = 3"))
+    replace_in(plan, "batch = 4", "batch = 3")
     with pytest.raises(ConfigError) as error:
         read_outcome(read_grid(plan), folder, task)
     outcome, runs = outcome_path(folder, task), folder / "runs" / task.slug
@@ -282,11 +274,7 @@ def test_a_training_of_other_settings_is_not_taken_for_one_of_these(
     ("before", "after", "said"),
     [
         ("batch = 4", "batch = 40", "a batch of 40 is more than the 16 sweeps"),
-        (
-            "clip_norm = 2",
-            "jitter = 200\n[self_supervised]\njitter = 200",
-            "jitter is 200 samples",
-        ),
+        ("clip_norm = 2", "jitter = 200\n[self_supervised]\njitter = 200", "jitter is 200 samples"),
         ("train = 2", "train = 1", 'pairs of "two-sweeps": no object has two sweeps'),
     ],
 )
@@ -321,28 +309,21 @@ def test_a_damaged_checkpoint_is_not_a_training_that_diverged(plan: Path, tmp_pa
     assert not outcome_path(tmp_path / "out", task).exists()
 
 
-def test_windows_of_the_test_begin_as_those_that_were_learnt_from(
-    plan: Path, tmp_path: Path
-) -> None:
-    bench = begun(plan, tmp_path / "out")
+def test_windows_of_the_test_begin_as_those_that_were_learnt_from(plan: Path) -> None:
+    bench = begun(plan, plan.parent / "out")
     config = bench.grid.config(bench.grid.tasks()[1], bench.data)
     heard, _ = bench._windows(config)
     set_out, _ = bench._windows(replace(config, window="sweep"))
     lead = bench.test.manifest.lead
-    np.testing.assert_array_equal(
-        set_out[0].samples[0, 0], bench.test.sweeps.values[0, lead : lead + 5]
-    )
+    first = bench.test.sweeps.values[0, lead : lead + 5]
+    np.testing.assert_array_equal(set_out[0].samples[0, 0], first)
     assert not np.array_equal(heard[0].samples, set_out[0].samples)
 
 
 def test_the_untrained_network_is_that_of_the_cell(plan: Path, tmp_path: Path) -> None:
-    plan.write_text(plan.read_text().replace("clip_norm = 2", 'preprocessing = "paper"'))
-    plan.write_text(
-        plan.read_text().replace(
-            'augmentation = "image"',
-            'augmentation = "image"\noptions = { preprocessing = "paper", optimizer = "lars" }',
-        )
-    )
+    replace_in(plan, "clip_norm = 2", 'preprocessing = "paper"')
+    options = 'options = { preprocessing = "paper", optimizer = "lars" }'
+    replace_in(plan, 'augmentation = "image"', f'augmentation = "image"\n{options}')
     grid = read_grid(plan)
     random = next(task for task in grid.tasks() if task.random)
     assert grid.config(random, Path()).preprocessing == "paper"
@@ -378,21 +359,10 @@ def test_a_full_disk_is_one_line_of_a_process_too(plan: Path, tmp_path: Path) ->
         run_grid(grid, folder, 2)
 
 
-def test_a_cell_begins_with_another_and_learns_from_fewer_objects(
-    plan: Path, tmp_path: Path
-) -> None:
-    plan.write_text(
-        plan.read_text().replace(
-            "[[question]]",
-            """[[cell]]
-encoder = "gru"
-begin = "gru simclr image"
-share = 0.5
-seeds = 1
-[[question]]""",
-        )
-    )
-    grid, folder = read_grid(plan), tmp_path / "out"
+def test_a_cell_begins_with_another_and_learns_from_fewer_objects(plan: Path) -> None:
+    cell = '[[cell]]\nencoder = "gru"\nbegin = "gru simclr image"\nshare = 0.5\nseeds = 1\n'
+    replace_in(plan, "[[question]]", f"{cell}[[question]]")
+    grid, folder = read_grid(plan), plan.parent / "out"
     name = "gru after simclr image of 0.5"
     assert [task.name for task in grid.tasks()].count(name) == 1, "one seed"
     (task,) = [task for task in grid.tasks() if task.name == name]
@@ -403,15 +373,13 @@ seeds = 1
     few = bench.splits_of(0.5)[0]
     assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
     assert bench.splits_of(1.0)[0] is bench.splits[0]
-    assert (
-        bench.do(task).failed == "'gru simclr image' diverged, and there is nothing to begin with"
-    )
+    said = "'gru simclr image' diverged, and there is nothing to begin with"
+    assert bench.do(task).failed == said
     (before,) = [t for t in grid.tasks() if t.slug in grid.needs(task)]
     assert not bench.do(before).failed
     shutil.rmtree(folder / "runs" / before.slug)  # its outcome was kept, its network was not
     done = bench.do(task)
-    assert not done.failed
-    assert done.chosen is not None
+    assert not done.failed and done.chosen is not None
     config = json.loads(next((folder / "runs" / task.slug).glob("*/config.json")).read_text())
     assert config["begin"].startswith(str(folder / "runs" / before.slug))
     assert "after simclr image of 0.5" in table(gather(grid, folder))
@@ -435,9 +403,8 @@ def test_what_only_its_scores_were_kept_of_is_trained_again(plan: Path, tmp_path
 def test_the_longest_training_is_not_longer_than_it_helps(
     plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    grid = msgspec.structs.replace(
-        read_grid(plan), growth=msgspec.convert({"first": 10, "most": 100}, Growth)
-    )
+    growth = msgspec.convert({"first": 10, "most": 100}, Growth)
+    grid = msgspec.structs.replace(read_grid(plan), growth=growth)
     scores = {10: 0.5, 20: 0.6, 40: 0.605, 80: 0.9}
     bench = object.__new__(Workbench)
     bench.grid = grid
@@ -514,6 +481,4 @@ def test_processes_share_the_work(plan: Path, tmp_path: Path) -> None:
     run_grid(grid, tmp_path / "one")
     for task in grid.tasks():  # who does it does not change what comes of it
         one, two = (read_outcome(grid, tmp_path / k, task) for k in ("one", "two"))
-        assert one is not None
-        assert two is not None
-        assert one.top1 == two.top1
+        assert one is not None and two is not None and one.top1 == two.top1

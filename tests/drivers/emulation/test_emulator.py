@@ -93,12 +93,18 @@ class Host:
         os.close(self.fd)
 
 
+def hear_all(device: Emulator) -> tuple[Emulator, Host]:
+    """Read all that a device sends."""
+    with device:
+        host = Host(device.endpoint.pty.path)
+        host.read_all(device)
+    return device, host
+
+
 def test_every_sample_comes_as_it_is_over_a_pty() -> None:
     values = np.frombuffer(np.random.default_rng(1).bytes(500 * 4 * 2 * 4), "<f4")
     values = np.where(np.isfinite(values), values, np.float32(0)).reshape(500, 4, 2)
-    with native(values=values) as device:  # all bytes, so also ^C, ^D, ^S, CR and LF
-        host = Host(device.endpoint.pty.path)
-        host.read_all(device)
+    device, host = hear_all(native(values=values))  # all bytes, so also ^C, ^D, ^S, CR and LF
     assert host.codec.spec == SPEC
     assert np.array_equal(host.values.view(np.uint32), values.view(np.uint32))
     assert host.count.tolist() == list(range(500))
@@ -138,11 +144,8 @@ DAMAGE = [
 
 
 def test_the_log_says_what_a_host_gets_sample_by_sample() -> None:
-    faults = FaultSchedule(DAMAGE, seed=5)
     values = signal(5000)
-    with native(values=values, faults=faults) as device:
-        host = Host(device.endpoint.pty.path)
-        host.read_all(device)
+    device, host = hear_all(native(values=values, faults=FaultSchedule(DAMAGE, seed=5)))
     log = device.log
     copies = np.bincount(host.count, minlength=5000)
     fate = log.fate
@@ -161,9 +164,7 @@ def test_the_log_says_what_a_host_gets_sample_by_sample() -> None:
 
 
 def test_counter_and_clock_begin_where_wanted_and_wrap() -> None:
-    with native(100, start_count=2**32 - 40, start_tick=2**32 - 60_000) as device:
-        host = Host(device.endpoint.pty.path)
-        host.read_all(device)
+    device, host = hear_all(native(100, start_count=2**32 - 40, start_tick=2**32 - 60_000))
     assert host.count.tolist() == [*range(2**32 - 40, 2**32), *range(60)]
     assert host.ticks[0] == 2**32 - 60_000 and host.ticks[60] == 0 and host.ticks[-1] == 39_000
     assert device.log.seq[-1] == 2**32 + 59, "not wrapped in the log"
@@ -176,9 +177,7 @@ def test_the_clock_drifts_jumps_and_restarts() -> None:
         Fault("sequence_reset", at_s=4.0),
         Fault("clock_jump", at_s=4.5, amount=-2),  # below zero: before the wrap
     ]
-    with native(5500, faults=FaultSchedule(faults), drift_ppm=-200) as device:
-        host = Host(device.endpoint.pty.path)
-        host.read_all(device)
+    _, host = hear_all(native(5500, faults=FaultSchedule(faults), drift_ppm=-200))
     t = host.ticks.astype(float)
     assert t[999] == pytest.approx(999_000 * (1 - 200e-6), abs=1.5)
     assert t[1000] - t[999] == pytest.approx(1000 - 250_000, abs=1.5)
@@ -475,13 +474,8 @@ def test_so_is_a_wrong_combination() -> None:
 
 def test_a_stream_of_known_length_stops_there() -> None:
     endless = ArraySource(SPEC, cut(signal(5000), 1000.0), live=True)
-    device = Emulator(
-        NativeSerial(NativeOptions()), endless, SerialEndpoint(), seconds=2.0,
-        faults=FaultSchedule([Fault("drop", rate=100)]),
-    )  # fmt: skip
-    with device:
-        host = Host(device.endpoint.pty.path)
-        host.read_all(device)
+    faults = FaultSchedule([Fault("drop", rate=100)])
+    device, _ = hear_all(native(source=endless, pace="realtime", seconds=2.0, faults=faults))
     assert device.log.sent == 2000
     assert device.log.counts[Fate.DROPPED] > 20
     assert (device.log.fate[1501:] == Fate.SENT).all()
@@ -507,9 +501,8 @@ def test_fakes_are_opened_by_their_url(fake_serial: Any, fake_can: Any) -> None:
     values = signal(300)
     serial_device = fake_serial(values, "native", spec=SPEC, pace="fast")
     slcan_device = fake_can(values, "native", spec=SPEC, pace="fast", options={"format": "float32"})
-    bus_device = fake_can(
-        values, spec=SPEC, pace="fast", bus="virtual:mine", options={"format": "float32"}
-    )
+    can_options = {"spec": SPEC, "pace": "fast", "options": {"format": "float32"}}
+    bus_device = fake_can(values, bus="virtual:mine", **can_options)
     for device in (serial_device, slcan_device, bus_device):
         with open_source(device.url) as source:
             assert source.spec == SPEC
