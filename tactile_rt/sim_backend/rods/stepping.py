@@ -48,7 +48,7 @@ STILL = 1e-9  # rad and rad/ms: a whisker at rest that nothing is near need not 
 
 
 class RodState(NamedTuple):
-    """What a whisker carries on from step to step, and how it rests.
+    """State of a whisker between steps, and its rest under its weight.
 
     Attributes:
         q, v: (degree of freedom,) angles and their rates, rad and rad/ms.

@@ -103,7 +103,7 @@ def test_weightless_arrays_stay_so() -> None:
 
 @pytest.mark.parametrize("profile", ["realtime", "dataset"])
 def test_a_shaken_whisker_answers_in_proportion(profile: str) -> None:
-    """What is near rest moves on by its linear answers; every step of it gives the same."""
+    """Near rest, whole samples by the linear answers give what single steps give."""
     mug, how = make_object("mug", 3), {"shake_g": 0.5, "shake_hz": 60.0, "distance_mm": 9.0}
     mouse = load_array("mouse")
     fast = SweepSimulation(mouse, mug, Sweep(**how), PROFILES[profile])
