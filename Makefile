@@ -2,6 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+define COMPILE
+@echo "Compiling the simulator, once on this machine: about half a minute"
+$(BIN)/python -c "from tactile_rt.sim_backend.source import compile_simulator as c; c()"
+endef
 # The exact releases that the tests run with.
 PINS := requirements/constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS)
@@ -42,7 +46,8 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 check: lint
-	$(PYTEST) $(PARALLEL) -m "not hardware"
+	$(PYTEST) $(PARALLEL) -m "not hardware and not alone"
+	$(PYTEST) -m alone
 	$(MAKE) wheel
 
 wheel: $(VENV)/.dev
@@ -74,11 +79,11 @@ clean:
 $(VENV)/.sim: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable '.[sim]'
-	@echo "Compiling the simulator, once on this machine: about half a minute"
-	$(BIN)/python -c "from tactile_rt.sim_backend.source import compile_simulator as c; c()"
+	$(COMPILE)
 	touch $@
 
 $(VENV)/.dev: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) --editable '.[sim,gym,train,view,dbc,import,publish,ros2,lerobot,test,docs,dev]'
+	$(COMPILE)
 	touch $@ $(VENV)/.sim

@@ -1,5 +1,6 @@
 """Whiskers let go, held and struck, beside fine steps and the laws of friction."""
 
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -42,6 +43,7 @@ def release(whisker: Whisker, profile: Profile, share: float) -> tuple[float, fl
     return float(error), float((side * found).min() / (side * truth).min())
 
 
+@cache
 def _swing(whisker: Whisker, profile: Profile, share: float) -> Floats:
     world = alone(whisker, profile)
     chain = world.rods[0].chain
@@ -98,15 +100,19 @@ def strike(whisker: Whisker, profile: Profile, speed: float, place: float) -> fl
     Returns:
         The error of the impulse on the base, relative, beside fine steps; 1: nothing is felt.
     """
+    found, truth = (_impulse(whisker, p, speed, place) for p in (profile, FINEST))
+    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+
+
+@cache
+def _impulse(whisker: Whisker, profile: Profile, speed: float, place: float) -> Floats:
     x = whisker.centreline(np.array([place * whisker.length]))[0, 0]
     low = whisker.centreline(np.linspace(0, whisker.length, 200))[:, 1].min()
     plate = Piece.of(trimesh.creation.box((20, PLATE_MM, 20)))
     samples = max(STRIKE_MS, round(8.0 / speed))
     way = np.array([x + 10, low - 2, 0.0]) + np.outer(np.arange(samples + 1), [0, speed, 0])
-    found, truth = (
-        alone(whisker, p, plate).advance(way)[0][:, 0, :3].sum(axis=0) for p in (profile, FINEST)
-    )
-    return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
+    force: Floats = alone(whisker, profile, plate).advance(way)[0][:, 0, :3]
+    return force.sum(axis=0)
 
 
 def slow_friction(whisker: Whisker, profile: Profile, speed: float) -> float:
@@ -123,6 +129,7 @@ def slow_friction(whisker: Whisker, profile: Profile, speed: float) -> float:
     return float(np.percentile(error, 95))
 
 
+@cache
 def _slid(whisker: Whisker, profile: Profile, speed: float) -> Floats:
     """(place, 3) force on the base at places along the way, N."""
     world = alone(whisker, profile, PEG)

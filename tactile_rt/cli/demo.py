@@ -209,7 +209,7 @@ class Demonstration:
 
         recording = Recording(DEMO)
         notes = recording.description.session
-        told = [notes[f"pass_{i}"].split() for i in range(len(notes))]
+        told = [note.split() for name, note in notes.items() if name.startswith("pass_")]
         passes = [RecordedPass(int(start), name, category) for start, name, category in told]
         chunks = list(recording)
         last = int(chunks[-1].t_ns[-1] - chunks[0].t_ns[0])

@@ -138,7 +138,8 @@ def describe(
     source: Source, url: str = "", session: Mapping[str, str] | None = None
 ) -> Description:
     """What a recording of this source is of; its UTC offset is that of now."""
-    about = Description(source.spec, utc_offset_ns(), url, session=dict(session or {}))
+    notes = {**getattr(source, "notes", {}), **(session or {})}
+    about = Description(source.spec, utc_offset_ns(), url, session=notes)
     device = device_of(source)
     if device is None:
         return about

@@ -40,7 +40,7 @@ from tactile_rt.sim_backend.sweep_simulation import (
     ringing,
 )
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
-from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
+from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, engine_version
 
 __all__ = [
     "CHUNK_SAMPLES",
@@ -243,6 +243,9 @@ class SimSource(PacedSource):
     Args:
         array: which array, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
+
+    Attributes:
+        notes: What recordings note: the version of the engine.
     """
 
     Options = SimOptions
@@ -260,6 +263,7 @@ class SimSource(PacedSource):
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._draw = _drawing(self._animals, options)
+        self.notes = {"engine": engine_version(PROFILES[options.profile])}
         self.passes: list[Pass] = []
         if line := ringing(self._animals, PROFILES[options.profile]):
             log.warning(line)

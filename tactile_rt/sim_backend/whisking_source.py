@@ -134,6 +134,7 @@ class WhiskingSource(PacedSource):
         self._sensor = Sensor(options, loads, options.seed)
         self._loads = loads
         self._drive = Drive(options.whisking)
+        self.notes = {"engine": "mujoco"}
         profile = PROFILES[options.profile]
         self._simulation: WhiskSimulation | None = WhiskSimulation(
             animal.whiskers,

@@ -40,6 +40,7 @@ __all__ = [
     "array_spec",
     "empty_world",
     "engine_of",
+    "engine_version",
     "quaternion",
     "read_base_loads",
     "set_damping",
@@ -98,6 +99,11 @@ PROFILES = {
 def engine_of(profile: Profile) -> str:
     """The engine that steps a sweep: MuJoCo where no compiler for `rods` is installed."""
     return profile.engine if find_spec("numba") is not None else "mujoco"
+
+
+def engine_version(profile: Profile) -> str:
+    """The version of the engine that steps a sweep, for sets and recordings; or ``mujoco``."""
+    return ENGINE if engine_of(profile) == "rods" else "mujoco"
 
 
 def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:

@@ -8,6 +8,7 @@ pytest.importorskip("trimesh")
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk, EndOfStream, SourceStats, concatenate
+from tactile_rt.recording.description import describe
 from tactile_rt.sim_backend import source as source_module
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
@@ -121,6 +122,12 @@ def test_all_categories_come_when_none_is_named() -> None:
     with fast() as source:
         assert source.read() is not None
         assert source.passes[0].category in CATEGORIES
+
+
+def test_a_recording_names_the_version_of_the_engine(
+    two_passes: tuple[SimSource, Chunk],
+) -> None:
+    assert describe(two_passes[0], session={"who": "Ada"}).session == {"engine": "2", "who": "Ada"}
 
 
 def test_its_url_takes_the_sensor_model() -> None:

@@ -37,7 +37,7 @@ from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
-from tactile_rt.sim_backend.world import ENGINE, PROFILES, SAMPLE_MS
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, engine_version
 
 __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
 
@@ -80,7 +80,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
         category_of=objects.category_of,
         versions={
             "tactile_rt": VERSION,
-            "engine": ENGINE,
+            "engine": engine_version(PROFILES[recipe.profile]),
             **{p: version(p) for p in packages},
             "whiskers": hashlib.sha256(morphology.encode()).hexdigest()[:16],
         },

@@ -1,7 +1,7 @@
 """An array and an object, stepped whisker by whisker."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -24,7 +24,7 @@ __all__ = ["Piece", "RodWorld"]
 
 Floats = NDArray[np.float64]
 
-WEIGHTLESS, NONE = np.zeros(3), np.zeros(0, np.int64)
+WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
 FEW_CORNERS = 64  # of so few it costs less to try them all
 
@@ -39,13 +39,14 @@ class Piece:
         corners: The (corner, 3) corners, mm, about the object's place.
         faces: The (face, 4) outward normals and offsets of the hull; none of a point or a line.
         rounding: The radius by which the hull is grown, mm.
-        beside: The corners to which an edge leads from each; empty: of few corners all are tried.
+        edges: The (2 * edge, 2) corners that an edge joins, both ways, in order; none: of few
+            corners all are tried.
     """
 
     corners: Floats
     faces: Floats
     rounding: float = 0.0
-    beside: Sequence[NDArray[np.int64]] = ()
+    edges: NDArray[np.int64] = field(default_factory=lambda: NO_EDGES)
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> "Piece":
@@ -56,13 +57,15 @@ class Piece:
         corners = np.array(mesh.vertices, dtype=np.float64)
         if len(corners) <= FEW_CORNERS:
             return cls(corners, faces)
-        hull = ConvexHull(corners)  # without corners that are none, or are there twice
-        number = np.full(len(corners), -1)
-        number[hull.vertices] = np.arange(len(hull.vertices))
-        edges = number[np.concatenate([hull.simplices[:, [i, i - 1]] for i in range(3)])]
-        edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
-        begins = np.searchsorted(edges[:, 0], np.arange(1, len(hull.vertices)))
-        return cls(corners[hull.vertices], faces, 0.0, np.split(edges[:, 1], begins))
+        triangles = np.asarray(mesh.faces)
+        if len(triangles) != 2 * len(corners) - 4:  # corners that are none, or are there twice
+            hull = ConvexHull(corners)
+            number = np.zeros(len(corners), np.int64)
+            number[hull.vertices] = np.arange(len(hull.vertices))
+            corners, triangles = corners[hull.vertices], number[hull.simplices]
+        edges, n = np.concatenate([triangles[:, [i, i - 1]] for i in range(3)]), len(corners)
+        both = np.sort(np.concatenate([edges @ (n, 1), edges @ (1, n)]))[::2]  # of two triangles
+        return cls(corners, faces, 0.0, np.stack(np.divmod(both, n), axis=1))
 
 
 class RodWorld:
@@ -140,8 +143,8 @@ class RodWorld:
                 np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
                 _begins([p.faces for p in pieces]),
                 np.array([p.rounding for p in pieces]),
-                np.concatenate([NONE, *(b for p in pieces for b in p.beside)]),
-                _begins([b for p in pieces for b in p.beside or [NONE] * len(p.corners)]),
+                np.concatenate([NO_EDGES, *(p.edges for p in pieces)])[:, 1].copy(),
+                np.cumsum(np.concatenate([[0], *map(_degrees, pieces)])),
             ),
             RodState(
                 self.angles,
@@ -264,6 +267,11 @@ def _stacked(each: Sequence[Any]) -> NDArray[Any]:
     if kept := [(0, 0)] * (np.ndim(each[0]) - 1):
         each = [np.pad(rows, (*kept, (0, wide - rows.shape[-1]))) for rows in each]
     return np.concatenate(each)
+
+
+def _degrees(piece: Piece) -> NDArray[np.int64]:
+    """The number of edges at each corner."""
+    return np.bincount(piece.edges[:, 0], minlength=len(piece.corners))
 
 
 def _begins(each: Sequence[Any]) -> NDArray[np.int64]:

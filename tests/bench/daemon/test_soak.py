@@ -28,6 +28,7 @@ MUST = ("unbalanced", "unexplained", "miscounted", "queues_unbalanced", "queues_
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_under_faults_every_sample_is_delivered_or_counted():
     result = soak(10.0, every_s=0.45, first_s=1.5)
     struck = {kind for played in result.played.values() for kind, _, _ in played.faults}

@@ -138,12 +138,12 @@ def test_a_body_of_many_corners_is_as_far_as_its_hull() -> None:
     """Uphill along its edges: the loads on a fine sphere are those when every corner is tried."""
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4.0)
     piece = Piece.of(ball)
-    assert len(piece.corners) > FEW_CORNERS and len(piece.beside) == len(piece.corners)
+    assert len(piece.corners) > FEW_CORNERS and len(piece.edges) == 2 * len(ball.edges_unique)
     root = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
     way = np.array([9.0, 5.0, 0.7]) + np.outer(np.linspace(0, 1, 121), [2.0, -2.5, 0.0])
     one, other = (
         RodWorld((flat("C2"),), root, (p,), 10, 4).advance(way)
-        for p in (piece, replace(piece, beside=()))
+        for p in (piece, replace(piece, edges=piece.edges[:0]))
     )
     assert one[1][:, 0, 0].any()
     np.testing.assert_allclose(one[0], other[0], atol=1e-9 * abs(other[0]).max())
