@@ -41,7 +41,7 @@ class Measured:
         for name in names:
             assert name in self.err, self.err
         spent = self.cpu_s
-        if spent >= cpu_s:  # machines differ, and whatever shares a core makes all on it take longer
+        if spent >= cpu_s:  # machines differ, and what shares a core slows all on it
             spent = min(measured(*self.arguments).cpu_s for _ in range(3)) - _start_cpu_s()
         assert spent < cpu_s, self
         assert self.peak_mb < peak_mb, self
