@@ -132,7 +132,8 @@ def _thinned(piece: trimesh.Trimesh) -> trimesh.Trimesh:
     z, turn = np.linspace(-1, 1, SIDES), np.pi * (3 - np.sqrt(5)) * np.arange(SIDES)
     sides = np.stack([*(np.sqrt(1 - z**2) * (np.cos(turn), np.sin(turn))), z], axis=1)
     furthest = np.unique(np.argmax(sides @ piece.vertices.T, axis=1))
-    return trimesh.Trimesh(piece.vertices[furthest]).convex_hull
+    hull: trimesh.Trimesh = trimesh.Trimesh(piece.vertices[furthest]).convex_hull
+    return hull
 
 
 def _entry(points: Floats, radii: Floats, pieces: Sequence[trimesh.Trimesh]) -> Floats:
