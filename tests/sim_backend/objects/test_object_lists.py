@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import threading
 import zipfile
+from collections import Counter
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -213,8 +214,19 @@ def test_objects_come_out_of_an_archive_of_an_unpacked_package(shapes, tmp_path:
     assert why.endswith("and say --clones FOLDER")
 
 
+def test_the_list_of_shapes_has_enough_of_every_shape() -> None:
+    things = read_list("real2")
+    first = [thing.files[0] for thing in things]
+    number = Counter(file.category for file in first)
+    assert len(number) == 13 and number.pop("other") == 600
+    assert min(number.values()) >= 60 and max(number.values()) == 150
+    assert 600 < 0.3 * len(things)
+    assert len({file.maker for file in first}) == 8 and all(file.kind for file in first)
+    assert all(file.attribution for file in first if file.licence.startswith("CC-BY"))
+
+
 def test_the_list_that_ships_has_enough_of_enough_kinds() -> None:
-    assert shipped_lists() == ("everyday", "real")
+    assert shipped_lists() == ("everyday", "real", "real2")
     shapes: dict[str, set[str]] = {}
     for thing in read_list("real"):
         first = thing.files[0]
