@@ -117,7 +117,7 @@ def way_to_contact(
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     fractions = [np.linspace(0, w.length, len(n)) for w, n in zip(whiskers, lines, strict=True)]
     radii = np.concatenate([w.radius(s) for w, s in zip(whiskers, fractions, strict=True)])
-    pieces = [_thinned(piece) for piece in pieces]
+    pieces = [_thin(piece) for piece in pieces]
     touching = _entry(points, radii + TOUCH_MM, pieces)
     near = _entry(points, radii + PASSED_BY_MM, pieces)
     met = np.zeros(len(lines), dtype=np.bool_)
@@ -125,8 +125,8 @@ def way_to_contact(
     return float(touching.min()), met
 
 
-def _thinned(piece: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the hull of a piece's furthest corners to all sides, within 0.3 % of its size."""
+def _thin(piece: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Thin out the corners of a piece that has many, within 0.3 % of its size."""
     if len(piece.vertices) <= SIDES:
         return piece
     z, turn = np.linspace(-1, 1, SIDES), np.pi * (3 - np.sqrt(5)) * np.arange(SIDES)
