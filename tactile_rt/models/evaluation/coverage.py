@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, fitting
 from tactile_rt.classifier.model_card import ModelCard, decided
-from tactile_rt.classifier.model_file import load_model
+from tactile_rt.classifier.model_file import file_outputs, load_model
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
@@ -17,7 +17,14 @@ from tactile_rt.models.evaluation.measures import Floats, Interval
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-__all__ = ["Coverage", "measure_coverage", "named_faults", "score_known"]
+__all__ = [
+    "Coverage",
+    "NameCoverage",
+    "measure_coverage",
+    "measure_names",
+    "named_faults",
+    "score_known",
+]
 
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 
@@ -40,6 +47,80 @@ class Coverage:
     size: Interval
     unknown: Interval
     faulty: Interval
+
+
+@dataclass(frozen=True)
+class NameCoverage:
+    """Prediction sets of kinds on a test, of things of known kinds.
+
+    Attributes:
+        nominal: The coverage that the model file tells, 0 to 1.
+        covered: The share of the sweeps of which the true kind was in the set of its class at every
+            step.
+        of_class: The same of each class, by its name.
+        where_right: The same of the sweeps of which the class is right at the last step.
+        top1: The share of which the true kind is the most probable of its class at the last step.
+        size: The mean number of kinds in the set of the last step.
+        kinds: The mean number of kinds of the classes.
+    """
+
+    nominal: float
+    covered: Interval
+    of_class: dict[str, Interval]
+    where_right: Interval
+    top1: Interval
+    size: Interval
+    kinds: float
+
+
+def measure_names(
+    path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
+) -> NameCoverage | None:
+    """Measure prediction sets of kinds; None of a model, or a test, without.
+
+    Args:
+        test: the sweeps, labelled by the model's classes; sweeps without a contact are left out.
+    """
+    session, card = load_model(path)
+    fitted = {name: fitting(own, disturbance.noise) for name, own in card.names.items()}
+    rules = {name: rule for name, rule in fitted.items() if rule}
+
+    def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
+        out = file_outputs(session, card, samples, offset, sigma)
+        return np.concatenate([out["logits"][..., : len(card.classes)], out["names"]], axis=-1)
+
+    if not rules or (test.kinds(card.kinds) < 0).all():
+        return None
+    cut = measures.cut_windows(test, disturbance=disturbance)
+    answers, found = measures.run_over(cut, run)
+    names = answers[..., len(card.classes) :]
+    right = answers[:, -1, : len(card.classes)].argmax(axis=1) == test.sweeps.labels
+    taken, rows = [], []
+    for name, at, posteriors, kinds in measures.split_by_class(
+        names, found, test.kinds(card.kinds), card.kinds
+    ):
+        for k in np.flatnonzero(found[at]) if name in rules else ():
+            steps = enumerate(posteriors[k], start=1)
+            sets = [rules[name].prediction_set(p, step) for step, p in steps]
+            inside = all(kinds[k] in one for one in sets)
+            taken.append(at[k])
+            rows.append((inside, sets[-1][0] == kinds[k], len(sets[-1]), len(card.kinds[name])))
+    if not taken:
+        return None
+    (inside, first, size, of), at = np.array(rows, dtype=float).T, np.array(taken)
+    objects, labels, sure = test.sweeps.objects[at], test.sweeps.labels[at], right[at]
+    return NameCoverage(
+        max(rule.coverage for rule in rules.values()),
+        measures.accuracy(inside, objects),
+        {
+            card.classes[k]: measures.accuracy(inside[labels == k], objects[labels == k])
+            for k in np.unique(labels).tolist()
+        },
+        measures.accuracy(inside[sure], objects[sure]) if sure.any() else NOTHING,
+        measures.accuracy(first, objects),
+        measures.bootstrap(lambda at: float(size[at].mean()), objects),
+        float(of.mean()),
+    )
 
 
 def measure_coverage(

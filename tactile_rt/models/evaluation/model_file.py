@@ -18,7 +18,12 @@ from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults, score_known
+from tactile_rt.models.evaluation.coverage import (
+    measure_coverage,
+    measure_names,
+    named_faults,
+    score_known,
+)
 from tactile_rt.models.evaluation.measures import Floats, Labels, Names
 from tactile_rt.models.evaluation.records import Record, record_share
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
@@ -76,6 +81,12 @@ def evaluate_model(
 
     records = [
         top("top-1", clean[:, -1]),
+        record_share(
+            "top-1, macro",
+            measures.macro_accuracy(measures.hits(clean[:, -1], labels), labels, objects),
+            "",
+            f"the mean over classes; {sample}",
+        ),
         top("top-5", clean[:, -1], top=5),
         top("top-1 at step 14 of 22", clean[:, 13]),
     ]
@@ -116,6 +127,7 @@ def evaluate_model(
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
         records.append(_measure_open_set(model, unknown, test))
     records += _measure_coverage(model, test, unknown, sample)
+    records += _measure_names(model, test, sample)
     if svm:
         right = measures.hits(clean[:, -1], labels)
         records += _compare_svm(data, card, test, right)
@@ -228,6 +240,27 @@ def _measure_coverage(
         records.append(record_share("unknown things called unknown", found.unknown, "", how))
     for name, share in named_faults(model, test):
         records.append(record_share(f"{name}, named as a fault", share, "", sample))
+    return records
+
+
+def _measure_names(model: Path, test: SweepSet, sample: str) -> list[Record]:
+    records = []
+    for noise, when in ((0.0, ""), (1.0, " at rated noise")):
+        found = measure_names(model, test, Disturbance(noise=noise))
+        if found is None:
+            return []
+        how = f"nominal: {100 * found.nominal:g} %; of kinds that it knows; {sample}"
+        worst = min(found.of_class, key=lambda name: found.of_class[name].value)
+        for name, share, of in (
+            ("kind, top-1 within the true class", found.top1, how),
+            ("coverage of the names", found.covered, how),
+            ("coverage of the names, lowest of a class", found.of_class[worst], f"{worst}; {how}"),
+            ("coverage of the names where the class is right", found.where_right, how),
+        ):
+            records.append(record_share(f"{name}{when}", share, "", of))
+        beside = f"of {found.kinds:.1f} kinds of the class"
+        name = f"models.names at the last step{when}"
+        records.append(Record(name, found.size.value, "", "", beside, sample))
     return records
 
 

@@ -10,6 +10,7 @@ A list is a CSV file with a row for every mesh file:
     scale                 metres in a unit of the file; empty: not known
     shape                 the same for variants, mirror images and copies of one thing, which stay
                           on one side of a split; empty: its own
+    kind                  what it is called within its category, such as box; empty: not known
 
 `get_objects` puts them into a folder as `object_sets` reads it, z up, with an `objects.csv` that
 says where each is from. No mesh comes with this package.
@@ -60,6 +61,7 @@ class ListedFile(msgspec.Struct, frozen=True):
     up: Annotated[str, msgspec.Meta(pattern="^[yz]$")] = "z"
     scale: str = ""
     shape: str = ""
+    kind: str = ""
 
 
 @dataclass(frozen=True)
@@ -211,5 +213,6 @@ def _write_table(objects: Sequence[ListedObject], folder: Path) -> None:
     for thing in objects:
         file = thing.files[0]
         shape = file.shape or file.name
-        table.writerow((file.category, file.name, shape, file.repository, file.licence))
+        origin = shape, file.repository, file.licence, file.kind
+        table.writerow((file.category, file.name, *origin))
     write_whole(folder / FOLDER_TABLE, lambda out: out.write(text.getvalue().encode()))

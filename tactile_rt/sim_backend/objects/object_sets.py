@@ -43,11 +43,13 @@ class Origin(msgspec.Struct, frozen=True):
         shape: The same for objects of a category that are variants, mirror images or copies of one
             thing; empty: no other is like it.
         licence: The SPDX name of the licence that it comes under.
+        kind: What it is called within its category, such as box; empty: not known.
     """
 
     shape: str = ""
     source: str = ""
     licence: str = ""
+    kind: str = ""
 
 
 class _Row(Origin, frozen=True, kw_only=True):
