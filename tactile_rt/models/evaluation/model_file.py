@@ -19,13 +19,14 @@ from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.coverage import (
+    NAMES_LEFT,
     measure_coverage,
     measure_names,
     named_faults,
     score_known,
 )
 from tactile_rt.models.evaluation.measures import Floats, Labels, Names
-from tactile_rt.models.evaluation.records import Record, record_share
+from tactile_rt.models.evaluation.records import Record, record_count, record_share
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.sets.manifest import WITHHELD
@@ -223,10 +224,8 @@ def _measure_coverage(
             how = f"nominal: {100 * found.nominal:g} %; {sample}"
             name = f"coverage of the prediction sets{when}"
             records.append(record_share(name, found.covered, "", how))
-            size = found.size
-            interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
-            name = f"models.prediction set at the last step{when}"
-            records.append(Record(name, size.value, "", "", interval, sample))
+            name = f"prediction set at the last step{when}"
+            records.append(record_count(name, found.size, sample))
         if UNKNOWN in refusals:
             records.append(
                 record_share(f"known things called unknown{when}", found.unknown, "", sample)
@@ -246,21 +245,11 @@ def _measure_coverage(
 def _measure_names(model: Path, test: SweepSet, sample: str) -> list[Record]:
     records = []
     for noise, when in ((0.0, ""), (1.0, " at rated noise")):
-        found = measure_names(model, test, Disturbance(noise=noise))
-        if found is None:
-            return []
-        how = f"nominal: {100 * found.nominal:g} %; of kinds that it knows; {sample}"
-        worst = min(found.of_class, key=lambda name: found.of_class[name].value)
-        for name, share, of in (
-            ("kind, top-1 within the true class", found.top1, how),
-            ("coverage of the names", found.covered, how),
-            ("coverage of the names, lowest of a class", found.of_class[worst], f"{worst}; {how}"),
-            ("coverage of the names where the class is right", found.where_right, how),
-        ):
-            records.append(record_share(f"{name}{when}", share, "", of))
-        beside = f"of {found.kinds:.1f} kinds of the class"
-        name = f"models.names at the last step{when}"
-        records.append(Record(name, found.size.value, "", "", beside, sample))
+        for name, found in measure_names(model, test, Disturbance(noise=noise)):
+            if name == NAMES_LEFT:
+                records.append(record_count(f"{name}{when}", found, sample))
+            else:
+                records.append(record_share(f"{name}{when}", found, "", sample))
     return records
 
 

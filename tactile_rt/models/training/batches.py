@@ -206,9 +206,11 @@ class TrainingBatches:
         samples = self._there(windows(values, start, data.timing))
         samples -= self._there(rest)[:, None, None]
         samples *= self._there(gain * alive)
-        labels, sound = self._spoilt(samples, data.sweeps.labels[at], rng)
+        told = data.sweeps.labels[at]
+        told = np.where(told < 0, len(data.manifest.categories), told)  # the first refusal: unknown
+        labels = self._spoilt(samples, told, rng)
         if self._related is not None:
-            related = np.where(sound[:, None], self._related[at], -1)
+            related = np.where((labels == told)[:, None], self._related[at], -1)
             labels = np.concatenate([labels[:, None], related], axis=1)
         if faults.offset or faults.drift:
             self._wander(samples, rng, severity)
@@ -239,15 +241,10 @@ class TrainingBatches:
 
     def _spoilt(
         self, samples: Tensor, labels: NDArray[np.int64], rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Make some of the samples implausible, in place.
-
-        Returns:
-            (n,) the labels that all then have, and whether each is as it was.
-        """
-        sound = np.ones(len(labels), dtype=np.bool_)
+    ) -> NDArray[np.int64]:
+        """Make some of the samples implausible, in place; (n,) the labels that all then have."""
         spec, first = self._data.manifest.spec, len(self._data.manifest.categories)
-        labels = np.where(labels < 0, first, labels)  # unknown is the first refusal
+        labels = labels.copy()
         names = [name for name in self._refusals if name in IMPLAUSIBLE]
         if names:
             bad = rng.random(len(samples)) < self._faults.implausible
@@ -257,8 +254,7 @@ class TrainingBatches:
                 spoilt = IMPLAUSIBLE[name](samples[at].cpu().numpy(), spec, rng)
                 samples[at] = self._there(spoilt)
                 labels[at] = first + self._refusals.index(name)
-            sound = ~bad
-        return labels, sound
+        return labels
 
     def _wander(self, samples: Tensor, rng: np.random.Generator, severity: float) -> None:
         """Add, in place, what has come to the readings since their baseline."""
