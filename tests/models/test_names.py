@@ -24,6 +24,8 @@ from tactile_rt.models.training.loop import train
 from tactile_rt.models.training.objectives import build_objective, identity_loss
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.splits import join_manifests
+from tactile_rt.teaching.class_incremental import extend_card, extend_graph, fit_new_classes
+from tactile_rt.teaching.model import write_checked
 from tests.helpers.tiny_model import write_model
 from tests.helpers.tiny_sweeps import write_tiny_set
 
@@ -277,3 +279,17 @@ def test_a_network_begins_with_the_kinds_that_another_knew(data, trained, tmp_pa
 def test_damaged_kinds_are_refused(tmp_path, change, said):
     with pytest.raises(ModelError, match=said):
         load_model(write_model(tmp_path / "model.onnx", **change))
+
+
+def test_a_class_taught_beside_leaves_kinds_as_they_are(exported, tmp_path):
+    _, card = load_model(exported)
+    features = np.random.default_rng(0).normal(size=(4, card.embedding + len(card.labels)))
+    classes = fit_new_classes(card, features, ["ring"] * 4)
+    proto = extend_graph(exported.read_bytes(), card, classes)
+    taught = write_checked(tmp_path / "taught.onnx", proto, extend_card(card, classes))
+    session, again = load_model(tmp_path / "taught.onnx")
+    assert taught.labels[3] == "ring" and again.kinds == KINDS and again.names == card.names
+    samples = np.zeros((1, card.steps, card.substeps, *card.array.shape), np.float32)
+    loads = samples, samples[:, 0, 0], samples[:, 0, 0] + np.float32(1e-6)
+    before = file_outputs(*load_model(exported), *loads)["names"]
+    assert np.allclose(file_outputs(session, again, *loads)["names"], before, atol=1e-5)
