@@ -123,6 +123,8 @@ class DecisionMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
     age_ms: float64
     late: bool
     json: str
+    names: sequence[str]
+    names_coverage: float64
 
 
 @dataclass

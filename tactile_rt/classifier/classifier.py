@@ -33,7 +33,7 @@ from tactile_rt.classifier.decision_rules import (
     PredictionSetRule,
     fitting,
 )
-from tactile_rt.classifier.model_card import decided, rated_noise
+from tactile_rt.classifier.model_card import decided, kind_columns, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.skips import CatchUp, Skip, Skips
@@ -66,9 +66,9 @@ class Classification:
             longer contact are not in it.
         final: Whether this decision is the last one of its window; an episode that a silence of
             the stream cuts short has no final decision.
-        label: The decision: the name of the most probable class, or a refusal to name one:
-            "unknown" for an object of no class that the model knows, or what is wrong with the
-            loads, see `ModelCard.refusals`.
+        label: The decision: the name of the most probable class, which is a shape where the model
+            tells kinds apart within it; or a refusal to name one: "unknown" for an object of no
+            class that the model knows, or what is wrong with the loads, see `ModelCard.refusals`.
         labels: (class,) The names of all classes and then of the refusals, in the order of
             `probabilities`.
         probabilities: (class,) The posterior probability of each of them, float32.
@@ -79,8 +79,13 @@ class Classification:
         coverage: The share of touches of known kinds of which the true class is in the prediction
             set of every step; None: there is no such set.
         late: Whether more work had gathered than the deadline allows.
-        embedding: (unit,) What the network's last layer read in the step, float32; None unless the
-            classifier was asked for it.
+        embedding: (unit,) What the network's last layer read in the step, or, of a model that was
+            trained to tell objects apart, where the touch lies, of length 1, float32; None unless
+            the classifier was asked for it.
+        names: The kinds of the label's class that are still possible, the most probable first:
+            box, crate; empty where the class has none or there is no rule, as `prediction_set`.
+        names_coverage: The share of touches of things of that class of which the true kind is among
+            the names of every step; None: there are no names.
     """
 
     onset_ns: int
@@ -95,6 +100,8 @@ class Classification:
     coverage: float | None = None
     late: bool = False
     embedding: Floats | None = None
+    names: tuple[str, ...] = ()
+    names_coverage: float | None = None
 
     @property
     def probability(self) -> float:
@@ -226,6 +233,8 @@ class Classifier:
         self._next_seq = 0
         self._rated = rated_noise(self.card)
         self._set_rule: PredictionSetRule | None = None  # of the episode
+        self._columns = kind_columns(self.card.kinds)
+        self._name_rules: dict[str, PredictionSetRule | None] = {}  # likewise, by class
 
     @property
     def deciding(self) -> bool:
@@ -293,7 +302,7 @@ class Classifier:
             self._begin(t_ns)
         elif before and self._sliding and self.detector.contact:
             self._begin(t_ns)  # a window within a contact, as others of this mode
-            self._set_rule = None
+            self._set_rule, self._name_rules = None, {}
         if self._decided and not self.detector.contact:
             self._onset_ns = None  # released: the next contact is a new episode
         if self._onset_ns is None or (self._decided and not self._sliding):
@@ -326,6 +335,7 @@ class Classifier:
         known = self._sigma[self.detector.has_baseline] / self._rated
         noise = float(np.median(known)) if known.size else np.inf
         self._set_rule = fitting(self.card.candidates, noise)
+        self._name_rules = {k: fitting(rules, noise) for k, rules in self.card.names.items()}
 
     def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
         """Take a step with the samples gathered; the decision that it gives, if any."""
@@ -359,6 +369,9 @@ class Classifier:
         # it was fitted on windows that begin where the contact does
         rule = None if self._decided else self._set_rule
         left = rule.prediction_set(probabilities[: len(self.card.classes)], step) if rule else []
+        label = self.card.labels[best]
+        name_rule = None if self._decided else self._name_rules.get(label)
+        names = self._names_left(name_rule, label, lane, step) if name_rule else ()
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
             self.stats.withheld += 1
@@ -368,7 +381,7 @@ class Classifier:
             t_ns=t_ns,
             step=step,
             final=final,
-            label=self.card.labels[best],
+            label=label,
             labels=self.card.labels,
             probabilities=probabilities,
             latency_s=latency,
@@ -376,7 +389,17 @@ class Classifier:
             coverage=rule.coverage if rule else None,
             late=late,
             embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
+            names=names,
+            names_coverage=name_rule.coverage if name_rule else None,
         )
+
+    def _names_left(
+        self, rule: PredictionSetRule, label: str, lane: int, step: int
+    ) -> tuple[str, ...]:
+        logits = self._stepper.names[lane, self._columns[label]]
+        probabilities = np.exp(logits - logits.max())
+        left = rule.prediction_set(probabilities / probabilities.sum(), step)
+        return tuple(self.card.kinds[label][k] for k in left)
 
     def _posterior(self, logits: Floats) -> Floats | None:
         probabilities: Floats = logits / self.card.temperature

@@ -5,7 +5,9 @@ reader would misread a file.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -35,6 +37,7 @@ __all__ = [
     "decided",
     "element_order",
     "fit_source",
+    "kind_columns",
     "one_line",
     "parse_card",
     "rated_noise",
@@ -122,6 +125,9 @@ class ModelCard(msgspec.Struct, frozen=True):
         sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
         unknown: The rule by which an object is of no known class; None if there is none.
         candidates: The rules of prediction sets, each for another noise or coverage.
+        kinds: The kinds that the model tells apart within a class, by the names of the classes that
+            have some; in this order, and theirs, they are those of the output ``names``.
+        names: The rules of prediction sets of these kinds, by the names of the classes.
         refusals: The last of the labels, if any: those that name no class, but say that the object
             is unknown, or what is wrong with the loads.
         embeddings: The places of touches of the known classes, so that others can be told from them
@@ -154,6 +160,8 @@ class ModelCard(msgspec.Struct, frozen=True):
     refusals: tuple[str, ...] = ()
     unknown: OpenSetRule | None = None
     candidates: tuple[PredictionSetRule, ...] = ()
+    kinds: dict[str, tuple[str, ...]] = {}
+    names: dict[str, tuple[PredictionSetRule, ...]] = {}
     embeddings: EmbeddingStatistics | None = None
     license: str = ""
 
@@ -166,6 +174,12 @@ class ModelCard(msgspec.Struct, frozen=True):
     def array(self) -> ArraySpec:
         """The array that the model was trained on."""
         return ArraySpec.from_json(self.spec)
+
+
+def kind_columns(kinds: Mapping[str, Sequence[str]]) -> dict[str, slice]:
+    """Find the columns of the output ``names`` that belong to each class."""
+    ends = list(accumulate(map(len, kinds.values()), initial=0))
+    return {name: slice(*ends[k : k + 2]) for k, name in enumerate(kinds)}
 
 
 def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.intp]:
@@ -287,7 +301,16 @@ def parse_card(path: Path, text: str) -> ModelCard:
         raise damaged(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
     if card.embedding < 1:
         raise damaged(f"an embedding of {card.embedding} units")
+    for name, kinds in card.kinds.items():
+        if name not in card.classes or not kinds or len(set(kinds)) != len(kinds):
+            raise damaged(f"kinds of {name[:MAX_NAME]!r}: it is no class, or they repeat")
+        if not all(map(named, kinds)):
+            raise damaged(f"kinds must be 1 to {MAX_NAME} printable characters")
+    if not card.names.keys() <= card.kinds.keys():
+        raise damaged("names have rules of a class without kinds")
     rules = {f"candidates[{i}]": rule for i, rule in enumerate(card.candidates)}
+    for name, own in card.names.items():
+        rules |= {f"names.{name[:MAX_NAME]}[{i}]": rule for i, rule in enumerate(own)}
     for what, rule in {"unknown": card.unknown, **rules}.items():
         if rule is not None and (wrong := rule.fault(card.steps)):
             raise damaged(f"{what}.{wrong}")

@@ -8,12 +8,14 @@ Inputs of the graph, one step of a stream, for a batch of independent streams:
     <state>  every tensor of `ModelCard.state`, all zeros when an episode begins
 
 Outputs: ``logits (batch, class)``, ``embedding (batch, unit)`` (what the network's last linear
-layer reads in this step) and for every state tensor ``<name>_next``, its next value. Units,
+layer reads in this step, or, where it was trained to tell objects apart, a vector of length 1 of
+all steps so far), ``names (batch, name)`` of models with `ModelCard.kinds` (logits, of which those
+of one class are a choice) and for every state tensor ``<name>_next``, its next value. Units,
 clipping, scaling and the layout on the grid are inside the graph, where a sample that is no number,
 or infinite, is no load and leaves nothing in the state.
 
 A file of kind "window" takes a whole episode instead: ``samples (batch, step, sub-step, element,
-channel)``, no state, and gives ``logits`` and ``embedding`` with a step axis after the batch's.
+channel)``, no state, and gives the other outputs with a step axis after the batch's.
 """
 
 import hashlib
@@ -51,6 +53,7 @@ __all__ = [
     "fit_source",
     "hash_of",
     "load_model",
+    "output_sizes",
     "probe_logits",
     "read_model",
     "shipped_model",
@@ -116,7 +119,7 @@ def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Content
     named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
     if wrong := sorted(named ^ set(contents.inputs)):
         raise _disagree(path, wrong)
-    for name in ("logits", "embedding", *(f"{s.name}_next" for s in card.state)):
+    for name in (*output_sizes(card), *(f"{s.name}_next" for s in card.state)):
         if name not in contents.outputs:
             raise ModelError(f"{path}: no output `{one_line(name)}`, which its metadata promises")
     return card, contents, data
@@ -207,10 +210,10 @@ def check_graph(
     batches = {shape[0] for shape, _ in inputs.values()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
-    sizes = {"logits": (len(card.labels), "classes"), "embedding": (card.embedding, "units")}
-    for name, (size, what) in sizes.items():
+    for name, size in output_sizes(card).items():
         shape, kind = outputs.get(name, ((), ""))
         if shape[-1:] != (size,) or len(shape) != 2 + window or kind != "tensor(float)":
+            what = {"logits": "classes", "embedding": "units", "names": "kinds"}[name]
             raise ModelError(f"{path}: no output `{name}` of {size} {what}")
     for state in card.state:
         shape, kind = outputs.get(f"{state.name}_next", ((), ""))
@@ -219,6 +222,13 @@ def check_graph(
         same = all(a == b or not isinstance(a, int) for a, b in axes)
         if not same or len(shape) != 1 + len(state.shape) or kind != _onnx_type(state.dtype):
             raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
+
+
+def output_sizes(card: ModelCard) -> dict[str, int]:
+    """List the outputs that are no state, and how many numbers each has."""
+    sizes = {"logits": len(card.labels), "embedding": card.embedding}
+    names = sum(map(len, card.kinds.values()))
+    return {**sizes, "names": names} if names else sizes
 
 
 def _disagree(path: Path, wrong: Sequence[str]) -> ModelError:
@@ -280,9 +290,10 @@ def file_outputs(
         offset, sigma: (batch, element, channel), SI.
 
     Returns:
-        ``logits`` (batch, step, class) and ``embedding`` (batch, step, unit).
+        ``logits`` (batch, step, class), ``embedding`` (batch, step, unit) and, of a model with
+            kinds, ``names`` (batch, step, name).
     """
-    wanted = ["logits", "embedding"]
+    wanted = list(output_sizes(card))
     feed: dict[str, NDArray[Any]] = {"offset": offset, "sigma": sigma}
     if card.kind == "window":
         windows = session.run(wanted, {"samples": samples, **feed})

@@ -13,6 +13,7 @@ import onnxruntime as ort
 from numpy.typing import DTypeLike, NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.classifier.model_file import output_sizes
 from tactile_rt.classifier.runtime import PROVIDERS, FlushDenormals, device_of
 from tactile_rt.core.errors import ConfigError
 
@@ -51,6 +52,7 @@ class Stepper:
     Attributes:
         samples: (lane, sub-step, element, channel) SI: write the step's input here.
         embedding: (lane, unit) The embedding of the last step, which the next one overwrites.
+        names: (lane, name) The logits of kinds, likewise; of a model without, none.
 
     Raises:
         ConfigError: the graph's batch is fixed to another number than `lanes`.
@@ -72,8 +74,10 @@ class Stepper:
         self._samples = Tensor((lanes, card.substeps, elements, channels), np.float32, device)
         self._offset = Tensor(shape, np.float32, device)
         self._sigma = Tensor(shape, np.float32, device)
-        self._logits = Tensor((lanes, len(card.labels)), np.float32, "cpu")
-        self._embedding = Tensor((lanes, card.embedding), np.float32, "cpu")
+        self._outputs = {
+            name: Tensor((lanes, size), np.float32, "cpu")
+            for name, size in output_sizes(card).items()
+        }
         first = {s.name: Tensor((lanes, *s.shape), s.dtype, device) for s in card.state}
         second = {
             s.name: first[s.name]
@@ -83,7 +87,8 @@ class Stepper:
         }
         self._states = (first, second)
         self.samples = self._samples.array
-        self.embedding = self._embedding.array
+        self.embedding = self._outputs["embedding"].array
+        self.names = self._outputs["names"].array if card.kinds else self.embedding[:, :0]
         self._steps = tuple(
             self._bind(self._states[now], self._states[1 - now]) for now in range(2)
         )
@@ -115,7 +120,7 @@ class Stepper:
         with self._flush:
             self._session.run_with_iobinding(self._steps[self._now])
         self._now = 1 - self._now
-        logits: NDArray[np.float32] = self._logits.array
+        logits: NDArray[np.float32] = self._outputs["logits"].array
         return logits
 
     def _bind(self, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Any:
@@ -123,8 +128,7 @@ class Stepper:
         inputs = {
             "samples": self._samples, "offset": self._offset, "sigma": self._sigma, **before,
         }  # fmt: skip
-        outputs = {"logits": self._logits, "embedding": self._embedding}
-        outputs |= {f"{k}_next": v for k, v in after.items()}
+        outputs = {**self._outputs, **{f"{k}_next": v for k, v in after.items()}}
         binding = self._session.io_binding()
         for name, tensor in inputs.items():
             binding.bind_ortvalue_input(name, tensor.value)

@@ -61,6 +61,8 @@ def show(file: File, json: Json = None) -> None:
         "temperature": f"{card.temperature:.4g}",
         "unknown": _unknown(card.unknown),
         "prediction sets": "\n".join(map(_describe_set, card.candidates)),
+        "kinds": "\n".join(f"{c}: {', '.join(kinds)}" for c, kinds in card.kinds.items()),
+        "names": "\n".join(f"{c}: {_describe_set(of[0])}" for c, of in card.names.items() if of),
         "figures": _pairs(card.figures),
         "licence": card.license,
         "probe": "stored" if card.probe else "none stored",

@@ -38,7 +38,8 @@ def run(
     contact on the stream's clock; step since onset, from 1; final, true for the episode's last;
     label, the most probable class, or a refusal to name one ("unknown"); probabilities of all of
     them; prediction_set, the classes that are still possible, and coverage, how often the true
-    one is among them; latency_ms of the model step.
+    one is among them; names, the kinds of the label's class that are still possible, and
+    names_coverage, how often the true one is among these; latency_ms of the model step.
 
     A summary goes to stderr. Ctrl-C ends it.
     """
@@ -91,6 +92,8 @@ def run(
                         },
                         "prediction_set": d.prediction_set,
                         "coverage": d.coverage,
+                        "names": d.names,
+                        "names_coverage": d.names_coverage,
                         "latency_ms": round(1e3 * d.latency_s, 3),
                     }
                     typer.echo(msgspec.json.encode(fields))  # which flushes

@@ -77,7 +77,8 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
         onset_ns: The stream time at which contact began, ns: with `source` and `model` it names
             the episode.
         step: The number of the step since onset, from 1; `final` is the last one of its episode.
-        label: The most probable class, or a refusal to name one, such as "unknown".
+        label: The most probable class, of some models a shape, or a refusal to name one, such as
+            "unknown".
         probabilities: The probability of each class, and of each refusal, by its label.
         latency_ms: The time from the sample that completed the step until the decision was there,
             ms.
@@ -89,6 +90,10 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
             model has no rule of it.
         coverage: The share of touches of known kinds of which the true class is in the prediction
             set of every step; null without one.
+        names: The kinds of the label's class that are still possible, the most probable first;
+            empty if the model tells none apart.
+        names_coverage: The share of touches of things of that class of which the true kind is among
+            the names of every step; null without any.
     """
 
     topic: ClassVar[str] = "decision"
@@ -104,6 +109,8 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     late: bool = False
     prediction_set: tuple[str, ...] = ()
     coverage: float | None = None
+    names: tuple[str, ...] = ()
+    names_coverage: float | None = None
 
 
 class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
@@ -242,6 +249,7 @@ def _decision(item: Decision) -> DecisionMessage:
         latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), age_ms=round(age_ns / 1e6, 3),
         late=d.late or (0 < item.deadline_ns < age_ns),
         prediction_set=d.prediction_set, coverage=d.coverage,
+        names=d.names, names_coverage=d.names_coverage,
     )  # fmt: skip
 
 

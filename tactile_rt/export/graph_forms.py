@@ -28,13 +28,13 @@ from onnx import TensorProto, helper, numpy_helper
 from tactile_rt.classifier.model_card import StateTensor
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["PRECISIONS", "Precision", "in_precision", "window_graph"]
+__all__ = ["OUTPUTS", "PRECISIONS", "Precision", "in_precision", "window_graph"]
 
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "fp16", "bf16", "int8")
 BLOCK, LEAST_BLOCK = 128, 16  # inputs that share a scale; onnxruntime wants a power of two
 SMALL = 1024  # weights of fewer numbers stay as they are
-OUTPUTS = ("logits", "embedding")
+OUTPUTS = ("logits", "embedding", "names")  # the last of networks that tell kinds apart
 CONTRIB = "com.microsoft"  # onnxruntime's own operators, which every build of it has
 
 
@@ -249,12 +249,13 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
     """A model of kind "window" from the step that `onnx_step.step_graph` made.
 
     samples (batch, step, sub-step, element, channel), offset and sigma as for the step
-    -> logits (batch, step, class), embedding (batch, step, unit)
+    -> logits (batch, step, class), embedding (batch, step, unit), names (batch, step, name)
     """
     graph = step.graph
     values = {value.name: value for value in (*graph.input, *graph.output)}
+    outputs = [name for name in OUTPUTS if name in values]
     # The loop's body sees offset and sigma from outside; other names it may not share with outside.
-    inside = {name: f"scan_{name}" for name in ("samples", *OUTPUTS, *(s.name for s in state))}
+    inside = {name: f"scan_{name}" for name in ("samples", *outputs, *(s.name for s in state))}
     nodes = []
     for node in graph.node:
         copy = onnx.NodeProto()
@@ -267,7 +268,7 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
         "step",
         [_named(values[name], inside[name]) for name in (*(s.name for s in state), "samples")],
         [values[f"{s.name}_next"] for s in state]
-        + [_named(values[name], inside[name]) for name in OUTPUTS],
+        + [_named(values[name], inside[name]) for name in outputs],
         list(graph.initializer),
         value_info=list(graph.value_info),
     )
@@ -292,11 +293,11 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
         helper.make_node(
             "Scan",
             [*(f"{s.name}_start" for s in state), "samples"],
-            [*(f"{s.name}_last" for s in state), *OUTPUTS],
+            [*(f"{s.name}_last" for s in state), *outputs],
             body=body,
             num_scan_inputs=1,
             scan_input_axes=[1],
-            scan_output_axes=[1] * len(OUTPUTS),
+            scan_output_axes=[1] * len(outputs),
         )
     )
     sample = values["samples"].type.tensor_type.shape.dim
@@ -309,7 +310,7 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
             values["offset"],
             values["sigma"],
         ],
-        [_of_every_step(values[name]) for name in OUTPUTS],
+        [_of_every_step(values[name]) for name in outputs],
         shapes,
     )
     model = helper.make_model(out, opset_imports=step.opset_import, ir_version=step.ir_version)

@@ -9,7 +9,7 @@ import hashlib
 import logging
 import platform
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,7 +34,7 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.packages import VERSION
-from tactile_rt.export.graph_forms import Precision, in_precision, window_graph
+from tactile_rt.export.graph_forms import OUTPUTS, Precision, in_precision, window_graph
 from tactile_rt.export.streaming import streaming
 from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.sets.manifest import SweepManifest
@@ -72,13 +72,14 @@ class StreamingStep(nn.Module):
         self, samples: Tensor, offset: Tensor, sigma: Tensor, *state: Tensor
     ) -> tuple[Tensor, ...]:
         """(batch, sub-step, element, channel) SI and state -> logits (batch, class), embedding
-        (batch, unit) and state.
+        (batch, unit), names (batch, name) of a network that has some, and state.
         """
         frame = self.inputs(samples, offset, sigma)
-        logits, embedding, following = self.network.step_embedded(
+        outputs, following = self.network.step_outputs(
             frame, dict(zip(self.names, state, strict=True))
         )
-        return (logits, embedding, *(following[name] for name in self.names))
+        told = (outputs[name] for name in OUTPUTS if name in outputs)
+        return (*told, *(following[name] for name in self.names))
 
 
 def export_checkpoint(
@@ -89,6 +90,7 @@ def export_checkpoint(
     name: str,
     temperature: float = 1.0,
     rules: tuple[OpenSetRule | None, tuple[PredictionSetRule, ...]] = (None, ()),
+    names: Mapping[str, tuple[PredictionSetRule, ...]] | None = None,
     embeddings: EmbeddingStatistics | None = None,
     figures: dict[str, Any] | None = None,
     precision: Precision = "fp32",
@@ -102,6 +104,7 @@ def export_checkpoint(
         manifests: of the sets that it was trained on.
         temperature: divides the logits at run time.
         rules: when the model refuses to name a class, and of its prediction sets.
+        names: of the prediction sets of kinds, by class.
         kind: "step" or "window".
 
     Raises:
@@ -120,6 +123,8 @@ def export_checkpoint(
         refusals=refusals,
         unknown=rules[0],
         candidates=rules[1],
+        kinds={name: tuple(kinds) for name, kinds in saved.get("kinds", {}).items()},
+        names=dict(names or {}),
         embeddings=embeddings,
         state=(),
         clip=tuple(model.inputs.clip.tolist()),
@@ -158,7 +163,7 @@ def export_step(
     """Write a classifier's streaming step, or a whole window of it.
 
     What the card says of the graph (state, embedding, kind, precision, hashes, parity, probe) is
-    filled in. Parity is of the graph in single precision, the worse of logits and embedding; what
+    filled in. Parity is of the graph in single precision, the worst of its outputs; what
     less precise weights change is ``quantisation_logits``, on the same input.
 
     Raises:
@@ -188,6 +193,7 @@ def step_graph(
     )
     batch = torch.export.Dim("batch")
     shapes = [{0: batch} for _ in arguments]
+    outputs = OUTPUTS if model.network.config.names else OUTPUTS[:2]
     with warnings.catch_warnings():
         # The exporter's own deprecations, and that torchvision is missing, are not the user's.
         warnings.simplefilter("ignore")
@@ -198,7 +204,7 @@ def step_graph(
             dynamo=True,
             opset_version=OPSET,
             input_names=["samples", "offset", "sigma", *state],
-            output_names=["logits", "embedding", *(f"{n}_next" for n in state)],
+            output_names=[*outputs, *(f"{n}_next" for n in state)],
             dynamic_shapes=(shapes[0], shapes[1], shapes[2], tuple(shapes[3:])),
             verbose=False,
         )
@@ -314,8 +320,9 @@ def parity(
     sigma = np.abs(offset)
     arrays = [torch.from_numpy(a) for a in (samples, offset, sigma)]
     with torch.inference_mode():
-        expected = {"logits": model.eval()(*arrays).numpy()}
-        expected["embedding"] = model.network.embed(model.inputs(*arrays)).numpy()
+        network, frames = model.eval().network, model.inputs(*arrays)
+        expected = {k: v.numpy() for k, v in network.split(network.answer(frames)).items()}
+        expected["embedding"] = network.embed(frames).numpy()
     found = file_outputs(session, card, samples, offset, sigma)
     return {
         name: float(np.abs(found[name] - v).max() / max(1.0, float(np.abs(v).max())))

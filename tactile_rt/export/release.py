@@ -10,7 +10,8 @@ by, is told by half of the objects; the other half, for which that is given, tel
 may be from it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from tactile_rt.export.graph_forms import Precision
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.models.checkpoints import load_checkpoint, trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
+from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.models.evaluation.measures import (
     Floats,
@@ -49,6 +51,7 @@ from tactile_rt.models.evaluation.measures import (
     predict,
     run_on,
     run_over,
+    split_by_class,
 )
 from tactile_rt.sets.splits import join_manifests
 
@@ -56,6 +59,7 @@ __all__ = ["fit_open_set", "fit_prediction_sets", "fit_temperature", "release"]
 
 TEMPERATURES = np.geomspace(0.25, 4.0, 81)
 COVERAGE = 0.95
+NAMED = 0.9  # the same of kinds within a class
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
 LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
 FEWEST = 50  # objects below which there is no rule: nearly all classes would be in each set
@@ -107,6 +111,8 @@ def release(
     temperature = fit_temperature(last, labels)
     told = (*known, *saved["refusals"])
     unknown, prediction_sets = fit_rules(sets, run_on(model), temperature, told, len(known))
+    kinds = saved.get("kinds", {})
+    names = fit_names(sets, run_on(model, "names"), kinds) if kinds else {}
     card = export_checkpoint(
         checkpoint,
         (model, saved),
@@ -115,6 +121,7 @@ def release(
         name,
         temperature=temperature,
         rules=(unknown, prediction_sets),
+        names=names,
         embeddings=embedding_statistics(model, validation, len(known)),
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         precision=precision,
@@ -261,6 +268,36 @@ def fit_rules(
     return unknown, tuple(rules)
 
 
+def fit_names(
+    sets: Sequence[SweepSet], run: Step, kinds: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[PredictionSetRule, ...]]:
+    """Fit the prediction sets of kinds within each class, of which each has the coverage.
+
+    With few objects of a class, all of its kinds are in the set.
+
+    Args:
+        sets: labelled sweeps that the model has not learnt from.
+        run: (samples, offset, sigma) of windows to (batch, step, name) logits.
+        kinds: those that it tells apart, by class.
+    """
+    rules: dict[str, tuple[PredictionSetRule, ...]] = {}
+    for bound, ends in NOISE.items():
+        drawn: dict[str, list[tuple[Floats, Labels, Names]]] = {}
+        for one, level in product(sets, ends):
+            logits, found = run_over(cut_windows(one, disturbance=Disturbance(noise=level)), run)
+            split = split_by_class(logits, found, one.kinds(kinds), kinds)
+            for name, at, posteriors, labels in split:
+                if found[at].any():
+                    group = posteriors, labels, one.sweeps.objects[at]
+                    drawn.setdefault(name, []).append(group)
+        for name, parts in drawn.items():
+            p, labels, objects = map(np.concatenate, zip(*parts, strict=True))
+            rule = fit_prediction_sets([(p, labels, objects)], bound, NAMED, fewest=1)
+            assert rule is not None
+            rules[name] = (*rules.get(name, ()), rule)
+    return rules
+
+
 def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSED) -> OpenSetRule:
     """Fit thresholds that refuse few sweeps of known kinds at each step.
 
@@ -284,7 +321,10 @@ def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSE
 
 
 def fit_prediction_sets(
-    groups: Sequence[tuple[Floats, Labels, Names]], noise: float, coverage: float = COVERAGE
+    groups: Sequence[tuple[Floats, Labels, Names]],
+    noise: float,
+    coverage: float = COVERAGE,
+    fewest: int = FEWEST,
 ) -> PredictionSetRule | None:
     """Fit the quantiles of a coverage in each group; None with too few objects.
 
@@ -292,6 +332,7 @@ def fit_prediction_sets(
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)
             and objects (sweep,).
         noise: the largest in units of the rated at which they hold.
+        fewest: the number of objects in a group below which there are too few.
 
     Raises:
         RecordingError: no contact in any sweep.
@@ -299,7 +340,7 @@ def fit_prediction_sets(
     fitted, objects = [], set()
     for posteriors, labels, names in _touched(groups):
         own = sorted(set(names.tolist()))
-        if len(own) < FEWEST:
+        if len(own) < fewest:
             return None
         objects |= set(own)
         scores = mass_above(posteriors)[np.arange(len(labels)), :, labels]

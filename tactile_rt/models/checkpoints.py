@@ -212,13 +212,19 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     return model.eval(), saved
 
 
-def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> dict[str, Any]:
+def begin_from(
+    model: TactileClassifier,
+    path: Path,
+    labels: Sequence[str],
+    kinds: Mapping[str, Sequence[str]],
+) -> dict[str, Any]:
     """Give a network that is to be trained the weights of a checkpoint.
 
     Args:
         model: of the same network, but that it may tell apart other things.
         labels: what the network is to tell apart; it knows those from the beginning that the
             checkpoint knew by the same name.
+        kinds: likewise, of each of these.
 
     Returns:
         What the checkpoint holds.
@@ -229,17 +235,17 @@ def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> d
     """
     trained, saved = load_checkpoint(path)
     there, here = asdict(trained.network.config), asdict(model.network.config)
-    differing = [
-        key for key in here if key not in ("classes", "dropout") and here[key] != there[key]
-    ]
+    own_to_each = ("classes", "names", "identity", "dropout")
+    differing = [key for key in here if key not in own_to_each and here[key] != there[key]]
     if differing or trained.inputs.element.tolist() != model.inputs.element.tolist():
         why = f"another {differing[0]}" if differing else "another array"
         raise SpecMismatch(f"{path} cannot be begun with: it is of {why}")
-    known = (*saved["categories"], *saved["refusals"])
-    both = [name for name in labels if name in known]
-    to, of = [labels.index(n) for n in both], [known.index(n) for n in both]
+    known = _name_rows((*saved["categories"], *saved["refusals"]), saved.get("kinds", {}), there)
+    wanted = _name_rows(labels, kinds, here)
+    both = [name for name in wanted if name in known]
+    to, of = [wanted.index(n) for n in both], [known.index(n) for n in both]
     weights, own = trained.state_dict(), model.state_dict()
-    # a row of the last layer is of a label, whose place may be another though as many are known
+    # a row of the last layer may have another place though as many are known
     for name in [name for name in own if name.startswith("network.decoder.")][-2:]:
         own[name][to] = weights[name][of]
         weights[name] = own[name]
@@ -247,6 +253,14 @@ def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> d
     kept = {name: own[name] if name.startswith("inputs.") else w for name, w in weights.items()}
     model.load_state_dict(kept)
     return saved
+
+
+def _name_rows(
+    labels: Sequence[str], kinds: Mapping[str, Sequence[str]], network: Mapping[str, Any]
+) -> list[Any]:
+    """Name the rows of the last layer: labels, kinds, units of the embedding."""
+    names = [(label, kind) for label in kinds for kind in kinds[label]] if network["names"] else []
+    return [*labels, *names, *range(network["identity"])]
 
 
 def untrained(saved: dict[str, Any]) -> TactileClassifier:
@@ -282,6 +296,7 @@ def fill_checkpoint(
         "period_ns": manifest.period_ns,
         "categories": list(manifest.categories),
         "refusals": list(refusals),
+        "kinds": manifest.kinds if model.network.config.names else {},
         "trained_objects": trained,
         "metrics": metrics,
     }

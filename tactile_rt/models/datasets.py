@@ -129,6 +129,24 @@ class SweepSet:
         """Names of all that a network that learns from it tells apart: last the refusals."""
         return (*self.manifest.categories, *self.refusals)
 
+    def kinds(self, of: Mapping[str, Sequence[str]]) -> NDArray[np.int64]:
+        """Number the kind of each sweep's object; -1 where it has none of these.
+
+        Args:
+            of: the kinds of each category, counted through all of them.
+
+        Returns:
+            (sweep,) numbers.
+        """
+        numbers = {one: k for k, one in enumerate((c, kind) for c in of for kind in of[c])}
+        names, which = np.unique(self.sweeps.objects, return_inverse=True)
+        category, kind_of = self.manifest.category, self.manifest.kind_of
+        found = [
+            numbers.get((category(name), kind_of[name]), -1) if name in kind_of else -1
+            for name in names.tolist()
+        ]
+        return np.array(found, dtype=np.int64)[which]
+
     @cached_property
     def noisy_starts(self) -> NDArray[np.int64]:
         """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found.

@@ -234,7 +234,7 @@ class EAD(nn.Module):
             self.attender = attenders.NoAttender()
         self.feature_size = width
         kind = decoders.KINDS[config.decoder]
-        self.decoder = kind(width, config.classes, config.width, config.max_steps)
+        self.decoder = kind(width, config.outputs, config.width, config.max_steps)
 
     def features(self, frames: Tensor) -> Tensor:
         """What the decoder reads of frames, (batch, step, feature)."""
@@ -243,11 +243,27 @@ class EAD(nn.Module):
         return features
 
     def embed(self, frames: Tensor) -> Tensor:
-        """What the decoder's last layer reads of frames at each step, (batch, step, unit)."""
+        """Embed frames, (batch, step, unit), as each step's `step_outputs` has it."""
+        if self.config.identity:
+            return self.split(self.answer(frames))["embedding"]
         return self.decoder.embed(self.features(frames))
 
     def forward(self, frames: Tensor) -> Tensor:
         """frames (batch, step, channel, row, column) -> logits (batch, step, class)"""
+        return self.answer(frames)[..., : self.config.classes]
+
+    def split(self, answers: Tensor) -> dict[str, Tensor]:
+        """Take answers (..., output) apart: logits, names and an embedding of length 1, if any."""
+        classes, names = self.config.classes, self.config.classes + self.config.names
+        out = {"logits": answers[..., :classes]}
+        if self.config.identity:
+            out["embedding"] = F.normalize(answers[..., names:], dim=-1)
+        if self.config.names:
+            out["names"] = answers[..., classes:names]
+        return out
+
+    def answer(self, frames: Tensor) -> Tensor:
+        """Answer frames with all that the last layer gives, (batch, step, output)."""
         logits: Tensor = self.decoder(self.features(frames))
         if self.config.readout == "last":
             return logits
@@ -267,7 +283,7 @@ class EAD(nn.Module):
             **self.decoder.initial_state(batch),
         }
         if self.config.readout == "mean":
-            state["logits_sum"] = weight.new_zeros(batch, self.config.classes)
+            state["logits_sum"] = weight.new_zeros(batch, self.config.outputs)
         return state
 
     def step(self, frame: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
@@ -275,29 +291,32 @@ class EAD(nn.Module):
 
         A lane is reset by putting its rows of `initial_state` back.
         """
-        logits, _, new = self.step_embedded(frame, state)
-        return logits, new
+        outputs, new = self.step_outputs(frame, state)
+        return outputs["logits"], new
 
-    def step_embedded(
+    def step_outputs(
         self, frame: Tensor, state: dict[str, Tensor]
-    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """As `step`, with the step's embedding (batch, unit) between logits and state.
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Take a step as `step` does, with all outputs: `logits`, `embedding` and maybe `names`.
 
-        It is that of the step alone, also where the logits are a mean over steps.
+        The embedding (batch, unit) is what the last layer reads in the step alone, also where the
+        logits are a mean over steps; one that is trained on identity is of all steps so far.
         """
         index = state["index"]
         frame = F.pad(frame, (0, 1)) if self._alone else frame
         features, encoder = self.encoder.step(frame, index, state)  # (batch, feature)
         features, attender = self.attender.step(features, index, state)
         embedding, decoder = self.decoder.step(features, index, state)  # (batch, unit)
-        logits = self.decoder.logits(embedding)  # (batch, class)
+        logits = self.decoder.logits(embedding)  # (batch, output)
         new = {"index": index + 1, **encoder, **attender, **decoder}
         if self.config.readout == "mean":
             count = index[:, None] - self.lag + 1  # steps in the mean; none before the lag is over
             total = state["logits_sum"] + torch.where(count > 0, logits, 0.0)
             logits = torch.where(count > 0, total / count.clamp(min=1), logits)
             new["logits_sum"] = total
-        return logits, embedding, {name: new[name] for name in state}
+        outputs = self.split(logits)
+        outputs.setdefault("embedding", embedding)
+        return outputs, {name: new[name] for name in state}
 
 
 def _encoder(config: EADConfig) -> Any:

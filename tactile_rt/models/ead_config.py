@@ -81,6 +81,13 @@ class EADConfig:
     frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of what it reads
     norm_epsilon: float = 0.0  # of the cells' layer norms; 0: each cell's own, see `cells`
     preprocessing: str = "log"  # of the input stage, see `inputs`
+    names: int = 0  # kinds within the classes, of which it gives logits beside those of the classes
+    identity: int = 0  # units of an embedding that is trained to tell objects apart; 0: none
+
+    @property
+    def outputs(self) -> int:
+        """Rows of the last layer: logits of classes, those of names, the embedding."""
+        return self.classes + self.names + self.identity
 
     def __post_init__(self) -> None:
         for field, known in (
@@ -94,6 +101,8 @@ class EADConfig:
                 raise ConfigError(f"{field} is {value!r}, not one of {name_some(known, 8)}")
         if self.classes < 1:
             raise ConfigError(f"classes is {self.classes}, must be at least 1")
+        if min(self.names, self.identity) < 0:
+            raise ConfigError("names and identity must be 0 or more")
         if not 0 < self.width <= WIDEST or self.width * WIDTH_UNIT % 1:
             raise ConfigError(
                 f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}, "

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
-         "prediction_set", "coverage")  # fmt: skip
+         "prediction_set", "coverage", "names", "names_coverage")  # fmt: skip
 # A recording ends with its source; what was being decided just then came too late for it.
 END_NS = NS_PER_S
 
@@ -213,7 +213,7 @@ def _difference(recorded: Fields, replayed: Fields) -> str:
         if name not in recorded:  # by an earlier release, that did not tell it
             continue
         was, now = recorded[name], replayed[name]
-        if name == "prediction_set":
+        if name in ("prediction_set", "names"):
             was, now = list(was), list(now)  # a message has no tuples
         if was == now:
             continue

@@ -58,6 +58,7 @@ class SweepManifest:
         recipe: What made the set (profile, seed, sweeps per object ...), for provenance.
         withheld: The categories of the splits "withheld" and "outliers".
         category_of: The category of objects whose name does not tell it.
+        kind_of: The kind of objects that have one within their category: box, where that is block.
         versions: The versions of what made the set (mujoco, numpy, ...).
         sensor: The description of the array's sensor; None: it has none, and the values are base
             loads.
@@ -73,6 +74,7 @@ class SweepManifest:
     version: int = SET_VERSION
     withheld: tuple[str, ...] = ()
     category_of: dict[str, str] = field(default_factory=dict)
+    kind_of: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     settings: dict[str, float | str] = field(default_factory=dict)
     sensor: SensorSpec | None = None
@@ -110,6 +112,15 @@ class SweepManifest:
     def limits(self) -> ChannelLimits:
         """What a network may believe of the channels."""
         return channel_limits(self.spec, self.sensor, self.period_ns)
+
+    @property
+    def kinds(self) -> dict[str, tuple[str, ...]]:
+        """The kinds of each category, as far as there are objects to learn from."""
+        found: dict[str, set[str]] = {}
+        for name in self.split["train"]:
+            if kind := self.kind_of.get(name):
+                found.setdefault(self.category(name), set()).add(kind)
+        return {c: tuple(sorted(found[c])) for c in self.categories if c in found}
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
         """Object names of these splits, or of all.

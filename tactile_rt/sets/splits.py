@@ -102,7 +102,8 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
         categories=tuple(dict.fromkeys(c for one in manifests for c in one.categories)),
         withheld=tuple(dict.fromkeys(c for one in manifests for c in one.withheld)),
         split={side: tuple(names) for side, names in split.items()},
-        category_of={name: kind for m in manifests for name, kind in m.category_of.items()},
+        category_of={name: c for one in manifests for name, c in one.category_of.items()},
+        kind_of={name: kind for one in manifests for name, kind in one.kind_of.items()},
     )
 
 

@@ -60,26 +60,38 @@ def write_tiny_set(
     categories: tuple[str, ...] = CATEGORIES,
     outliers: int = 0,
     faults: dict[str, float] | None = None,
+    kinds: tuple[str, ...] = (),
+    held_out: int = 1,
 ) -> SweepManifest:
-    """Objects of some categories, every sweep a touch that noise and a category's mean make."""
+    """Objects of some categories, every sweep a touch that noise and a category's mean make.
+
+    `kinds`: those of every category but the last, each of its objects one after another; their mean
+    is another. `held_out`: objects of a category for validation, and for test.
+    """
     spec, rng = spec or tiny_array(), np.random.default_rng(1)
-    split = split_by_object(categories, objects, 1, 1)
+    split = split_by_object(categories, objects, held_out, held_out)
+    kind_of = {
+        f"{c}-{i}": kinds[i % len(kinds)]
+        for c in categories[:-1] if kinds for i in range(objects)
+    }  # fmt: skip
     recipe = {"contacts": True} if contacts else {}
     recipe |= {"faults": faults} if faults else {}
     withheld = ("thing",) if outliers else ()
     if outliers:
         split["outliers"] = tuple(f"thing-{k}" for k in range(outliers))
     manifest = SweepManifest(
-        spec, period_ns, LEAD, categories, split, recipe=recipe, withheld=withheld
+        spec, period_ns, LEAD, categories, split, recipe=recipe, withheld=withheld, kind_of=kind_of
     )
     manifest.write(folder)
     unit = np.array([{"N": 1e-4, "N m": 1e-6}[u] for u in spec.units])
     # the last is that of things of no category
     means = np.random.default_rng(2).normal(size=(len(categories) + 1, *spec.shape)) * unit
+    apart = np.random.default_rng(3).normal(size=(len(kinds), *spec.shape)) * unit
     for name in manifest.names():
-        values = (
-            means[manifest.label(name)] + rng.normal(size=(sweeps, SAMPLES, *spec.shape)) * unit
-        )
+        mean = means[manifest.label(name)]
+        if kind := kind_of.get(name):
+            mean = mean + apart[kinds.index(kind)]
+        values = mean + rng.normal(size=(sweeps, SAMPLES, *spec.shape)) * unit
         values[:, :LEAD] = 0
         where = np.full(values.shape[:3], np.nan, np.float32)
         where[:, LEAD:] = 0.01  # of the base, m

@@ -7,18 +7,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.decision_rules import UNKNOWN, fitting
+from tactile_rt.classifier.decision_rules import UNKNOWN, PredictionSetRule, fitting
 from tactile_rt.classifier.model_card import ModelCard, decided
-from tactile_rt.classifier.model_file import load_model
+from tactile_rt.classifier.model_file import file_outputs, load_model
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.measures import Floats, Interval
+from tactile_rt.models.evaluation.measures import Floats, Interval, Labels
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-__all__ = ["Coverage", "measure_coverage", "named_faults", "score_known"]
+__all__ = [
+    "NAMES_LEFT",
+    "Coverage",
+    "measure_coverage",
+    "measure_names",
+    "named_faults",
+    "score_known",
+]
 
+NAMES_LEFT = "names at the last step"  # a number, where the others are shares
+Doubles = NDArray[np.float64]
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 
 
@@ -40,6 +49,56 @@ class Coverage:
     size: Interval
     unknown: Interval
     faulty: Interval
+
+
+def measure_names(
+    path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
+) -> Iterator[tuple[str, Interval]]:
+    """Measure the prediction sets of kinds; nothing of a model, or a test, without.
+
+    The coverage of each class is that of its rule: of the sweeps of things of kinds that the model
+    knows, the share of which the kind is in the set of their class at every step.
+
+    Args:
+        test: the sweeps, labelled by the model's classes; sweeps without a contact are left out.
+
+    Yields:
+        The name of a figure, and the figure.
+    """
+    session, card = load_model(path)
+    rules = {name: fitting(own, disturbance.noise) for name, own in card.names.items()}
+    numbers, classes = test.kinds(card.kinds), len(card.classes)
+
+    def run(*loads: Floats) -> Floats:
+        out = file_outputs(session, card, *loads)
+        return np.concatenate([out["logits"][..., :classes], out["names"]], axis=-1)
+
+    if not any(rules.values()) or (numbers < 0).all():
+        return
+    answers, found = measures.run_over(measures.cut_windows(test, disturbance=disturbance), run)
+    right = answers[:, -1, :classes].argmax(axis=1) == test.sweeps.labels
+    split = measures.split_by_class(answers[..., classes:], found, numbers, card.kinds)
+    taken, rows = [], []
+    for name, at, posteriors, kinds in split:
+        if (rule := rules.get(name)) is None:
+            continue
+        touched = found[at]
+        taken.append(at[touched])
+        rows.append(_in_sets(rule, posteriors[touched], kinds[touched]))
+    at, (inside, first, size) = np.concatenate(taken), np.concatenate(rows, axis=1)
+    if not len(at):
+        return
+    objects, of = test.sweeps.objects[at], test.sweeps.labels[at]
+    yield "kind, top-1 within the true class", measures.accuracy(first, objects)
+    yield "coverage of the names", measures.accuracy(inside, objects)
+    for label in np.unique(of).tolist():
+        own = of == label
+        name = f"coverage of the names of {card.classes[label]}"
+        yield name, measures.accuracy(inside[own], objects[own])
+    if (own := right[at]).any():
+        name = "coverage of the names where the class is right"
+        yield name, measures.accuracy(inside[own], objects[own])
+    yield NAMES_LEFT, measures.bootstrap(lambda at: float(size[at].mean()), objects)
 
 
 def measure_coverage(
@@ -65,12 +124,7 @@ def measure_coverage(
         return Coverage(float("nan"), NOTHING, NOTHING, unknown, faulty)
     found = np.flatnonzero(~np.isnan(posteriors[:, 0, 0]))
     labels, objects = labels[found], objects[found]
-    inside, sizes = np.zeros(len(labels), dtype=np.bool_), np.zeros(len(labels))
-    for k, at in enumerate(found):
-        own = posteriors[at][:, : len(card.classes)]
-        left = [rule.prediction_set(p, step) for step, p in enumerate(own, start=1)]
-        inside[k] = all(labels[k] in names for names in left)
-        sizes[k] = len(left[-1])
+    inside, _, sizes = _in_sets(rule, posteriors[found][..., : len(card.classes)], labels)
     return Coverage(
         rule.coverage,
         measures.accuracy(inside, objects),
@@ -78,6 +132,23 @@ def measure_coverage(
         unknown,
         faulty,
     )
+
+
+def _in_sets(rule: PredictionSetRule, posteriors: Floats, labels: Labels) -> Doubles:
+    """Form the sets of sweeps at every step.
+
+    Args:
+        posteriors, labels: (sweep, step, class) and (sweep,).
+
+    Returns:
+        (3, sweep) whether the truth is in the set of every step, whether it is the first of the
+        last one, and how many are in that.
+    """
+    rows = []
+    for p, label in zip(posteriors, labels.tolist(), strict=True):
+        sets = [rule.prediction_set(one, step) for step, one in enumerate(p, start=1)]
+        rows.append((all(label in one for one in sets), sets[-1][0] == label, len(sets[-1])))
+    return np.array(rows, dtype=float).reshape(-1, 3).T
 
 
 def score_known(path: Path, test: SweepSet) -> Floats:

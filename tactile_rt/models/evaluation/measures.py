@@ -9,7 +9,7 @@ decision, and counts as wrong everywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import fuse
+from tactile_rt.classifier.model_card import kind_columns
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 
@@ -38,12 +39,14 @@ __all__ = [
     "expected_calibration_error",
     "fused_accuracy",
     "hits",
+    "macro_accuracy",
     "open_set",
     "posteriors",
     "predict",
     "run_on",
     "run_over",
     "softmax",
+    "split_by_class",
 ]
 
 Floats = NDArray[np.float32]
@@ -158,6 +161,32 @@ def among(posteriors: Floats, classes: int) -> Floats:
     """(..., class) posteriors of the first so many labels alone, had it to be one of them."""
     own = posteriors[..., :classes]
     return np.asarray(own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30))
+
+
+def split_by_class(
+    logits: Floats,
+    found: NDArray[np.bool_],
+    numbers: Labels,
+    kinds: Mapping[str, Sequence[str]],
+) -> Iterator[tuple[str, Labels, Floats, Labels]]:
+    """Split sweeps by the class that they are of, with posteriors of its kinds alone.
+
+    Args:
+        logits: (sweep, step, name) of the kinds of all classes.
+        found: (sweep,) whether a contact was detected.
+        numbers: (sweep,) the true kind, as `SweepSet.kinds` counts them.
+        kinds: those of each class.
+
+    Yields:
+        The class, which sweeps are of a kind of it, their posteriors (sweep, step, kind), NaN where
+        no contact was detected, and their kinds (sweep,) among those of the class.
+    """
+    for name, columns in kind_columns(kinds).items():
+        at = np.flatnonzero((numbers >= columns.start) & (numbers < columns.stop))
+        with np.errstate(invalid="ignore"):
+            own = softmax(logits[at][..., columns])
+        own[~found[at]] = np.nan
+        yield name, at, own, numbers[at] - columns.start
 
 
 def hits(posteriors: Floats, labels: Labels, top: int = 1) -> NDArray[np.bool_]:
@@ -289,15 +318,34 @@ def bootstrap(
     return Interval(statistic(np.arange(len(objects))), float(low), float(high))
 
 
-def run_on(model: TactileClassifier) -> Step:
-    """The function that `predict` wants, of a torch model."""
+def macro_accuracy(correct: NDArray[np.bool_], labels: Labels, objects: Names) -> Interval:
+    """Average the accuracies of all classes; `accuracy` is the mean over sweeps.
+
+    Args:
+        correct, labels, objects: (sweep,) whether each was right, its class and its object.
+    """
+
+    def mean(at: Labels) -> float:
+        count = np.bincount(labels[at])
+        right = np.bincount(labels[at], weights=correct[at])
+        return float((right[count > 0] / count[count > 0]).mean())
+
+    return bootstrap(mean, objects)
+
+
+def run_on(model: TactileClassifier, output: str = "logits") -> Step:
+    """The function that `predict` wants, of a torch model; or one that gives another output."""
     import torch  # here: a model file is measured without
 
     def run(*loads: Floats) -> Floats:
         model.eval()
         device = model.inputs.clip.device
         with torch.inference_mode():
-            logits = model(*(torch.from_numpy(a).to(device) for a in loads))
-        return np.asarray(logits.float().cpu().numpy())
+            windows = [torch.from_numpy(a).to(device) for a in loads]
+            if output == "logits":
+                out = model(*windows)
+            else:
+                out = model.network.split(model.network.answer(model.inputs(*windows)))[output]
+        return np.asarray(out.float().cpu().numpy())
 
     return run

@@ -18,9 +18,15 @@ from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults, score_known
+from tactile_rt.models.evaluation.coverage import (
+    NAMES_LEFT,
+    measure_coverage,
+    measure_names,
+    named_faults,
+    score_known,
+)
 from tactile_rt.models.evaluation.measures import Floats, Labels, Names
-from tactile_rt.models.evaluation.records import Record, record_share
+from tactile_rt.models.evaluation.records import Record, record_count, record_share
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.sets.manifest import WITHHELD
@@ -76,6 +82,12 @@ def evaluate_model(
 
     records = [
         top("top-1", clean[:, -1]),
+        record_share(
+            "top-1, macro",
+            measures.macro_accuracy(measures.hits(clean[:, -1], labels), labels, objects),
+            "",
+            f"the mean over classes; {sample}",
+        ),
         top("top-5", clean[:, -1], top=5),
         top("top-1 at step 14 of 22", clean[:, 13]),
     ]
@@ -116,6 +128,7 @@ def evaluate_model(
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
         records.append(_measure_open_set(model, unknown, test))
     records += _measure_coverage(model, test, unknown, sample)
+    records += _measure_names(model, test, sample)
     if svm:
         right = measures.hits(clean[:, -1], labels)
         records += _compare_svm(data, card, test, right)
@@ -211,10 +224,8 @@ def _measure_coverage(
             how = f"nominal: {100 * found.nominal:g} %; {sample}"
             name = f"coverage of the prediction sets{when}"
             records.append(record_share(name, found.covered, "", how))
-            size = found.size
-            interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
-            name = f"models.prediction set at the last step{when}"
-            records.append(Record(name, size.value, "", "", interval, sample))
+            name = f"prediction set at the last step{when}"
+            records.append(record_count(name, found.size, sample))
         if UNKNOWN in refusals:
             records.append(
                 record_share(f"known things called unknown{when}", found.unknown, "", sample)
@@ -228,6 +239,17 @@ def _measure_coverage(
         records.append(record_share("unknown things called unknown", found.unknown, "", how))
     for name, share in named_faults(model, test):
         records.append(record_share(f"{name}, named as a fault", share, "", sample))
+    return records
+
+
+def _measure_names(model: Path, test: SweepSet, sample: str) -> list[Record]:
+    records = []
+    for noise, when in ((0.0, ""), (1.0, " at rated noise")):
+        for name, found in measure_names(model, test, Disturbance(noise=noise)):
+            if name == NAMES_LEFT:
+                records.append(record_count(f"{name}{when}", found, sample))
+            else:
+                records.append(record_share(f"{name}{when}", found, "", sample))
     return records
 
 

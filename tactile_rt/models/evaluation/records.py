@@ -13,7 +13,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from tactile_rt.models.evaluation.measures import Interval
 
-__all__ = ["Record", "as_dicts", "as_table", "record_share", "show", "write"]
+__all__ = ["Record", "as_dicts", "as_table", "record_count", "record_share", "show", "write"]
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
@@ -50,6 +50,12 @@ def record_share(
     """Give a share as a figure of a model in percent, with its interval."""
     interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
     return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
+
+
+def record_count(name: str, estimate: "Interval", how: str) -> Record:
+    """Give a mean number as a figure of a model, with its interval."""
+    interval = f"95 % interval {estimate.low:.1f} to {estimate.high:.1f}, by object"
+    return Record(f"models.{name}", estimate.value, "", "", interval, how)
 
 
 def as_table(records: list[Record]) -> Table:

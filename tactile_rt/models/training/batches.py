@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from collections.abc import Generator as Yields
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -33,6 +33,7 @@ __all__ = [
     "TrainingBatches",
     "check_batches",
     "generator_of",
+    "order_in_twos",
     "partners",
     "prefetched",
 ]
@@ -49,15 +50,33 @@ def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int6
 
     objects (n,), the object of each -> (n,) indices into it.
     """
-    order = np.lexsort((rng.random(len(objects)), objects))  # each object's, shuffled
-    in_order = objects[order]
-    begins = np.flatnonzero(np.r_[True, in_order[1:] != in_order[:-1]])
+    order, begins = _by_object(objects, rng)
     ends = np.r_[begins[1:], len(objects)] - 1
     following = np.arange(1, len(objects) + 1)
     following[ends] = begins  # the last of an object is followed by its first
     found = np.empty(len(objects), dtype=np.int64)
     found[order] = order[following]
     return found
+
+
+def order_in_twos(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
+    """Order sweeps at random, but so that two of one object follow each other.
+
+    objects (n,), the object of each -> (n,) indices into it; the last of an odd number is alone.
+    """
+    order, begins = _by_object(objects, rng)
+    place = np.arange(len(objects)) - np.repeat(begins, np.diff(np.r_[begins, len(objects)]))
+    two = np.cumsum(place % 2 == 0) - 1  # which of all twos each belongs to
+    return np.asarray(order[np.argsort(rng.random(len(objects))[two], kind="stable")])
+
+
+def _by_object(
+    objects: NDArray[Any], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Order sweeps by object, each one's shuffled, and say where each object begins."""
+    order = np.lexsort((rng.random(len(objects)), objects))
+    in_order = objects[order]
+    return order, np.flatnonzero(np.r_[True, in_order[1:] != in_order[:-1]])
 
 
 def check_batches(
@@ -100,6 +119,8 @@ class TrainingBatches:
     Args:
         jitter: samples by which a window may begin earlier or later.
         two_sweeps: whether the second view of a window is of another sweep of its object.
+        kinds: those of each category; labels (batch, 3) are then of the class, the kind and the
+            object, each -1 where a window has none, and two sweeps of an object follow each other.
         device: of the samples, offsets and sigmas; a GPU also draws the noise of the samples.
 
     Attributes:
@@ -115,6 +136,7 @@ class TrainingBatches:
         jitter: int = JITTER,
         two_sweeps: bool = False,
         device: str = "cpu",
+        kinds: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self._data, self._batch, self._seed, self._jitter = data, batch, seed, jitter
         self._device = device
@@ -127,6 +149,10 @@ class TrainingBatches:
         touched, samples = data.sweeps.objects[self._usable], data.sweeps.values.shape[1]
         check_batches(touched, samples, batch, jitter, two_sweeps)
         self._two_sweeps = two_sweeps
+        self._related: NDArray[np.int64] | None = None  # (sweep, 2) kind and object
+        if kinds is not None:
+            _, number = np.unique(data.sweeps.objects, return_inverse=True)
+            self._related = np.stack([data.kinds(kinds), number], axis=1)
 
     def __len__(self) -> int:
         return len(self._usable) // self._batch
@@ -139,7 +165,10 @@ class TrainingBatches:
         two views are not to be known as one sweep.
         """
         rng = np.random.default_rng([self._seed, number])
-        order = rng.permutation(self._usable)
+        if self._related is None:
+            order = rng.permutation(self._usable)
+        else:
+            order = self._usable[order_in_twos(self._related[self._usable, 1], rng)]
         if view:
             rng = np.random.default_rng([self._seed, number, view])
             if self._two_sweeps:
@@ -177,7 +206,12 @@ class TrainingBatches:
         samples = self._there(windows(values, start, data.timing))
         samples -= self._there(rest)[:, None, None]
         samples *= self._there(gain * alive)
-        labels = self._spoilt(samples, data.sweeps.labels[at], rng)
+        told = data.sweeps.labels[at]
+        told = np.where(told < 0, len(data.manifest.categories), told)  # the first refusal: unknown
+        labels = self._spoilt(samples, told, rng)
+        if self._related is not None:
+            related = np.where((labels == told)[:, None], self._related[at], -1)
+            labels = np.concatenate([labels[:, None], related], axis=1)
         if faults.offset or faults.drift:
             self._wander(samples, rng, severity)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
@@ -210,7 +244,7 @@ class TrainingBatches:
     ) -> NDArray[np.int64]:
         """Make some of the samples implausible, in place; (n,) the labels that all then have."""
         spec, first = self._data.manifest.spec, len(self._data.manifest.categories)
-        labels = np.where(labels < 0, first, labels)  # unknown is the first refusal
+        labels = labels.copy()
         names = [name for name in self._refusals if name in IMPLAUSIBLE]
         if names:
             bad = rng.random(len(samples)) < self._faults.implausible
@@ -265,7 +299,8 @@ class Batch:
     Attributes:
         views: The loads, one or two batches of them, as `InputStage` takes them, each drawn by
             itself.
-        labels: (batch,) The index of the category of each window.
+        labels: (batch,) The index of the category of each window, or as `TrainingBatches` has
+            them of kinds.
         generator: What the augmentation of the frames is drawn from.
     """
 

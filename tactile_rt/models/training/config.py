@@ -47,6 +47,7 @@ RATES_PER = ("update", "epoch")
 WINDOWS = ("onset", "sweep")
 PAIRS = ONE_SWEEP, TWO_SWEEPS = ("one-sweep", "two-sweeps")
 PATHS = ("data", "also", "begin")  # keys of a configuration
+EMBEDDED = 128  # units of the embedding that is trained on identity
 LARGEST = 1e38  # numbers of single precision end there
 
 
@@ -78,8 +79,13 @@ class TrainingConfig:
         pairs: What the two views of "simclr" and "simsiam" are of: "one-sweep", the same window
             twice, or "two-sweeps", windows of two sweeps of the same object, as a robot has them
             that touches a thing twice.
-        temperature: The temperature of "simclr": a similarity counts divided by it. 0.1 in the
-            paper; where two views are hard to tell as a pair, as two sweeps are, a higher one.
+        temperature: The temperature of "simclr" and of `identity`: a similarity counts divided by
+            it. 0.1 in the paper; where two views are hard to tell as a pair, as two sweeps are, a
+            higher one.
+        names: The weight of the cross-entropy over the kinds of a sweep's class, of objects that
+            have a kind, beside that over classes (supervised).
+        identity: The weight of a supervised contrast between objects, of which any two sweeps are
+            a pair, that trains an embedding (supervised).
         masking: The share of the steps of a window that is blanked, from 0 to less than 1.
         optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
             `updates`.
@@ -128,6 +134,8 @@ class TrainingConfig:
     augmentation: str = "none"
     pairs: str = ONE_SWEEP
     temperature: float = 0.1
+    names: float = 0.0
+    identity: float = 0.0
     masking: float = 0.0
     optimizer: str = "adamw"
     schedule: str = "one-cycle"
@@ -165,7 +173,7 @@ class TrainingConfig:
                 raise ConfigError(f"{name} is {value!r}, not one of {name_some(known, 8)}")
         for name in ("epochs", "batch", "learning_rate", "drop_every", "temperature"):
             _check_positive(name, getattr(self, name))
-        for name in ("updates", "clip_norm", "weight_decay", "jitter"):
+        for name in ("updates", "clip_norm", "weight_decay", "jitter", "names", "identity"):
             if not (getattr(self, name) >= 0 and isfinite(getattr(self, name))):
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
         for name in ("masking", "warmup", "label_smoothing", "easy"):
@@ -175,6 +183,8 @@ class TrainingConfig:
             raise ConfigError(
                 f"{self.objective} compares sweeps of a batch: batch must be 2 or more"
             )
+        if self.related and not self.labelled:
+            raise ConfigError(f"names and identity are of supervised, not of {self.objective}")
         if self.pairs != ONE_SWEEP and self.objective not in ("simclr", "simsiam"):
             raise ConfigError(f"pairs are of simclr and simsiam: {self.objective} has no two views")
         if self.schedule == "one-cycle" and self.rate_per == "epoch":
@@ -191,6 +201,11 @@ class TrainingConfig:
         """Whether it is learnt from labels."""
         return self.objective == "supervised"
 
+    @property
+    def related(self) -> bool:
+        """Whether it is learnt from what sweeps have in common beside their class."""
+        return self.names > 0 or self.identity > 0
+
     def check_sets(self) -> None:
         """Refuse sets that cannot be learnt from so, before anything of them is read.
 
@@ -202,14 +217,17 @@ class TrainingConfig:
         _, whole = read_manifests(self.folders, self.labelled)
         self.network(len(whole.categories), whole.frame)
 
-    def network(self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME) -> EADConfig:
-        """The network's configuration for so many classes and for frames of a size.
+    def network(
+        self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME, names: int = 0
+    ) -> EADConfig:
+        """The network's configuration for so many classes and names and for frames of a size.
 
         Raises:
             ConfigError: there is no such network.
         """
         own = {name: getattr(self, name) for name in NETWORK}
-        return EADConfig(classes=classes, frame=frame, **own)
+        identity = EMBEDDED if self.identity else 0
+        return EADConfig(classes=classes, frame=frame, names=names, identity=identity, **own)
 
 
 def as_json(config: TrainingConfig) -> dict[str, Any]:

@@ -94,13 +94,15 @@ def _train(
     objective = build_objective(config, training)
     before = None
     if config.begin:
-        before = begin_from(objective.model, Path(config.begin), training.classes)
+        kinds = training.manifest.kinds
+        before = begin_from(objective.model, Path(config.begin), training.classes, kinds)
     met = trained_objects(training.manifests, before)
     share = Share(fabric.global_rank, fabric.world_size)
     two_sweeps = config.pairs == TWO_SWEEPS
     batches = TrainingBatches(
-        training, config.batch, config.seed, config.jitter, two_sweeps, str(fabric.device)
-    )
+        training, config.batch, config.seed, config.jitter, two_sweeps, str(fabric.device),
+        training.manifest.kinds if config.related else None,
+    )  # fmt: skip
     if config.easy:
         updates = config.updates or config.epochs * len(batches)
         batches.easy_epochs = round(config.easy * updates / len(batches))

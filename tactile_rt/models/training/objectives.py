@@ -6,11 +6,12 @@ training.
     objective(views, labels, generator) -> loss
 
 `views` are one or two batches of loads (samples, offset, sigma) as `TactileClassifier` takes them,
-`Objective.views` says how many; labels (batch,) count for the supervised objective alone. It is
-done in two: `see` makes the frames, whose augmentation it draws from the generator, and `loss`
-draws nothing but dropout.
+`Objective.views` says how many; labels (batch,) count for the supervised objective alone, which
+takes those of kind and object, too (batch, 3). It is done in two: `see` makes the frames, whose
+augmentation it draws from the generator, and `loss` draws nothing but dropout.
 
-- `Supervised`: cross-entropy with the category.
+- `Supervised`: cross-entropy with the category, with the kind inside of it, and a supervised
+  contrast between objects (Khosla et al. 2020).
 - `SimCLR` (Chen et al. 2020): two views of a window are to be found among all others' views.
 - `SimSiam` (Chen and He 2021): one view predicts the other, which does not look back.
 - `Autoencoder` (Olshausen and Field 1996): sparse features of each step rebuild its frame.
@@ -30,6 +31,7 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.augmentation import Augmentation, Loads, build
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.ead import TactileClassifier
@@ -45,6 +47,7 @@ __all__ = [
     "Supervised",
     "anytime_loss",
     "build_objective",
+    "identity_loss",
     "last_loss",
     "nt_xent",
 ]
@@ -56,6 +59,7 @@ PROJECTED, BOTTLENECK = 2048, 512  # SimSiam's projector and predictor
 NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
 DECONVOLUTIONS = 3
 PREDICTED = 4  # steps from each on that `Predictive` tells
+OUTSIDE = -1e4  # the logit of a kind that is none of the class
 SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
 
 
@@ -66,18 +70,30 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
         ConfigError: there is no such network, or the array cannot be augmented so.
     """
     manifest = training.manifest
-    network = config.network(len(training.classes), manifest.frame)
+    kinds = manifest.kinds if config.names else {}
+    names = sum(map(len, kinds.values()))
+    network = config.network(len(training.classes), manifest.frame, names)
     model = TactileClassifier(manifest.spec, network, manifest.limits)
     if config.first_weights == "paper" and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)
     augmentation = build(config.augmentation, manifest.spec, config.masking)
     if config.labelled:
-        return Supervised(model, augmentation, config.loss, config.label_smoothing)
+        objects = training.sweeps.objects
+        if config.identity and len(set(objects.tolist())) == len(objects):
+            raise ConfigError(
+                f"identity: no object of {config.data} has two sweeps to be told as one: make more "
+                "of each"
+            )
+        class_of = [manifest.categories.index(c) for c in kinds for _ in kinds[c]]
+        return Supervised(
+            model, augmentation, config.loss, config.label_smoothing, class_of,
+            config.names, config.identity, config.temperature,
+        )  # fmt: skip
     model.network.decoder.requires_grad_(False)  # it has no part in these
     if config.objective == "simclr":
         return SimCLR(model, augmentation, config.temperature)
-    kinds = {"simsiam": SimSiam, "autoencoder": Autoencoder, "predictive": Predictive}
-    return kinds[config.objective](model, augmentation)
+    others = {"simsiam": SimSiam, "autoencoder": Autoencoder, "predictive": Predictive}
+    return others[config.objective](model, augmentation)
 
 
 class Objective(nn.Module):
@@ -132,7 +148,7 @@ def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> 
     """Half the cross-entropy of the last step, half the mean of all steps that can know anything.
 
     logits (batch, step, class), labels (batch,) -> scalar. The first `lag` steps, before any input
-    has reached the output, would only teach the prior.
+    has reached the output, would only teach the prior. A label of -1 counts as no loss.
     """
     steps = logits[:, lag:]
     n = steps.shape[1]
@@ -140,6 +156,7 @@ def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> 
         steps.flatten(0, 1).float(),
         labels[:, None].expand(-1, n).flatten(),
         reduction="none",
+        ignore_index=-1,
         label_smoothing=smoothing,
     ).view(-1, n)
     return 0.5 * each[:, -1].mean() + 0.5 * each.mean()
@@ -147,29 +164,80 @@ def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> 
 
 def last_loss(logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
     """The cross-entropy of the last step, as published; shapes as above."""
-    return F.cross_entropy(logits[:, -1].float(), labels, label_smoothing=smoothing)
+    each = F.cross_entropy(
+        logits[:, -1].float(), labels, reduction="none", ignore_index=-1, label_smoothing=smoothing
+    )
+    return each.mean()
+
+
+def identity_loss(embedding: Tensor, objects: Tensor, temperature: float) -> Tensor:
+    """Contrast embeddings: those of one object are to be found among all (Khosla et al. 2020).
+
+    embedding (n, unit) of length 1, objects (n,), -1: of none -> scalar, the mean over all that
+    have another of their object. Their cosines count divided by the temperature.
+    """
+    itself = torch.eye(len(objects), dtype=torch.bool, device=objects.device)
+    same = (objects[:, None] == objects) & (objects >= 0) & ~itself
+    similarity = (embedding @ embedding.T / temperature).masked_fill(itself, float("-inf"))
+    found = torch.where(same, F.log_softmax(similarity, dim=1), 0.0).sum(dim=1)
+    others = same.sum(dim=1)
+    return -(found / others.clamp(min=1)).sum() / (others > 0).sum().clamp(min=1)
 
 
 class Supervised(Objective):
-    """Categories.
+    """Categories, and of labels (batch, 3) kinds and objects.
 
     Args:
         loss: "anytime" or "last".
+        class_of: (name,) the class of each kind; a kind is sought among those of its class alone.
+        names, identity: weights of the losses of kinds and of objects.
+        temperature: of the latter.
     """
 
+    class_of: Tensor
+
     def __init__(
-        self, model: TactileClassifier, augmentation: Augmentation, loss: str, smoothing: float
+        self,
+        model: TactileClassifier,
+        augmentation: Augmentation,
+        loss: str,
+        smoothing: float,
+        class_of: Sequence[int] = (),
+        names: float = 0.0,
+        identity: float = 0.0,
+        temperature: float = 0.1,
     ) -> None:
         super().__init__(model, augmentation)
         self._anytime, self._smoothing = loss == "anytime", smoothing
+        self._names, self._identity, self._temperature = names, identity, temperature
+        self.register_buffer("class_of", torch.tensor(class_of, dtype=torch.int64), False)
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         (frames,) = seen
-        logits = self.model.network(frames)
-        with _in_single_precision(logits):
-            if self._anytime:
-                return anytime_loss(logits, labels, self._smoothing, self.model.network.lag)
-            return last_loss(logits, labels, self._smoothing)
+        network = self.model.network
+        answers = network.answer(frames)
+        with _in_single_precision(answers):
+            found = network.split(answers.float())
+            if labels.dim() == 1:
+                return self._entropy(found["logits"], labels, self._smoothing)
+            classes, names, objects = labels.unbind(1)
+            loss = self._entropy(found["logits"], classes, self._smoothing)
+            if "names" in found:
+                inside = classes[:, None] == self.class_of  # (batch, name)
+                own = found["names"].masked_fill(~inside[:, None], OUTSIDE)
+                share = (names >= 0).float().mean().clamp(min=1 / len(names))
+                loss = loss + self._names * self._entropy(own, names, 0.0) / share
+            if self._identity:
+                rows = torch.cat([found["embedding"][:, -1], objects[:, None].float()], dim=1)
+                rows = _of_all_devices(rows)
+                contrast = identity_loss(rows[:, :-1], rows[:, -1], self._temperature)
+                loss = loss + self._identity * contrast
+            return loss
+
+    def _entropy(self, logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
+        if self._anytime:
+            return anytime_loss(logits, labels, smoothing, self.model.network.lag)
+        return last_loss(logits, labels, smoothing)
 
 
 def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:

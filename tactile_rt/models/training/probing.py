@@ -68,8 +68,9 @@ def probe(
         classes, held_out = len(manifest.categories), _validation(trained, begin, validation)
         layer, history = linear_probe(features, labels, *held_out, classes, config)
         network = replace(
-            trained.network.config, classes=classes, decoder="linear", readout=config.readout
-        )
+            trained.network.config, classes=classes, decoder="linear", readout=config.readout,
+            names=0, identity=0,
+        )  # fmt: skip
         model = TactileClassifier(manifest.spec, network, manifest.limits)
         head = "network.decoder."
         kept = {k: v for k, v in trained.state_dict().items() if not k.startswith(head)}

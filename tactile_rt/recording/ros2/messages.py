@@ -61,6 +61,8 @@ class _Decision(_Told):
     probabilities: dict[str, float] = {}
     prediction_set: list[str] = []
     coverage: float | None = None
+    names: list[str] = []
+    names_coverage: float | None = None
     model_ms: float = 0.0
     latency_ms: float = 0.0
     age_ms: float = 0.0
@@ -91,6 +93,8 @@ def decision_message(text: bytes) -> bytes:
             "probabilities": list(said.probabilities.values()),
             "prediction_set": said.prediction_set,
             "coverage": math.nan if said.coverage is None else said.coverage,
+            "names": said.names,
+            "names_coverage": math.nan if said.names_coverage is None else said.names_coverage,
             "model_ms": said.model_ms, "latency_ms": said.latency_ms, "age_ms": said.age_ms,
             "late": said.late, "json": text.decode(),
         },

@@ -78,6 +78,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
         recipe=replace(recipe, objects=chosen).to_dict(),
         withheld=(*withheld, *outliers),
         category_of=objects.category_of,
+        kind_of=objects.kind_of,
         versions={
             "tactile_rt": VERSION,
             "engine": engine_version(PROFILES[recipe.profile]),

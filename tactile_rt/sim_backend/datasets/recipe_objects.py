@@ -85,6 +85,11 @@ class ShapeObjects:
         return {name: name[len(self._prefix) : name.rindex("-")] for name in names}
 
     @property
+    def kind_of(self) -> dict[str, str]:
+        """Nothing: a category of them is of one kind."""
+        return {}
+
+    @property
     def skipped(self) -> dict[str, str]:
         """Nothing: all of them can be made."""
         return {}
@@ -205,6 +210,13 @@ class MeshObjects:
         """Category of every object."""
         names = chain.from_iterable(self.split.values())
         return {name: self._set.categories[self._names[name]] for name in names}
+
+    @property
+    def kind_of(self) -> dict[str, str]:
+        """Kind of every object of which the folder says it."""
+        names, origins = chain.from_iterable(self.split.values()), self._set.origins
+        known = {name: origins[own].kind for name in names if (own := self._names[name]) in origins}
+        return {name: kind for name, kind in known.items() if kind}
 
     @property
     def skipped(self) -> dict[str, str]:

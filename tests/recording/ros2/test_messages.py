@@ -163,6 +163,17 @@ def test_a_decision_s_prediction_set_and_probabilities():
     assert math.isnan(none["coverage"])
 
 
+def test_a_decision_s_names_which_older_recordings_lack():
+    said = msgspec.json.encode({"label": "block", "names": ["box", "crate"], "names_coverage": 0.9})
+    message = messages.decision_message(said)
+    found = cdr.decode(messages.DECISION, message)
+    assert (found["names"], found["names_coverage"]) == (["box", "crate"], 0.9)
+    older = message[: message.index(said) + len(said) + 1]
+    assert messages.json_of(messages.DECISION, older) == said
+    with pytest.raises(ValueError, match="are no"):
+        messages.json_of(messages.DECISION, message[:-4])
+
+
 def test_only_one_element_that_measures_a_whole_force_in_newton_has_a_wrench():
     one = replace(small_spec(1), channels=("fx", "fy", "fz"), units=("N", "N", "N"))
     values = np.array([[[1, 2, 3]]], np.float32)

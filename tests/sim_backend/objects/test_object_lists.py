@@ -21,6 +21,7 @@ import trimesh
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
+from tactile_rt.sim_backend.datasets.recipes import ObjectChoice
 from tactile_rt.sim_backend.objects import object_lists
 from tactile_rt.sim_backend.objects.object_lists import (
     ListedFile,
@@ -88,9 +89,9 @@ def test_objects_come_out_of_a_folder_of_clones(shapes, tmp_path: Path, call) ->
     assert out.startswith("2 of 2 objects of 2 kinds are in ")
     upright(tmp_path / "got")
     assert (tmp_path / "got" / "objects.csv").read_text().splitlines() == [
-        "category,name,shape,source,licence",
-        "box,brick,brick,some/shapes,CC0-1.0",
-        "chair,one,one,some/shapes,CC0-1.0",
+        "category,name,shape,source,licence,kind",
+        "box,brick,brick,some/shapes,CC0-1.0,",
+        "chair,one,one,some/shapes,CC0-1.0,",
     ]
     code, out, _ = call("objects", "check", tmp_path / "got")
     assert code == 0 and "chair" in out
@@ -241,6 +242,17 @@ def test_the_list_of_everyday_things_has_hundreds_that_are_alone_of_their_kind()
     assert {thing.files[0].licence for thing in things} == {"CC0-1.0"}
     assert len({thing.name for thing in things}) == len(things) > 800
     assert sum(thing.files[0].category == "thing" for thing in things) > 400
+
+
+def test_kinds_within_a_category_come_from_the_folder_s_table(tmp_path: Path) -> None:
+    (tmp_path / "block").mkdir()
+    rows = ["category,name,kind"]
+    for k in range(6):
+        (tmp_path / "block" / f"{k}.ply").touch()
+        rows.append(f"block,{k},{'box' if k % 2 else ''}")
+    (tmp_path / "objects.csv").write_text("\n".join(rows))
+    choice = ObjectChoice(str(tmp_path), validation=1, test=1)
+    assert choose_objects(choice).kind_of == {f"block-{k}": "box" for k in (1, 3, 5)}
 
 
 def test_variants_stay_on_one_side_and_a_source_can_be_left_out(tmp_path: Path) -> None:

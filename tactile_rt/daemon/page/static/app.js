@@ -77,7 +77,8 @@ const take = {
     const last = decisions.findLast((d) => d.model === m.model);
     const from = last && last.onset === onset ? last.t : Math.max(onset, t - STEP_MS);
     decisions.push({ t, from, onset, model: m.model, step: m.step, final: m.final, label: m.label,
-      p: m.probabilities, prediction_set: m.prediction_set || [], coverage: m.coverage });
+      p: m.probabilities, prediction_set: m.prediction_set || [], coverage: m.coverage,
+      names: m.names || [], names_coverage: m.names_coverage });
     if (decisions.length > 2000) decisions.splice(0, 1000);
     dirty = true;
   },
@@ -405,10 +406,18 @@ function draw() {
   decide(newest ? newest.t : (decisions.at(-1) || { t: 0 }).t);
 }
 
-function possible(decision) {
-  const names = decision.prediction_set, shown = names.slice(0, SET_SHOWN);
+function possible(names, coverage) {
+  const shown = names.slice(0, SET_SHOWN);
   const more = names.length > shown.length ? ` and ${names.length - shown.length} more` : "";
-  return `if it is of a known kind, one of: ${shown.join(", ")}${more} (${Math.round(100 * decision.coverage)} % coverage)`;
+  return `one of: ${shown.join(", ")}${more} (${Math.round(100 * coverage)} % coverage)`;
+}
+
+function sets(decision) {
+  const { prediction_set, coverage, names, names_coverage, label } = decision;
+  return [
+    prediction_set.length ? `if it is of a known kind, ${possible(prediction_set, coverage)}` : "",
+    names.length ? `if it is a ${label}, ${possible(names, names_coverage)}` : "",
+  ].filter(Boolean).join("; ");
 }
 
 function decide(now) {
@@ -438,7 +447,7 @@ function decide(now) {
   $("episode").textContent = !about ? "" : touching
     ? `in contact${last ? `, step ${last.step}${last.final ? " (last)" : ""}` : ""}`
     : last ? `no contact; decided ${Math.max(0, (now - last.t) / 1000).toFixed(0)} s ago` : "no contact yet";
-  $("prediction-set").textContent = last && last.prediction_set.length ? possible(last) : "";
+  $("prediction-set").textContent = last ? sets(last) : "";
   const top = last ? Object.entries(last.p).sort((a, b) => b[1] - a[1]).slice(0, 5) : [];
   const list = $("top");
   while (list.children.length < 5) {
