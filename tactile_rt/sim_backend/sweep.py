@@ -126,7 +126,7 @@ def way_to_contact(
 
 
 def _thin(piece: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Thin out the corners of a piece that has many, within 0.3 % of its size."""
+    """Thin out many corners of a piece, within 0.3 % of its size."""
     if len(piece.vertices) <= SIDES:
         return piece
     z, turn = np.linspace(-1, 1, SIDES), np.pi * (3 - np.sqrt(5)) * np.arange(SIDES)
