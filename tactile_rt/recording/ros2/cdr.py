@@ -115,7 +115,6 @@ CODES = {
 }  # fmt: skip
 MOST_S = 2**31 - 1  # a stamp's seconds are an int32
 NS = 10**9
-LATER = ("names", "names_coverage")  # fields at the end of a decision, not in older recordings
 
 
 def encode(message: str, values: Mapping[str, Any]) -> bytes:
@@ -186,8 +185,6 @@ def _number(out: bytearray, code: str, size: int, value: Any) -> None:
 def _take(data: bytes, at: int, message: str) -> tuple[dict[str, Any], int]:
     found: dict[str, Any] = {}
     for name, kind, many in fields_of(message):
-        if at == len(data) and name in LATER:
-            break
         n = 1
         if many:
             n, at = _read(data, at, "I", 4)

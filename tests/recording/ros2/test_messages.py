@@ -159,19 +159,11 @@ def test_a_decision_s_prediction_set_and_probabilities():
     assert (found["labels"], found["probabilities"]) == (["a", "b"], [0.25, 0.75])
     assert (found["coverage"], found["prediction_set"], found["is_final"]) == (0.9, ["b"], True)
     assert found["header"]["stamp"] == {"sec": 1, "nanosec": 7}
+    named = messages.decision_message(b'{"names": ["box", "crate"], "names_coverage": 0.9}')
+    found = cdr.decode(messages.DECISION, named)
+    assert (found["names"], found["names_coverage"]) == (["box", "crate"], 0.9)
     none = cdr.decode(messages.DECISION, messages.decision_message(b'{"coverage": null}'))
     assert math.isnan(none["coverage"])
-
-
-def test_a_decision_s_names_which_older_recordings_lack():
-    said = msgspec.json.encode({"label": "block", "names": ["box", "crate"], "names_coverage": 0.9})
-    message = messages.decision_message(said)
-    found = cdr.decode(messages.DECISION, message)
-    assert (found["names"], found["names_coverage"]) == (["box", "crate"], 0.9)
-    older = message[: message.index(said) + len(said) + 1]
-    assert messages.json_of(messages.DECISION, older) == said
-    with pytest.raises(ValueError, match="are no"):
-        messages.json_of(messages.DECISION, message[:-4])
 
 
 def test_only_one_element_that_measures_a_whole_force_in_newton_has_a_wrench():
