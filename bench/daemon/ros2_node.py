@@ -118,13 +118,13 @@ class DecisionMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
     probabilities: sequence[float64]
     prediction_set: sequence[str]
     coverage: float64
+    names: sequence[str]
+    names_coverage: float64
     model_ms: float64
     latency_ms: float64
     age_ms: float64
     late: bool
     json: str
-    names: sequence[str]
-    names_coverage: float64
 
 
 @dataclass
