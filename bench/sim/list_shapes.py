@@ -174,7 +174,7 @@ class FoundObject:
 
     @property
     def key(self) -> str:
-        """Of what is kept of it."""
+        """Name the file of the cache that keeps its look."""
         first = next(iter(self.files))
         return hashlib.sha1(f"{self.source.repository}:{first}".encode()).hexdigest()[:16]
 
@@ -185,7 +185,7 @@ def _git(place: Path, *command: str) -> bytes:
 
 
 def _blobs(place: Path, paths: list[str]) -> Iterator[tuple[str, bytes]]:
-    """What a clone has of files at its head; a clone may lack large ones."""
+    """Read files of a clone at its head; it may lack large ones."""
     asked = "".join(f"HEAD:{path}\n" for path in paths).encode()
     with tempfile.TemporaryFile() as file:
         file.write(asked)

@@ -203,7 +203,7 @@ class TrainingConfig:
 
     @property
     def related(self) -> bool:
-        """Whether it is learnt from what sweeps have in common beside their class."""
+        """True if kinds or objects are learnt, beside classes."""
         return self.names > 0 or self.identity > 0
 
     def check_sets(self) -> None:
