@@ -26,6 +26,11 @@ class Helper:
         self._process.start()
         theirs.close()
 
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        return self._process.pid or 0
+
     def hear(self, seconds: float = 0.0) -> Any:
         """What it says next.
 

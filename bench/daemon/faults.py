@@ -11,12 +11,13 @@ was told, what else was, and when nothing was told any more.
 import argparse
 import http.client
 import json
+import os
 import re
 import signal
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -32,8 +33,8 @@ ASK_S = 0.04
 SEEN_S, GONE_S = 1.0, 2.0  # stated
 HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
 PATIENCE_S = 12.0
-# Two looks further apart, or a thread of the daemon that waited longer for a processor, beside what
-# every turn takes: the machine has other things to do.
+# Two looks further apart, or a thread (of the daemon, an array or this process) that waited longer
+# for a processor, beside what every turn takes: the machine has other things to do.
 BUSY_S, WAITED_S, TURN_NS = 0.25, 0.15, 150_000
 RETRIES = 3
 DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
@@ -145,7 +146,7 @@ def repeat(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> Repetition:
 def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repetition, bool]:
     named, allowed = frozenset(kind.named), frozenset(kind.named + kind.also)
     began, disagreed = time.monotonic(), watcher.disagreed
-    waited = _waited(scene.daemon.process.pid)
+    waited = _waited(scene)
     with contextmanager(kind.cause)(scene) as effect:  # type: ignore[arg-type]
         if named:
             seen = watcher.wait(lambda look: named <= look.diagnostics.keys(), began, PATIENCE_S)
@@ -167,7 +168,7 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
         }
     )
     gaps = np.diff([look.at for look in looks]) if len(looks) > 1 else np.zeros(1)
-    more = _waited(scene.daemon.process.pid)
+    more = _waited(scene)
     longest_s = max(ns - waited.get(task, 0) for task, ns in more.items()) / 1e9
     # while a process is stopped nobody answers
     busy = (gaps.max() > BUSY_S or longest_s > WAITED_S) and not kind.blind
@@ -177,13 +178,16 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     ), busy  # fmt: skip
 
 
-def _waited(pid: int) -> dict[str, int]:
+def _waited(scene: FaultScene) -> dict[str, int]:
     """How long each thread has waited for a processor so far, by the kernel's account and beyond
     what every turn takes, ns."""
     found = {}
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        _, waited, turns = map(int, (task / "schedstat").read_text().split())
-        found[task.name] = waited - TURN_NS * turns
+    arrays = (array.pid for array in scene.arrays.values())
+    for pid in (scene.daemon.process.pid, *arrays, os.getpid()):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            with suppress(OSError):  # it has just ended
+                _, waited, turns = map(int, (task / "schedstat").read_text().split())
+                found[task.name] = waited - TURN_NS * turns
     return found
 
 

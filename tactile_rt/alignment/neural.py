@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 
@@ -169,7 +169,7 @@ def read_published(path: Path) -> dict[str, Floats]:
     except FileNotFoundError:
         raise ConfigError(f"no file {path}") from None
     except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = describe_error(error)
         raise ConfigError(f"{path}: not an npz file of numbers ({reason})") from None
     if not arrays:
         raise ConfigError(f"{path}: holds no animal")

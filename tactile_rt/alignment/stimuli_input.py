@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
@@ -99,7 +99,7 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
     except FileNotFoundError:
         raise ConfigError(f"no file {path}: make one with `tactile-rt whisk`") from None
     except Exception as error:  # numpy and zipfile raise many unrelated types for a damaged file
-        reason = " ".join(str(error).split())[:80] or type(error).__name__
+        reason = describe_error(error, 80)
         raise ConfigError(f"{path} is no model input of `tactile-rt whisk`: {reason}") from None
     for what in ("stimuli", "elements", "channels", "units"):
         text = arrays[what]

@@ -18,11 +18,15 @@ objects = add_group("objects", "Download objects to simulate, and check meshes o
 
 @objects.command(epilog="tactile-rt objects get real objects")
 def get(
-    wanted: Annotated[str, typer.Argument(metavar="LIST", help="The list: real, or a CSV file.")],
+    wanted: Annotated[
+        str, typer.Argument(metavar="LIST", help="The list: real, real2, everyday, or a CSV file.")
+    ],
     folder: Annotated[Path, typer.Argument(help="Folder to write: FOLDER/CATEGORY/NAME.ply.")],
     clones: Annotated[
         Path | None,
-        typer.Option(help="Folder of cloned repositories to use instead of GitHub."),
+        typer.Option(
+            help="Folder of cloned repositories and unpacked packages to use instead of GitHub."
+        ),
     ] = None,
     json: Json = None,
 ) -> None:

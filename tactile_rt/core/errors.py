@@ -20,6 +20,7 @@ __all__ = [
     "SourceError",
     "SpecMismatch",
     "TactileError",
+    "describe_error",
     "explain_errors",
     "length",
     "name_some",
@@ -75,6 +76,15 @@ class ModelError(TactileError):
     """A model file is damaged, incomplete or of another version; the message names the file."""
 
 
+def describe_error(error: BaseException, most: int | None = None) -> str:
+    """Describe an error by its words in one line; without any, by its type.
+
+    Args:
+        most: Number of characters of its words.
+    """
+    return " ".join(str(error).split())[:most] or type(error).__name__
+
+
 @contextmanager
 def explain_errors(
     kind: type[TactileError], before: str, after: str = ")", most: int | None = None
@@ -89,5 +99,4 @@ def explain_errors(
     except TactileError:
         raise
     except Exception as error:  # parsers raise a dozen unrelated types
-        reason = " ".join(str(error).split())[:most] or type(error).__name__
-        raise kind(f"{before}{reason}{after}") from None
+        raise kind(f"{before}{describe_error(error, most)}{after}") from None

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Generic
 
-from tactile_rt.core.errors import ConfigError, SourceError
+from tactile_rt.core.errors import ConfigError, SourceError, describe_error
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 
@@ -272,7 +272,7 @@ class SlcanLink(Link[Sequence[CanFrame]]):
 def _reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
-    return " ".join(str(error).split()) or type(error).__name__
+    return describe_error(error)
 
 
 def _why(port: str, error: Exception) -> str:

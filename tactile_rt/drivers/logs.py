@@ -18,7 +18,7 @@ from itertools import islice, pairwise, tee, zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
-from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.codec import CanFrame
@@ -231,7 +231,7 @@ class LineLog:
         except OSError:
             raise
         except Exception as error:  # python-can raises anything on what is cut or damaged
-            why = " ".join(str(error).split()) or type(error).__name__
+            why = describe_error(error)
             self.notes.append(f"it is cut short or damaged after {self.frames} frames ({why:.80})")
         finally:
             warned.removeFilter(self._note_warning)

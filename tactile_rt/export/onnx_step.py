@@ -113,6 +113,7 @@ def export_checkpoint(
     model, saved = trained
     manifest = join_manifests(manifests)
     refusals = tuple(saved["refusals"])
+    engines = sorted({m.versions["engine"] for m in manifests if "engine" in m.versions})
     card = ModelCard(
         name=name,
         spec=saved["spec"],
@@ -141,7 +142,7 @@ def export_checkpoint(
             "unseen_objects": list(manifests[0].split["test"]),
             "trained_objects": trained_objects(manifests, saved),
             "tactile_rt": VERSION,
-            "engine": manifest.versions.get("engine", "1"),  # of the simulated sweeps
+            **({"engine": ", ".join(engines)} if engines else {}),  # of the simulated sweeps
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on
             "onnx": onnx.__version__,
             "onnxruntime": onnxruntime.__version__,

@@ -156,7 +156,7 @@ def embedding_statistics(
 
 
 def run_file(path: Path) -> Step:
-    """The function that `evaluation.predict` wants, of a model file of either kind."""
+    """The function that `evaluation.measures.predict` wants, of a model file of either kind."""
     session, card = load_model(path, kind=None)
 
     def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:

@@ -25,7 +25,7 @@ __all__ = [
     "utc_offset_ns",
 ]
 
-LAYOUT_VERSION = "2"
+LAYOUT_VERSION = "3"
 METADATA, SESSION, SUMMARY, RECOVERED = "tactile_rt", "session", "summary", "recovered"
 
 

@@ -43,13 +43,13 @@ def foreign(path):
         other.finish()
 
 
-def newer(path):
+def older(path):
     from mcap.writer import Writer
 
     with path.open("wb") as file:
         other = Writer(file)
         other.start()
-        other.add_metadata("tactile_rt", {"version": "3"})
+        other.add_metadata("tactile_rt", {"version": "2"})
         other.finish()
 
 
@@ -61,9 +61,9 @@ def newer(path):
         (lambda p: p.write_bytes(b""), RecordingError, "not an MCAP file"),
         (lambda p: p.write_text("seq,t_ns\n"), RecordingError, "not an MCAP file"),
         (foreign, RecordingError, "no recording of tactile-rt"),
-        (newer, RecordingError, "of version '3'; this release reads 2"),
+        (older, RecordingError, "of version '2'; this release reads 3"),
     ],
-    ids=["missing", "folder", "empty", "text", "another's mcap", "newer"],
+    ids=["missing", "folder", "empty", "text", "another's mcap", "older"],
 )
 def test_what_is_no_recording_is_named(make, kind, said, path):
     make(path)

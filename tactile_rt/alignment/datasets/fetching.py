@@ -28,7 +28,7 @@ from tactile_rt.alignment.nwb_parts import (
     WHISKER,
     last_time,
 )
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, describe_error
 from tactile_rt.core.files import write_whole
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ def _needed(remote: RangeFile, published: PublishedFile) -> tuple[bytes, int]:
             target.attrs["source"] = published.url
             target.attrs["source_sha256"] = published.sha256
     except Exception as error:  # of what a file over the network raises, h5py makes many things
-        reason = remote.error or " ".join(str(error).split()) or type(error).__name__
+        reason = remote.error or describe_error(error)
         raise ConfigError(f"{published.path} cannot be fetched: {reason}") from None
     return small.getvalue(), remote.transferred
 

@@ -114,8 +114,10 @@ class Names:
     def cut_glued(self, line: str) -> str:
         """Return what follows where a sample broke off and another begins; empty: nowhere."""
         for found in self._glued.finditer(line):
-            if self._names[found[2]] <= self._names[found[1]]:
-                return line[found.end() :]
+            one, other = (self._patterns[self._names[name]] for name in found.groups())
+            rest = line[found.end() :]
+            if other.search(line[: found.end()]) or one.search(rest):  # one of them comes again
+                return rest
         return ""
 
 

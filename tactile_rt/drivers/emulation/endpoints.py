@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic
 
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, describe_error
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.emulation.pseudo_terminal import Pty, Wire, bytes_s, frames_s
 from tactile_rt.drivers.slcan import SlcanAdapter
@@ -237,7 +237,7 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
         try:
             self._bus = can.Bus(self._channel, self._interface, bitrate=self._bitrate, **options)
         except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
-            why = " ".join(str(error).split()) or type(error).__name__
+            why = describe_error(error)
             raise ConfigError(f"bus {self.address[4:]} cannot be opened ({why})") from None
 
     def pull(self) -> None:

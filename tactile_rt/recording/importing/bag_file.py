@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, Final
 
-from tactile_rt.core.errors import RecordingError
+from tactile_rt.core.errors import RecordingError, describe_error
 from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import require_extra
 from tactile_rt.recording.records import MAGIC
@@ -75,7 +75,7 @@ class OpenBag:
         try:
             yield from self.reader.messages(connections=which)
         except Exception as error:  # so it does where a chunk is damaged
-            note = f"it is damaged, and read up to there ({_words(error)})"
+            note = f"it is damaged, and read up to there ({describe_error(error)})"
             self.notes += [note] if note not in self.notes else []
 
     def _decode(self, connection: Any, raw: bytes) -> Any:
@@ -104,7 +104,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         try:
             reader = stack.enter_context(AnyReader([path], default_typestore=store))
         except Exception as error:  # rosbags and what it reads by raise anything on a damaged bag
-            why = _words(error)
+            why = describe_error(error)
             notes = [f"its end is missing or damaged ({why}): what is whole before it was read"]
             new = Path(stack.enter_context(TemporaryDirectory())) / "mended.mcap"
             if path.suffix == ".mcap" and _mend_bag(path, new):
@@ -116,10 +116,6 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
                     "`ros2 bag reindex` mend one without its end"
                 ) from None
         yield OpenBag(reader, notes)
-
-
-def _words(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def _mend_bag(path: Path, new: Path) -> int:

@@ -157,10 +157,7 @@ def write_chunks(
     def fill(file: BinaryIO) -> None:
         made = McapFile(file, about)
         for at in range(0, n, size):
-            piece = slice(at, at + size)
-            part = Chunk(
-                chunk.seq[piece], chunk.t_ns[piece], chunk.values[piece], chunk.valid[piece]
-            )
+            part = chunk.select(slice(at, at + size))
             made.add(SAMPLES, encode_samples(part), int(part.t_ns[-1]))
         made.note(SUMMARY, {"samples": str(n), "packets": "0"})
         made.finish()

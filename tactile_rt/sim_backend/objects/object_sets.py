@@ -29,7 +29,7 @@ from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-__all__ = ["FOLDER_TABLE", "ObjectSet", "Origin", "open_objects"]
+__all__ = ["FOLDER_TABLE", "ObjectRow", "ObjectSet", "Origin", "open_objects", "read_table"]
 
 SHAPENET_FILE = Path("models") / "model_normalized.obj"
 TAXONOMY = "taxonomy.json"
@@ -55,7 +55,9 @@ class Origin(msgspec.Struct, frozen=True):
     attribution: str = ""
 
 
-class _Row(Origin, frozen=True, kw_only=True):
+class ObjectRow(Origin, frozen=True, kw_only=True):
+    """A row of a folder's `objects.csv`."""
+
     category: str
     name: str
 
@@ -138,7 +140,7 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
             f"{', '.join(MESH_SUFFIXES[1:])}), or ShapeNet's synset/id/{SHAPENET_FILE.as_posix()}"
         )
     named = [(p.parent.name, p.stem, p) for p in plain]
-    return ObjectSet(folder, _named(folder, named), detail, _origins(folder))
+    return ObjectSet(folder, _named(folder, named), detail, dict(read_table(folder)))
 
 
 def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
@@ -155,15 +157,15 @@ def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
     return dict(sorted(paths.items()))
 
 
-def _origins(folder: Path) -> dict[str, Origin]:
-    """What the folder's table says of its objects, if it has one."""
+def read_table(folder: Path) -> dict[str, ObjectRow]:
+    """Read what a folder's table says of its objects by their names; nothing if it has none."""
     path = folder / FOLDER_TABLE
     if not path.exists():
         return {}
     table = read_csv(path)
     known = ("category", "name", *Origin.__struct_fields__)
     check_columns(table, known, known[:2])
-    rows: list[_Row] = [convert(row, _Row) for row in table.rows]
+    rows: list[ObjectRow] = [convert(row, ObjectRow) for row in table.rows]
     return {f"{_safe(row.category)}/{_safe(row.name)}": row for row in rows}
 
 

@@ -101,4 +101,7 @@ def compiled(function: Function) -> Function:
 def is_kept(function: Callable[..., Any]) -> bool:
     """Return True if other processes find this version of a function compiled."""
     cache: Any = getattr(function, "_cache", None)
-    return isinstance(cache, _Kept) and bool(cache._cache_file._load_index())
+    try:
+        return isinstance(cache, _Kept) and bool(cache._cache_file._load_index())
+    except Exception:  # as when one is loaded
+        return False

@@ -3,7 +3,7 @@ const $ = (id) => document.getElementById(id);
 const buttons = new Map(); // of the classes, by name
 let listed = ""; // names of the classes on the page
 let shown = ""; // the newest state
-let asked = 0; // how often the state was asked for
+let asking = false; // an answer is on its way
 
 async function order(text) {
   try {
@@ -57,15 +57,17 @@ function show(state) {
 }
 
 async function look() {
-  const mine = ++asked;
+  if (asking) return;
+  asking = true;
   try {
     const text = await (await fetch("state")).text();
-    if (mine !== asked) return; // a newer answer is on its way
     if (text !== shown) show(JSON.parse(text));
     shown = text;
   } catch {
     shown = "";
     $("prompt").textContent = "The teaching program has ended.";
+  } finally {
+    asking = false;
   }
 }
 

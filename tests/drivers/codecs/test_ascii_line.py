@@ -11,6 +11,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
+from tactile_rt.drivers.codecs.ascii_text import Names
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,
@@ -145,6 +146,20 @@ def test_a_name_before_a_number_may_stand_there() -> None:
     line = b"\nt:5, x=1.5 y: 2\tz_2 = 3 w4:4\n"
     samples = ascii_line("-,A0.a,A0.b,A0.c,A0.d").feed(line, T0)
     assert samples is not None and samples.values.tolist() == [[[1.5, 2.0, 3.0, 4.0]]]
+
+
+@pytest.mark.parametrize(
+    ("line", "rest"),
+    [
+        ("X:1X:3,Y:4", "X:3,Y:4"),
+        ("X:1,Y:2X:3,Y:4", "X:3,Y:4"),
+        ("Y:2X:3,Y:4", "X:3,Y:4"),
+        ("Y:2X:3", ""),  # in another order, and whole
+        ("X:2Y:3", ""),
+    ],
+)
+def test_a_sample_breaks_off_where_a_name_comes_again(line: str, rest: str) -> None:
+    assert Names({"X": 0, "Y": 1}).cut_glued(line) == rest
 
 
 def test_a_count_that_is_none_is_damage() -> None:

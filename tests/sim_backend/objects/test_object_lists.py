@@ -97,6 +97,20 @@ def test_objects_come_out_of_a_folder_of_clones(shapes, tmp_path: Path, call) ->
     assert code == 0 and "chair" in out
 
 
+def test_a_second_list_takes_nothing_away_of_the_first(shapes, tmp_path: Path, call) -> None:
+    wanted, clones = shapes
+    get_objects(read_list(str(wanted)), tmp_path / "got", clones)
+    first = open_objects(tmp_path / "got").origins
+    brick = part(clones / "shapes", "meshes/other.ply", box((0, 0, 0), (3, 2, 3)))
+    rows = [{"name": "other", **brick}, {"name": "brick", "repository": "an/other", **brick}]
+    second = listed(tmp_path / "second.csv", rows)
+    code, out, err = call("objects", "get", second, tmp_path / "got", "--clones", clones)
+    assert code == 1
+    assert "box/brick.ply is of some/shapes: choose another folder" in out + err
+    both = open_objects(tmp_path / "got").origins
+    assert first.items() <= both.items() and both.keys() - first.keys() == {"box/other"}
+
+
 def test_a_commit_counts_and_not_what_lies_about(shapes, tmp_path: Path) -> None:
     wanted, clones = shapes
 
@@ -209,9 +223,9 @@ def test_objects_come_out_of_an_archive_of_an_unpacked_package(shapes, tmp_path:
         if archive:
             (folder / "all.sh3f").write_bytes(archive)
         why = get_objects(things, tmp_path / "again", clones)["box/brick"]
-        assert f"{clones}: no brick.ply of shapes; `apt-get download shapes`, `dpkg -x" in why
+        assert f"{clones}: no brick.ply of shapes; `apt-get download shapes=1.8-1`" in why
     why = get_objects(things, tmp_path / "again")["box/brick"]
-    assert why.startswith("shapes is a package; `apt-get download shapes`")
+    assert why.startswith("shapes is a package; `apt-get download shapes=1.8-1`")
     assert why.endswith("and say --clones FOLDER")
 
 
