@@ -12,7 +12,7 @@ import io
 import lzma
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,24 +21,25 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.models.datasets import SweepSet
+from bench.perception.folds import KINDS, hold_out_makers
+from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD, SweepManifest
 from tactile_rt.sets.objects import Sweeps
+from tactile_rt.sim_backend.objects.object_sets import Origin
 
 NAME, VERSION = "realtouch", 1
 FILE = Path(__file__).parent / "data" / f"{NAME}-{VERSION}.xz"
+SHAPES_FILE = FILE.with_name(f"{NAME}-2.xz")
 SOURCE = "source"  # known kinds from a source that no other split has anything of
-SPLITS = ("train", "validation", "test", SOURCE, OUTLIERS, WITHHELD)
+SPLITS = ("train", "validation", "test", SOURCE, OUTLIERS, WITHHELD, KINDS)
 STEP = 0.2  # of the rated noise
 
 
-class _Origin(msgspec.Struct, frozen=True):
-    """Where an object is from."""
+class BenchmarkObject(Origin, frozen=True, kw_only=True, omit_defaults=True):
+    """Where an object is from, of what category it is, and on which side."""
 
     category: str
     split: str
-    source: str
-    licence: str
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,21 @@ class Portion:
         folder: The sweep set that they come from.
         there: Their split in that set.
         wide: Whether the objects lie in any way, and are of any size and speed.
+        most: The number of sweeps of each object that are taken; 0: all.
     """
 
     split: str
     folder: Path
     there: str
     wide: bool = False
+    most: int = 0
+
+    def read(self) -> SweepSet:
+        """Its sweeps, an object's first ones."""
+        data = SweepSet.read(self.folder, self.there)
+        _, begins, counts = np.unique(data.sweeps.objects, return_index=True, return_counts=True)
+        place = np.arange(len(data.sweeps)) - np.repeat(np.sort(begins), counts[begins.argsort()])
+        return data[place < (self.most or len(place))]
 
 
 @dataclass(frozen=True)
@@ -63,7 +73,7 @@ class Data:
     """The benchmark's data.
 
     Attributes:
-        sets: The sweeps of every split of `SPLITS`, labelled by `kinds`; -1 of the last two.
+        sets: The sweeps of every split of `SPLITS`, labelled by `kinds`; -1 where they have none.
         wide: The same objects of the splits "test" and "source" in the wide world.
         origins: Kind, split, source and licence of every object.
         digest: SHA-256 of the file.
@@ -71,7 +81,7 @@ class Data:
 
     sets: dict[str, SweepSet]
     wide: dict[str, SweepSet]
-    origins: dict[str, _Origin]
+    origins: dict[str, BenchmarkObject]
     digest: str
 
     @cached_property
@@ -79,26 +89,36 @@ class Data:
         """The known kinds, in the order of their labels."""
         return self.sets["train"].manifest.categories
 
+    def without_makers(self, makers: Sequence[str]) -> "Data":
+        """The same with all objects of some makers in a split of their own, `MAKER`."""
+        whole = joined([one for one in self.sets.values() if len(one.sweeps)])
+        split = hold_out_makers(self.sets["train"].manifest, self.origins, makers).split
+        sets = {
+            side: whole[np.flatnonzero(np.isin(whole.sweeps.objects, names))]
+            for side, names in split.items()
+            if names
+        }
+        return replace(self, sets=sets, wide={})
 
-def pack(parts: Sequence[Portion], origins: dict[str, tuple[str, str]]) -> bytes:
+
+def pack(parts: Sequence[Portion], origins: Mapping[str, Origin]) -> bytes:
     """The file's content.
 
     Args:
         parts: what it is made of, the training split first.
-        origins: source and licence by the name of the object.
+        origins: by the name of the object.
     """
     manifest = SweepManifest.read(parts[0].folder)
     step = (manifest.limits.noise * STEP).astype(np.float64)
     values, objects, wide, told = [], [], [], {}
     for part in parts:
-        data = SweepSet.read(part.folder, part.there)
+        data = part.read()
         wide.append(np.full(len(data.sweeps), part.wide))
         values.append(np.round(data.sweeps.values / step).astype(np.int32))
         objects.append(data.sweeps.objects)
         for name in dict.fromkeys(data.sweeps.objects.tolist()):
-            source, licence = origins[name]
-            category = data.manifest.category(name)
-            told[name] = _Origin(category, part.split, source, licence)
+            category, of = data.manifest.category(name), msgspec.structs.asdict(origins[name])
+            told[name] = BenchmarkObject(category=category, split=part.split, **of)
     steps = np.diff(np.concatenate(values), axis=1, prepend=0)
     if np.abs(steps).max() > np.iinfo(np.int16).max:
         raise ValueError("a load rises by more than 16 bits hold")
@@ -123,7 +143,7 @@ def load(path: Path = FILE) -> Data:
     with np.load(io.BytesIO(lzma.decompress(content))) as arrays:
         steps, objects, step, wide = (arrays[k] for k in ("steps", "objects", "step", "wide"))
         manifest = msgspec.json.decode(arrays["manifest"].tobytes(), type=SweepManifest)
-        origins = msgspec.json.decode(arrays["origins"].tobytes(), type=dict[str, _Origin])
+        origins = msgspec.json.decode(arrays["origins"].tobytes(), type=dict[str, BenchmarkObject])
     values = (steps.transpose(0, 3, 1, 2).cumsum(axis=1, dtype=np.int32) * step).astype(np.float32)
     split = {s: tuple(n for n, o in origins.items() if o.split == s) for s in SPLITS}
     category_of = {name: origin.category for name, origin in origins.items()}
@@ -148,6 +168,8 @@ def main() -> int:
     data = load(Path(sys.argv[1]) if len(sys.argv) > 1 else FILE)
     for split in SPLITS:
         mine = [o for o in data.origins.values() if o.split == split]
+        if not mine:
+            continue
         print(f"{split}: {len(data.sets[split].sweeps)} sweeps of {len(mine)} objects")  # noqa: T201
         kinds = Counter(o.category for o in mine)
         print("   ", ", ".join(f"{k} {n}" for k, n in sorted(kinds.items())))  # noqa: T201

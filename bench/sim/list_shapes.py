@@ -28,6 +28,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from bench.perception.folds import FOLDS
 from bench.sim.list_objects import (
     ALIKE,
     BINS,
@@ -45,11 +46,7 @@ SHAPES = {  # by the letter that they are labelled with on a sheet
     "block": "k", "panel": "p", "slab": "s", "ball": "o", "bottle": "b", "cup": "c", "bowl": "w",
     "disc": "d", "chair": "h", "table": "t", "rod": "r", "plant": "l", "other": "x",
 }  # fmt: skip
-FOLDS = {  # of makers: train on four, test on the fifth
-    "sweethome3d": "sweethome3d", "quaternius": "quaternius", "kenney": "kenney+gazebo+aws",
-    "gazebo": "kenney+gazebo+aws", "aws": "kenney+gazebo+aws", "m3": "m3",
-    "kaykit": "kaykit+scans", "scans": "kaykit+scans",
-}  # fmt: skip
+FOLD_OF = {maker: fold for fold, makers in FOLDS.items() for maker in makers}
 SEED, MOST_OF_SHAPE, MOST = 61, 150, {"other": 600}
 CREDITS = {
     "osrf/gazebo_models": "Open Source Robotics Foundation",
@@ -472,7 +469,7 @@ def make_list(clones: Path, work: Path) -> None:
     things, looks = read_looks(clones, work)
     distinct = find_distinct(things, looks)
     drawn = draw_evenly(
-        [(i, shapes[things[i].name], FOLDS[things[i].source.maker]) for i in distinct]
+        [(i, shapes[things[i].name], FOLD_OF[things[i].source.maker]) for i in distinct]
     )
     rows = [
         {
@@ -513,7 +510,7 @@ def draw_evenly(objects: Sequence[tuple[int, str, str]]) -> list[int]:
     for shape in sorted({shape for _, shape, _ in objects}):
         generator = np.random.default_rng([SEED, zlib.crc32(shape.encode())])
         turns = []
-        for fold in sorted(set(FOLDS.values())):
+        for fold in sorted(FOLDS):
             mine = [i for i, a, b in objects if (a, b) == (shape, fold)]
             turns += [(turn, fold, int(i)) for turn, i in enumerate(generator.permutation(mine))]
         drawn += [i for _, _, i in sorted(turns)[: MOST.get(shape, MOST_OF_SHAPE)]]
@@ -550,8 +547,8 @@ def _print_counts(
     shapes: dict[str, str],
 ) -> None:
     for title, some in (("distinct", list(distinct)), ("drawn", drawn)):
-        count = Counter((shapes[things[i].name], FOLDS[things[i].source.maker]) for i in some)
-        folds = sorted(set(FOLDS.values()))
+        count = Counter((shapes[things[i].name], FOLD_OF[things[i].source.maker]) for i in some)
+        folds = sorted(FOLDS)
         print(f"{title:8s}", *(f"{fold:>16s}" for fold in folds), f"{'all':>8s}")  # noqa: T201
         for shape in SHAPES:
             numbers = [count[shape, fold] for fold in folds]

@@ -131,7 +131,8 @@ def _train(
     config = read_recipe(RECIPE, str(sweeps.resolve()))
     splits = read_splits(config.folders, config.labelled)
     batch = max(2, min(config.batch, len(splits[0].sweeps) // 8))
-    config = replace(config, batch=batch)
+    twice = len(splits[0].sweeps) > len(set(splits[0].sweeps.objects.tolist()))
+    config = replace(config, batch=batch, identity=config.identity if twice else 0.0)
     if not budget.updates:
         each_s = _time_of_an_update(project, config, splits)
         most = MOST_EPOCHS * len(splits[0].sweeps) // batch

@@ -5,13 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.sets.manifest import OUTLIERS, SPLITS, UNLABELLED, WITHHELD, SweepManifest
 
 __all__ = [
     "check_labelled",
     "check_split",
     "join_manifests",
+    "merge_categories",
     "read_manifests",
     "split_by_object",
     "trained_objects",
@@ -104,6 +105,37 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
         split={side: tuple(names) for side, names in split.items()},
         category_of={name: c for one in manifests for name, c in one.category_of.items()},
         kind_of={name: kind for one in manifests for name, kind in one.kind_of.items()},
+    )
+
+
+def merge_categories(
+    manifest: SweepManifest, classes: Mapping[str, Sequence[str]]
+) -> SweepManifest:
+    """Merge categories into classes; what an object was labelled by becomes its kind.
+
+    Args:
+        classes: the categories of each class; any other category stays a class.
+
+    Raises:
+        ConfigError: the set has no such category, or it is of two classes.
+    """
+    class_of: dict[str, str] = {}
+    for one, categories in classes.items():
+        for category in categories:
+            if category not in manifest.categories:
+                known = name_some(manifest.categories, 8)
+                raise ConfigError(f"classes: no category {category!r}: there are {known}")
+            if class_of.setdefault(category, one) != one:
+                raise ConfigError(f"classes: {category!r} is both {class_of[category]} and {one}")
+    if not class_of:
+        return manifest
+    known = [name for name in manifest.names() if manifest.label(name) >= 0]
+    before = {name: manifest.category(name) for name in known}
+    return replace(
+        manifest,
+        categories=tuple(dict.fromkeys(class_of.get(c, c) for c in manifest.categories)),
+        category_of=manifest.category_of | {n: class_of.get(c, c) for n, c in before.items()},
+        kind_of={n: c for n, c in before.items() if c in class_of} | manifest.kind_of,
     )
 
 

@@ -27,6 +27,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Sour
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
@@ -263,6 +264,8 @@ class SimSource(PacedSource):
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._draw = _drawing(self._animals, options)
+        recipe = _recipe_of(options)
+        self._class_of = recipe.objects.class_of if recipe else {}
         self.notes = {"engine": engine_version(PROFILES[options.profile])}
         self.passes: list[Pass] = []
         if line := ringing(self._animals, PROFILES[options.profile]):
@@ -353,7 +356,8 @@ class SimSource(PacedSource):
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
-        self.passes.append(Pass(now, target.name, target.category, sweep))
+        category = self._class_of.get(target.category, target.category)
+        self.passes.append(Pass(now, target.name, category, sweep))
 
 
 @cache
@@ -370,14 +374,19 @@ def _drawing(
 ) -> Callable[[np.random.Generator], Sweep]:
     """What draws the parameters of each sweep."""
     chosen = options.chosen
-    if not options.recipe:
+    if (recipe := _recipe_of(options)) is None:
         return partial(draw_sweep, distance_mm=usual_distance(animals), chosen=chosen)
-    sweeps = read_recipe(options.recipe, Path(options.recipe).parent).sweeps
+    sweeps = recipe.sweeps
 
     def draw(rng: np.random.Generator) -> Sweep:
         return replace(sweeps.draw(rng, int(rng.integers(len(sweeps))), rng), **chosen)
 
     return draw
+
+
+def _recipe_of(options: SimOptions) -> SweepRecipe | None:
+    """The recipe that the options name, if any."""
+    return read_recipe(options.recipe, Path(options.recipe).parent) if options.recipe else None
 
 
 def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:

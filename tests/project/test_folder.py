@@ -91,6 +91,21 @@ def test_the_device_meets_what_the_sweeps_say(tmp_path: Path) -> None:
     assert 46.2 <= min(first.speed_mm_s, second.speed_mm_s)
 
 
+def test_categories_that_feel_alike_may_be_one_class(project: Project) -> None:
+    path = project.folder / "sweeps.toml"
+    lines = path.read_text().splitlines()
+    at = lines.index(next(line for line in lines if line.startswith("# [objects.classes]")))
+    lines[at : at + 2] = [line.removeprefix("# ") for line in lines[at : at + 2]]
+    path.write_text("\n".join(lines))
+    manifest = describe_set(project.recipe())
+    assert manifest.kinds == {"vessel": ("bottle", "mug")}
+    assert set(manifest.categories) == {*KINDS, "vessel"} - {"bottle", "mug"}
+    with open_source(project.source_url(["mug-0"], pace="fast", sweeps=1)) as source:
+        while not source.passes:
+            source.read(1.0)
+    assert source.passes[0].category == "vessel"
+
+
 def test_training_draws_the_drift_that_the_sensor_is_said_to_have(tmp_path: Path) -> None:
     drifting = new_project(tmp_path / "drifting", "hx711_whisker")
     assert drifting.recipe().faults.offset == pytest.approx(4.0, rel=0.05)

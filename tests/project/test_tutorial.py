@@ -20,6 +20,7 @@ pytest.importorskip("matplotlib")
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.sensor_spec import SensorSpec
+from tactile_rt.models.training.config import EMBEDDED
 from tactile_rt.project.budget import Budget, described, write_budget
 from tactile_rt.project.folder import KINDS, Project
 from tactile_rt.project.making import make
@@ -83,6 +84,7 @@ def test_the_model_is_of_the_array_that_was_described(folder: Path) -> None:
     assert card.array.rate_hz == 100
     assert (card.period_ns, card.substeps) == (10_000_000, 4)
     assert card.labels == KINDS
+    assert card.embedding == EMBEDDED
     assert card.clip == pytest.approx([1e-4] * 2)
     assert card.sensor["rate_hz"] == 100
     manifest = SweepManifest.read(folder / "whiskers" / "build" / "sweeps")

@@ -17,7 +17,7 @@ from tactile_rt.sets.objects import (
     write_object,
     write_skipped,
 )
-from tactile_rt.sets.splits import split_by_object
+from tactile_rt.sets.splits import merge_categories, split_by_object
 from tactile_rt.testing import small_spec
 
 SPEC = small_spec()
@@ -269,6 +269,20 @@ def test_an_objects_category_may_be_told_apart_from_its_name(tmp_path: Path) -> 
         write_object(tmp_path, name, sweeps_of(name, 1), {})
     assert read_sweeps(tmp_path, "train").labels.tolist() == [0, 1]
     assert SweepManifest.read(tmp_path).category("02876657-1a-f0") == "bowl"
+
+
+def test_categories_that_are_one_class_become_its_kinds() -> None:
+    split = {**MANIFEST.split, "withheld": ("spoon-0",)}
+    manifest = replace(MANIFEST, split=split, withheld=("spoon",), kind_of={"mug-1": "stein"})
+    merged = merge_categories(manifest, {"round": ["mug"]})
+    assert merged.categories == ("bowl", "round")
+    assert [merged.label(n) for n in ("bowl-0", "mug-0", "mug-1", "spoon-0")] == [0, 1, 1, -1]
+    assert merged.kind_of == {"mug-0": "mug", "mug-1": "stein"}
+    assert merge_categories(manifest, {}) is manifest
+    with pytest.raises(ConfigError, match="classes: no category 'mgu': there are bowl, mug"):
+        merge_categories(manifest, {"round": ["mgu"]})
+    with pytest.raises(ConfigError, match="classes: 'mug' is both round and flat"):
+        merge_categories(manifest, {"round": ["mug"], "flat": ["mug"]})
 
 
 def test_skipped_objects_are_not_missed(folder: Path) -> None:

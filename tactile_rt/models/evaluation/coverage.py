@@ -57,7 +57,8 @@ def measure_names(
     """Measure the prediction sets of kinds; nothing of a model, or a test, without.
 
     The coverage of each class is that of its rule: of the sweeps of things of kinds that the model
-    knows, the share of which the kind is in the set of their class at every step.
+    knows, the share of which the kind is in the set of their class at every step. Classes of one
+    kind are left out.
 
     Args:
         test: the sweeps, labelled by the model's classes; sweeps without a contact are left out.
@@ -80,14 +81,14 @@ def measure_names(
     split = measures.split_by_class(answers[..., classes:], found, numbers, card.kinds)
     taken, rows = [], []
     for name, at, posteriors, kinds in split:
-        if (rule := rules.get(name)) is None:
+        if (rule := rules.get(name)) is None or len(card.kinds[name]) < 2:
             continue
         touched = found[at]
         taken.append(at[touched])
         rows.append(_in_sets(rule, posteriors[touched], kinds[touched]))
-    at, (inside, first, size) = np.concatenate(taken), np.concatenate(rows, axis=1)
-    if not len(at):
+    if not sum(map(len, taken)):
         return
+    at, (inside, first, size) = np.concatenate(taken), np.concatenate(rows, axis=1)
     objects, of = test.sweeps.objects[at], test.sweeps.labels[at]
     yield "kind, top-1 within the true class", measures.accuracy(first, objects)
     yield "coverage of the names", measures.accuracy(inside, objects)

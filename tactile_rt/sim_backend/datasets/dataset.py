@@ -26,11 +26,12 @@ from tactile_rt.core.stream import Chunk
 from tactile_rt.core.stream.sensor_spec import LOADS
 from tactile_rt.sets.manifest import MANIFEST, SweepManifest, has_object
 from tactile_rt.sets.objects import read_skipped, write_object, write_skipped
+from tactile_rt.sets.splits import merge_categories
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.inventory import remove_leftovers, write_sums, written_sum
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
-from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
+from tactile_rt.sim_backend.datasets.recipes import ObjectChoice, SweepRecipe
 from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor
@@ -68,7 +69,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     )
     of_meshes = () if recipe.objects.generated else ("manifold3d",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
-    return SweepManifest(
+    manifest = SweepManifest(
         spec=device_spec(animals),
         sensor=sensor_of(animals),
         period_ns=recipe.period_ns,
@@ -87,6 +88,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
         },
         settings=asdict(PROFILES[recipe.profile]),
     )
+    return merge_categories(manifest, recipe.objects.classes)
 
 
 def make_sweeps(
@@ -205,11 +207,13 @@ class _Work:
 
     @property
     def _objects(self) -> ShapeObjects | MeshObjects:
-        return _objects_once(self.recipe.objects)
+        return _objects_once(msgspec.json.encode(self.recipe.objects))
 
 
-# Once in a process: Ray hands each task a work of its own.
-_objects_once = lru_cache(maxsize=1)(choose_objects)
+@lru_cache(maxsize=1)
+def _objects_once(choice: bytes) -> ShapeObjects | MeshObjects:
+    """Objects of a choice, once in a process: Ray hands each task a work of its own."""
+    return choose_objects(msgspec.json.decode(choice, type=ObjectChoice))
 
 
 def _write(folder: Path, name: str, records: Sequence[SweepRecord], target: TactileObject) -> None:

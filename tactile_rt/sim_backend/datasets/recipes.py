@@ -136,6 +136,8 @@ class ObjectChoice(msgspec.Struct, frozen=True):
         source: The origin of the objects: "shapes" (the parametric ones, each kind of one plan),
             "varied-shapes" (of any plan) or a folder of meshes.
         categories: The names of the classes; empty: all that there are.
+        classes: The categories that count as one class, by its name; what an object was made as
+            is then its kind. Any other category is a class by itself.
         withheld: The categories of the extra split "withheld", which is for open-set tests: their
             objects are in no other split. Empty: none, or `catalogue.WITHHELD` if `per_withheld`
             asks for some.
@@ -155,6 +157,7 @@ class ObjectChoice(msgspec.Struct, frozen=True):
 
     source: Text = msgspec.field(name="from", default=SHAPES)
     categories: tuple[str, ...] = ()
+    classes: dict[str, tuple[str, ...]] = {}
     withheld: tuple[str, ...] = ()
     outliers: tuple[str, ...] = ()
     # None where nothing is said: then as `OF_SHAPES` or `OF_A_FOLDER` has it.
@@ -173,6 +176,11 @@ class ObjectChoice(msgspec.Struct, frozen=True):
     def generated(self) -> bool:
         """Whether the objects are parametric ones and not a folder's."""
         return self.source in GENERATED
+
+    @property
+    def class_of(self) -> dict[str, str]:
+        """The class of each category that counts as another one."""
+        return {own: one for one, categories in self.classes.items() for own in categories}
 
     @property
     def mesh(self) -> MeshDetail:

@@ -13,7 +13,7 @@ pytest.importorskip("torch")
 pytest.importorskip("sklearn")
 
 from bench.perception.area import OBJECTS, BenchmarkResults
-from bench.perception.data import FILE, SOURCE, SPLITS, Data, Portion, load, pack
+from bench.perception.data import FILE, SOURCE, Data, Portion, load, pack
 from bench.perception.generator import _without, measured
 from bench.perception.methods import Method, of_kinds
 from bench.perception.page import PAGE, figures, made
@@ -25,8 +25,10 @@ from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
 from tactile_rt.sets.objects import write_object
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
+from tactile_rt.sim_backend.objects.object_sets import Origin
 from tests.helpers.source_tree import ROOT
 
+SPLITS = ("train", "validation", "test", SOURCE, OUTLIERS, WITHHELD)
 LIST = ROOT / "tactile_rt/sim_backend/objects/lists/real.csv"
 
 
@@ -105,10 +107,10 @@ def test_what_is_packed_is_what_was_felt_to_a_fifth_of_the_noise(
     path = tmp_path / "packed.xz"
     parts = [Portion(split, tmp_path, split) for split in SPLITS]
     parts.append(Portion("test", tmp_path, "test", wide=True))
-    told = {n: (origins[n].source, origins[n].licence) for n in names}
-    path.write_bytes(pack(parts, told))
+    path.write_bytes(pack(parts, {n: Origin(maker="me", source=n) for n in names}))
     back = load(path)
     assert {n: o.split for n, o in back.origins.items()} == {n: origins[n].split for n in names}
+    assert all((o.maker, o.source) == ("me", n) for n, o in back.origins.items())
     assert np.array_equal(back.wide["test"].sweeps.values, back.sets["test"].sweeps.values)
     assert not len(back.wide[SOURCE].sweeps)
     for name in names:

@@ -48,7 +48,9 @@ from tactile_rt.testing import cut
 RECIPE = SweepRecipe(
     lead_ms=45,
     length_ms=225,
-    objects=ObjectChoice(categories=("mug",), per_category=3, validation=1, test=1),
+    objects=ObjectChoice(
+        categories=("mug",), classes={"cup": ("mug",)}, per_category=3, validation=1, test=1
+    ),
     sweeps=SweepChoice(yaw_deg=Range((0, 360)), gap_mm=Range((0.5, 1)), draws=2),
 )
 NAMES = ["mug-0", "mug-1", "mug-2"]
@@ -84,6 +86,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_set_is_what_its_manifest_says(finished: Path) -> None:
     manifest = SweepManifest.read(finished)
     assert manifest == describe_set(RECIPE)
+    assert manifest.kinds == {"cup": ("mug",)}
     assert {"tactile_rt", "mujoco", "numpy"} <= set(manifest.versions)
     assert manifest.settings == asdict(PROFILES["realtime"])
     assert sorted(p.name for p in finished.iterdir()) == [
