@@ -19,6 +19,7 @@ from tactile_rt.models.augmentation import (
 )
 from tactile_rt.models.training.config import AUGMENTATIONS
 from tests.helpers.tiny_sweeps import plate, tiny_array
+from tests.helpers.touch_streams import reordered
 
 SPEC = tiny_array()
 NAMES = ("columns", "rows", "turn")
@@ -90,10 +91,7 @@ def test_a_load_along_the_whisker_stays_one(which):
 
 
 def test_a_symmetric_array_is_mirrored_as_another_module_mirrors_it():
-    """Whiskers that are each other's mirror images: the loads of one are the other's, signs apart.
-
-    And those signs are known from calibration: f' = T f, m' = -T m, with T flipping z.
-    """
+    """Of whiskers that are each other's mirror images: f' = T f, m' = -T m, with T flipping z."""
     mirror = Mirror(axis="y", element_axis="z")
     right = [
         ((4e-3, y, -1e-3 * r), tiny_array(r).orientations[k])
@@ -141,11 +139,8 @@ def test_a_bending_keeps_its_direction_in_the_head():
 
 
 def test_arrays_without_symmetries_are_refused():
-    line = replace(
-        SPEC, **{k: getattr(SPEC, k)[:5] for k in ("elements", "grid", "positions", "orientations")}
-    )
     with pytest.raises(ConfigError, match="no grid of whiskers"):
-        symmetries(line)
+        symmetries(reordered(SPEC, range(5)))
     other = replace(SPEC, channels=("fx", "fy", "fz", "mx", "my", "angle"))
     with pytest.raises(ConfigError, match="mx is no component"):
         symmetries(other)

@@ -33,6 +33,7 @@ from tactile_rt.models.grid.work import Workbench
 from tactile_rt.models.training.config import DivergedError, Progress
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object
+from tests.helpers.refusals import refusal
 from tests.helpers.source_tree import ROOT
 from tests.helpers.tiny_sweeps import plate
 
@@ -151,11 +152,8 @@ def test_the_page_of_results_is_what_was_found() -> None:
 )
 def test_a_slip_in_a_grid_is_named(plan: Path, old: str, new: str, said: str) -> None:
     replace_in(plan, old, new)
-    with pytest.raises(ConfigError) as error:
-        read_grid(plan)
-    assert str(plan) in str(error.value)
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
+    found = refusal(read_grid, plan)
+    assert str(plan) in found and said in found
 
 
 def test_a_grid_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
@@ -257,10 +255,9 @@ def test_a_training_of_other_settings_is_not_taken_for_one_of_these(plan: Path) 
     task = bench.grid.tasks()[1]
     bench.do(task)
     replace_in(plan, "batch = 4", "batch = 3")
-    with pytest.raises(ConfigError) as error:
-        read_outcome(read_grid(plan), folder, task)
     outcome, runs = outcome_path(folder, task), folder / "runs" / task.slug
-    assert f"delete {outcome} and {runs} to train it again" in str(error.value)
+    said = refusal(read_outcome, read_grid(plan), folder, task)
+    assert f"delete {outcome} and {runs} to train it again" in said
     outcome.unlink()
     with pytest.raises(ConfigError, match="was trained with other settings"):
         begun(plan, folder).do(task)
