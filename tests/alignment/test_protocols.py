@@ -210,15 +210,8 @@ def test_the_correction_recovers_what_noise_takes():
     """With noise r_xy falls; corrected, it is what it is for the same units without noise."""
     shared = geometry(np.random.default_rng(7))
     model = responses(np.random.default_rng(8), shared, 300)
-    quiet, loud = (
-        score(
-            freeze_strict(
-                animals(np.random.default_rng(9), shared=shared, noise=noise), BOOTSTRAPS
-            ),
-            {"layer": model},
-        )
-        for noise in (0.01, 9)
-    )
+    seen = [animals(np.random.default_rng(9), shared=shared, noise=noise) for noise in (0.01, 9)]
+    quiet, loud = (score(freeze_strict(made, BOOTSTRAPS), {"layer": model}) for made in seen)
     assert sum(loud.reliable) >= 4
     assert np.mean(loud.r) < np.mean(quiet.r) - 0.1
     assert loud.score == pytest.approx(quiet.score, abs=0.05)
