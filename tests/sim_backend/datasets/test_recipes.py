@@ -23,12 +23,7 @@ from tactile_rt.sim_backend.datasets.recipe_files import (
     shipped_recipes,
 )
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
-from tactile_rt.sim_backend.datasets.recipes import (
-    ObjectChoice,
-    Range,
-    SweepChoice,
-    SweepRecipe,
-)
+from tactile_rt.sim_backend.datasets.recipes import ObjectChoice, Range, SweepChoice, SweepRecipe
 from tactile_rt.sim_backend.objects import catalogue as objects
 from tactile_rt.sim_backend.sweep import Sweep
 
@@ -282,10 +277,7 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (
-            "sead = 1",
-            r":1: the file has no key 'sead'; did you mean seed\?",
-        ),
+        ("sead = 1", r":1: the file has no key 'sead'; did you mean seed\?"),
         (
             "[sweeps]\nyaw_deg = { betwen = [0, 1] }",
             r"sweeps.yaw_deg has no key 'betwen'; did you mean between\?",
