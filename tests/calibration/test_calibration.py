@@ -358,8 +358,7 @@ def test_what_cannot_be_is_refused(changes: dict[str, object], what: str) -> Non
 
 @pytest.mark.parametrize("fields", [{"axis": "u"}, {"element_axis": ""}, {"signs": {"fx": 0}}])
 def test_a_mirror_that_cannot_be_is_refused(fields: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match="mirror"):
-        Mirror(**fields)
+    assert "mirror" in refusal(Mirror, **fields)
 
 
 # ---- files
@@ -423,8 +422,7 @@ def test_a_user_without_a_home_is_told_so(monkeypatch) -> None:
     monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
     monkeypatch.setattr(Path, "home", homeless)
     for use in (calibration_path, load_calibration):
-        with pytest.raises(ConfigError, match="no home to keep calibrations in: set XDG_CONFIG"):
-            use("d")
+        assert "no home to keep calibrations in: set XDG_CONFIG" in refusal(use, "d")
 
 
 def test_a_folder_that_is_not_there_is_not_made(tmp_path) -> None:
@@ -469,11 +467,9 @@ def test_a_bad_file_is_one_line_that_names_it(tmp_path, old: str, new: str, what
 
 
 def test_the_device_meant_is_named(home) -> None:
-    with pytest.raises(ConfigError, match="there are none"):
-        load_calibration("left-hand")
+    assert "there are none" in refusal(load_calibration, "left-hand")
     save_calibration(Calibration.of("left-hand", small_spec()))
-    with pytest.raises(ConfigError, match=r"did you mean left-hand\?"):
-        load_calibration("left_hand")
+    assert "did you mean left-hand?" in refusal(load_calibration, "left_hand")
 
 
 # ---- tare
@@ -573,8 +569,7 @@ def test_a_silent_source_is_not_waited_for(monkeypatch) -> None:
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_seconds_are_refused(seconds: float) -> None:
-    with pytest.raises(ConfigError, match="seconds"):
-        tare(source_of(quiet(np.random.default_rng(16))), seconds)
+    assert "seconds" in refusal(tare, source_of(quiet(np.random.default_rng(16))), seconds)
 
 
 # ---- fitting
