@@ -221,8 +221,7 @@ def test_a_grid_is_done_once_and_told(plan: Path, monkeypatch: pytest.MonkeyPatc
     assert second.chosen.updates == outcome.chosen.updates
 
     changed = msgspec.structs.replace(grid, batch=3)
-    with pytest.raises(ConfigError, match="'gru' trained with other settings"):
-        run_grid(changed, folder)
+    assert "'gru' trained with other settings" in refusal(run_grid, changed, folder)
 
 
 def test_a_network_that_diverges_is_an_outcome(plan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,8 +258,7 @@ def test_a_training_of_other_settings_is_not_taken_for_one_of_these(plan: Path) 
     said = refusal(read_outcome, read_grid(plan), folder, task)
     assert f"delete {outcome} and {runs} to train it again" in said
     outcome.unlink()
-    with pytest.raises(ConfigError, match="was trained with other settings"):
-        begun(plan, folder).do(task)
+    assert "was trained with other settings" in refusal(begun(plan, folder).do, task)
     shutil.rmtree(runs)
     begun(plan, folder).do(task)
     for config in runs.glob("*/config.json"):
@@ -338,14 +336,12 @@ def test_outcomes_of_other_sweeps_and_damaged_ones_are_told(plan: Path, tmp_path
     assert gather(grid, folder).sweeps == 16
     draw_grid(gather(grid, folder), folder / "none.png")  # of no network yet
     made_up(folder, grid, svm, "1" * 15)
-    with pytest.raises(ConfigError, match="'svm', seed 0, was tested on 15 sweeps, of which there"):
-        gather(grid, folder)
+    assert "'svm', seed 0, was tested on 15 sweeps, of which there" in refusal(gather, grid, folder)
     path = outcome_path(folder, svm)
     whole = path.read_text()
     for old, new in (('"top1":"1', '"top1":"2'), ("{", "[")):
         path.write_text(whole.replace(old, new, 1))
-        with pytest.raises(ConfigError, match=r"svm_seed0\.json is damaged"):
-            gather(grid, folder)
+        assert "svm_seed0.json is damaged" in refusal(gather, grid, folder)
 
 
 def test_a_full_disk_is_one_line_of_a_process_too(plan: Path, tmp_path: Path) -> None:
@@ -417,8 +413,7 @@ def test_a_grid_without_its_sweeps_says_so(plan: Path, tmp_path: Path) -> None:
     grid = msgspec.structs.replace(read_grid(plan), data=str(tmp_path / "none"))
     with pytest.raises(RecordingError, match="is not a sweep set"):
         run_grid(grid, tmp_path / "out")
-    with pytest.raises(ConfigError, match="has no outcome yet"):
-        gather(grid, tmp_path / "out")
+    assert "has no outcome yet" in refusal(gather, grid, tmp_path / "out")
 
 
 def made_up(folder: Path, grid: results.Grid, task: Task, right: str) -> None:

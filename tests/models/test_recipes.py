@@ -131,8 +131,6 @@ def test_a_mistake_is_one_line_that_names_file_and_key(tmp_path, text, said):
 def test_a_recipe_that_is_not_there(tmp_path):
     with pytest.raises(ConfigError, match="no recipe 'paper-simclar'; did you mean paper-simclr"):
         read_recipe("paper-simclar", "set")
-    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
-        read_recipe(str(tmp_path / "none.toml"), "set")
+    assert "none.toml: no such file" in refusal(read_recipe, str(tmp_path / "none.toml"), "set")
     (tmp_path / "b.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match="not UTF-8 text"):
-        read_recipe(str(tmp_path / "b.toml"), "set")
+    assert "not UTF-8 text" in refusal(read_recipe, str(tmp_path / "b.toml"), "set")

@@ -12,7 +12,6 @@ pytest.importorskip("manifold3d")
 
 import trimesh
 
-from tactile_rt.core.errors import ConfigError
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
@@ -21,6 +20,7 @@ from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.object_sets import open_objects
 from tests.helpers import mesh_truth
+from tests.helpers.refusals import refusal
 
 MM = 40.0  # largest extent that errors are given at
 
@@ -142,8 +142,7 @@ def test_a_shapenet_folder_without_its_taxonomy(shapenet: Path) -> None:
     (shapenet / "taxonomy.json").unlink()
     assert open_objects(shapenet).names[0] == "02876657/c3"
     (shapenet / "taxonomy.json").write_text('{"not": "a list"}')
-    with pytest.raises(ConfigError, match=r"taxonomy\.json is not ShapeNet's taxonomy"):
-        open_objects(shapenet)
+    assert "taxonomy.json is not ShapeNet's taxonomy" in refusal(open_objects, shapenet)
 
 
 def test_a_folder_of_folders(tmp_path: Path) -> None:
@@ -154,19 +153,15 @@ def test_a_folder_of_folders(tmp_path: Path) -> None:
     objects = open_objects(root)
     assert objects.names == ("bracket/one", "gear/my_gear")
     assert objects.load("gear/my_gear").name == "gear-my_gear"
-    with pytest.raises(ConfigError, match="holds no object 'gear/other'"):
-        objects.load("gear/other")
+    assert "holds no object 'gear/other'" in refusal(objects.load, "gear/other")
 
 
 def test_wrong_folders_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no such folder of objects"):
-        open_objects(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match=r"holds no objects: expected category/object\.obj"):
-        open_objects(tmp_path)
+    assert "no such folder of objects" in refusal(open_objects, tmp_path / "nowhere")
+    assert "holds no objects: expected category/object.obj" in refusal(open_objects, tmp_path)
     for suffix in (".obj", ".stl"):
         saved(mesh_truth.bracket(), tmp_path / "bracket" / f"one{suffix}")
-    with pytest.raises(ConfigError, match="would have the same name: rename one"):
-        open_objects(tmp_path)
+    assert "would have the same name: rename one" in refusal(open_objects, tmp_path)
 
 
 RECIPE = """
