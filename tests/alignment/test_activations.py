@@ -142,13 +142,8 @@ def test_taps_of_the_shipped_step_leave_its_output_bitwise_unchanged():
     names = [o.name for o in session.get_outputs()]
     quiet = {"offset": FELT.offset[3:4], "sigma": FELT.sigma[3:4]}
     for t in range(22):
-        out = dict(
-            zip(
-                names,
-                session.run(None, {**state, **quiet, "samples": FELT.samples[3:4, t]}),
-                strict=True,
-            )
-        )
+        made = session.run(None, {**state, **quiet, "samples": FELT.samples[3:4, t]})
+        out = dict(zip(names, made, strict=True))
         state = {s.name: out[f"{s.name}_next"] for s in card.state}
         np.testing.assert_array_equal(found.logits[3, t], out["logits"][0])
         np.testing.assert_array_equal(found.traces["encoder.layer1"][3, t], state["gru_h"][0, 1])
@@ -184,9 +179,7 @@ def test_stimuli_are_taken_by_name_not_by_place(tmp_path):
     arrays = dict(np.load(SHIPPED))
     order = [3, 1, 5, 0, 2, 4]
     path = tmp_path / "shuffled.npz"
-    np.savez(
-        path, **arrays | {"stimuli": arrays["stimuli"][order], "values": arrays["values"][order]}
-    )
+    np.savez(path, **arrays | {name: arrays[name][order] for name in ("stimuli", "values")})
     again = read_stimuli(path)
     np.testing.assert_array_equal(again.samples, FELT.samples)
     assert again.sha256 == FELT.sha256
@@ -234,11 +227,7 @@ def test_a_twin_has_the_first_weights_that_its_network_had():
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"encoder": "of-a-later-release"},
-        {"frame": [30, 2, 2]},
-        {"max_steps": 3},
-    ],
+    [{"encoder": "of-a-later-release"}, {"frame": [30, 2, 2]}, {"max_steps": 3}],
 )
 def test_a_card_whose_network_cannot_be_built_has_no_control(change):
     card = read_model(shipped_model())[0]

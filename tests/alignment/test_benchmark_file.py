@@ -23,18 +23,13 @@ def benchmark():
     poor = replace(
         first, name="mouse-9", chosen=Frozen(np.zeros(15), math.nan, math.nan, 3), reliable=False
     )
-    names = (*made.a2a.animals, "mouse-9")
-    return replace(
-        made,
-        targets=(*made.targets, poor),
-        a2a=Consistency(
-            names,
-            np.append(made.a2a.pooled, np.nan),
-            np.pad(made.a2a.pairwise, (0, 1), constant_values=np.nan),
-        ),
-        sources=("a.nwb", "b.nwb"),
-        notes=("session x left out",),
+    a2a = Consistency(
+        (*made.a2a.animals, "mouse-9"),
+        np.append(made.a2a.pooled, np.nan),
+        np.pad(made.a2a.pairwise, (0, 1), constant_values=np.nan),
     )
+    said = {"sources": ("a.nwb", "b.nwb"), "notes": ("session x left out",)}
+    return replace(made, targets=(*made.targets, poor), a2a=a2a, **said)
 
 
 @pytest.fixture
@@ -46,11 +41,8 @@ def path(benchmark, tmp_path):
 def test_a_benchmark_comes_back_as_it_was(benchmark, path):
     again = load_benchmark(path)
     assert benchmark_sha256(again) == benchmark_sha256(benchmark)
-    assert (again.protocol, again.notes, again.sources) == (
-        "strict",
-        benchmark.notes,
-        again.sources,
-    )
+    assert again.protocol == "strict"
+    assert (again.notes, again.sources) == (benchmark.notes, benchmark.sources)
     np.testing.assert_array_equal(again.a2a.pairwise, benchmark.a2a.pairwise)
     assert math.isnan(again.targets[3].chosen.factor)
     layers = {"a": np.random.default_rng(1).normal(size=(6, 9))}
@@ -98,13 +90,11 @@ def test_a_file_of_another_kind_says_where(path, change, message):
         (lambda b: replace(b, stimuli=b.stimuli[::-1]), "stimuli"),
         (lambda b: replace(b, targets=b.targets[1:]), "not of the same animals"),
         (
-            lambda b: replace(
-                b, targets=(replace(b.targets[0], chosen=SHORT), *b.targets[1:])
-            ),
+            lambda b: replace(b, targets=(replace(b.targets[0], chosen=SHORT), *b.targets[1:])),
             "an RDM has 15 entries",
         ),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_contradicts_itself_is_refused(benchmark, path, change, message):
     save_benchmark(change(benchmark), path)
     with pytest.raises(ConfigError, match=message):

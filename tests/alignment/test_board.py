@@ -79,12 +79,10 @@ def test_another_animal_stands_below(made):
     board, animals, _ = made
     assert board.rows[-1] == BoardRow(ANOTHER, "animal")
     measures = [find_metric("rsa")(animal) for animal in animals]
-    means = [
-        np.concatenate(
-            [np.stack([s.rates[s.stimulus == k].mean(0) for k in range(6)]) for s in a.sessions], 1
-        )[:, None]
-        for a in animals
-    ]
+    means = []
+    for animal in animals:
+        each = [[s.rates[s.stimulus == k].mean(0) for k in range(6)] for s in animal.sessions]
+        means.append(np.concatenate(each, axis=1)[:, None])
     wanted = [
         np.mean([m.fit(x) for j, x in enumerate(means) if j != i]) / m.ceiling
         for i, m in enumerate(measures)

@@ -15,6 +15,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import install_extra
 from tests.helpers.brains import geometry, padded
 from tests.helpers.nwb_sessions import write_session
+from tests.helpers.refusals import refusal
 
 
 @pytest.fixture
@@ -39,8 +40,7 @@ def test_a_published_file_builds_a_paper_code_benchmark(rates, tmp_path):
 
 def test_its_stimuli_have_no_names_so_strict_refuses_it(rates, tmp_path):
     np.savez_compressed(tmp_path / "rates.npz", **rates)
-    with pytest.raises(ConfigError, match="its stimuli have no names"):
-        build([tmp_path / "rates.npz"])
+    assert "its stimuli have no names" in refusal(build, [tmp_path / "rates.npz"])
     with pytest.raises(ConfigError, match="name nothing beside it"):
         build([tmp_path / "rates.npz", tmp_path], "paper-code")
 
@@ -83,13 +83,10 @@ def test_a_build_without_reliable_animals_says_why(tmp_path):
     for i in range(2):  # units that answer to contact, and to all stimuli alike
         rng = np.random.default_rng(i)
         write_session(tmp_path / f"{i}.nwb", rng, np.full((6, 12), 7.0), f"mouse-{i}", trials=48)
-    with pytest.raises(ConfigError) as error:
-        build([tmp_path], bootstraps=30)
-    said = str(error.value)
+    said = refusal(build, [tmp_path], bootstraps=30)
     assert re.match(
-        r"no animal is reliable enough .*: mouse-0 (-?\d\.\d\d|nan) \(\d+ of 12 un", said
+        r"no animal is reliable enough .*: mouse-0 (-?\d\.\d\d|nan) \(\d+ of 12 u", said
     )
-    assert "\n" not in said
 
 
 @pytest.mark.parametrize(
@@ -99,6 +96,7 @@ def test_a_build_without_reliable_animals_says_why(tmp_path):
         (np.zeros((4, 6, 3), dtype="U1"), "not numbers"),
         (np.zeros((1, 6, 3)), "fewer than two rows or units"),
         (np.full((4, 6, 3), np.inf), "infinite rate"),
+        (np.array([None]), "not an npz file of numbers"),
     ],
 )
 def test_arrays_of_another_shape_are_refused(tmp_path, array, message):
@@ -109,25 +107,17 @@ def test_arrays_of_another_shape_are_refused(tmp_path, array, message):
 
 def test_files_of_another_kind_are_refused(tmp_path):
     (tmp_path / "text.npz").write_text("hello")
-    with pytest.raises(ConfigError, match=r"text\.npz: not an npz file of numbers"):
-        read_published(tmp_path / "text.npz")
-    np.savez(tmp_path / "objects.npz", m=np.array([None]))
-    with pytest.raises(ConfigError, match="not an npz file of numbers"):
-        read_published(tmp_path / "objects.npz")
+    assert "text.npz: not an npz file of numbers" in refusal(read_published, tmp_path / "text.npz")
     np.savez(tmp_path / "empty.npz")
-    with pytest.raises(ConfigError, match="holds no animal"):
-        read_published(tmp_path / "empty.npz")
-    with pytest.raises(ConfigError, match="no file"):
-        read_published(tmp_path / "none.npz")
+    assert "holds no animal" in refusal(read_published, tmp_path / "empty.npz")
+    assert "no file" in refusal(read_published, tmp_path / "none.npz")
 
 
 def test_requests_that_cannot_be_met(tmp_path):
     with pytest.raises(ConfigError, match="no protocol 'loose': there are strict, paper-code"):
         build([tmp_path], "loose")
-    with pytest.raises(ConfigError, match="name NWB files"):
-        build([])
-    with pytest.raises(ConfigError, match="0 bootstraps"):
-        build([tmp_path], bootstraps=0)
+    assert "name NWB files" in refusal(build, [])
+    assert "0 bootstraps" in refusal(build, [tmp_path], bootstraps=0)
 
 
 def test_without_h5py_it_says_what_to_install(tmp_path, monkeypatch):

@@ -8,8 +8,8 @@ from tactile_rt.alignment.clock import contact_response
 from tactile_rt.alignment.neural import by_animal
 from tactile_rt.alignment.nwb import find_nwb, read_nwb
 from tactile_rt.alignment.strict import freeze_strict
-from tactile_rt.core.errors import ConfigError
 from tests.helpers.nwb_sessions import ORIGIN_S, write_animals
+from tests.helpers.refusals import refusal
 
 pytest.importorskip("h5py", reason="h5py reads the files")
 
@@ -46,15 +46,10 @@ def test_a_build_says_what_it_found(as_published):
 
 
 def test_strict_refuses_the_wrong_clock_and_names_the_right_offset(as_published, mistaken):
-    for folder, clock, right in (
-        (as_published, "recording", 0.0),
-        (mistaken, "session", ORIGIN_S),
-    ):
-        with pytest.raises(ConfigError, match="rates do not rise after contact") as error:
-            build([folder], bootstraps=5, clock=clock)
-        said = str(error.value)
+    for folder, clock, right in ((as_published, "recording", 0.0), (mistaken, "session", ORIGIN_S)):
+        said = refusal(build, [folder], bootstraps=5, clock=clock)
+        assert "rates do not rise after contact" in said
         assert "in 4 of 4 sessions another offset fits contacts better" in said
-        assert "\n" not in said
         offset = float(said.split(") if ")[1].split(" s is subtracted")[0])
         assert offset == pytest.approx(right, abs=0.02)
     assert len(build([mistaken], bootstraps=50, clock="recording").reliable) == 4

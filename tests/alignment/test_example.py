@@ -76,15 +76,9 @@ def test_pynwb_reads_the_sessions(written):
         assert file.acquisition["extracellular array recording"].starting_time == BEGIN_S
         assert set(units) == {"depth", "inhibitory", "spike_times"} and len(units) == 6
         first = min(times[0] for times in units["spike_times"])
-        touches = np.sort(
-            np.concatenate(
-                [
-                    table["start_time"][:]
-                    for name, table in file.processing["behavior"].data_interfaces.items()
-                    if name.startswith("contacts")
-                ]
-            )
-        )
+        tables = file.processing["behavior"].data_interfaces.items()
+        touches = [t["start_time"][:] for name, t in tables if name.startswith("contacts")]
+        touches = np.sort(np.concatenate(touches))
     # Spikes are on the session's clock: none before the electrical recording began.
     assert BEGIN_S <= first < BEGIN_S + 2
     correct = trials[trials.outcome == "correct"]

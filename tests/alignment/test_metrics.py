@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from bench.align import oracles
-from tactile_rt.alignment.metrics import (
-    METRICS,
-    MINIMUM_CEILING,
-    find_metric,
-    metric_names,
-)
+from tactile_rt.alignment.metrics import METRICS, MINIMUM_CEILING, find_metric, metric_names
 from tactile_rt.alignment.metrics.crossnobis import distances
 from tactile_rt.alignment.metrics.geometry import cka, rsa, time_course
 from tactile_rt.alignment.metrics.halves import bins_of, divisions, half_means
@@ -161,15 +156,8 @@ def test_parts_of_cortex():
     }
     assert all([a.name for a in animals] == ["a"] for animals in found.values())
     units = {name: animals[0].sessions[0].rates.shape[1] for name, animals in found.items()}
-    assert units == {
-        "L1": 1,
-        "L2/3": 3,
-        "L4": 2,
-        "L5": 2,
-        "L6": 2,
-        "inhibitory": 4,
-        "excitatory": 8,
-    }
+    layers = {"L1": 1, "L2/3": 3, "L4": 2, "L5": 2, "L6": 2}
+    assert units == {**layers, "inhibitory": 4, "excitatory": 8}
     cut = found["L4"][0].sessions[0]
     np.testing.assert_array_equal(cut.rates, plain.rates[:, 3:5])
     np.testing.assert_array_equal(cut.course[:, 1], plain.rates[:, 3:5])

@@ -14,8 +14,8 @@ from tactile_rt.alignment.report import report_page
 from tactile_rt.alignment.results import model_result, read_results, results_of
 from tactile_rt.alignment.stimuli_input import SHIPPED, read_stimuli
 from tactile_rt.alignment.strict import freeze_strict
-from tactile_rt.core.errors import ConfigError
 from tests.helpers import brains
+from tests.helpers.refusals import refusal
 
 FELT = read_stimuli()
 DEEP = 100_000
@@ -55,9 +55,7 @@ def scores(tmp_path_factory):
 def test_what_is_no_json_of_ours_is_refused_in_a_line(tmp_path, read, content):
     path = tmp_path / "odd.json"
     path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"odd\.json") as error:
-        read(path)
-    assert "\n" not in str(error.value)
+    assert "odd.json" in refusal(read, path)
 
 
 @pytest.mark.parametrize(
@@ -83,9 +81,7 @@ def test_scores_whose_tables_cannot_be_drawn_are_refused(scores, tmp_path, place
         inside = inside[key]
     inside[place[-1]] = value
     (tmp_path / "odd.json").write_text(json.dumps(found))
-    with pytest.raises(ConfigError, match=r"odd\.json") as error:
-        read_results(tmp_path / "odd.json")
-    assert "\n" not in str(error.value)
+    assert "odd.json" in refusal(read_results, tmp_path / "odd.json")
 
 
 def test_a_share_of_masking_that_is_no_number_is_not_compared(scores):
@@ -107,6 +103,4 @@ def test_a_share_of_masking_that_is_no_number_is_not_compared(scores):
 )
 def test_an_input_of_other_types_is_refused_in_a_line(tmp_path, name, value):
     np.savez(tmp_path / "odd.npz", **dict(np.load(SHIPPED)) | {name: value})
-    with pytest.raises(ConfigError, match=r"odd\.npz") as error:
-        read_stimuli(tmp_path / "odd.npz")
-    assert "\n" not in str(error.value)
+    assert "odd.npz" in refusal(read_stimuli, tmp_path / "odd.npz")

@@ -11,18 +11,9 @@ from msgspec.structs import replace as change
 from tactile_rt.alignment.gate import neural_checks
 from tactile_rt.alignment.json_file import encode, write_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.pictures import (
-    Point,
-    draw_profiles,
-    draw_scatter,
-)
+from tactile_rt.alignment.pictures import Point, draw_profiles, draw_scatter
 from tactile_rt.alignment.report import report_page
-from tactile_rt.alignment.results import (
-    baseline_of,
-    model_result,
-    read_results,
-    results_of,
-)
+from tactile_rt.alignment.results import baseline_of, model_result, read_results, results_of
 from tactile_rt.alignment.stimuli_input import read_stimuli
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError

@@ -12,7 +12,7 @@ from tactile_rt.alignment.nwb import read_nwb, read_session
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError
 from tests.helpers import brains
-from tests.helpers.nwb_sessions import write_animals
+from tests.helpers.nwb_sessions import changed_copy, write_animals
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 
@@ -35,6 +35,10 @@ def folder(tmp_path_factory):
 
 def files(folder):
     return sorted(folder.glob("*.nwb"))
+
+
+def remove(name):
+    return lambda file: file.__delitem__(name)
 
 
 def test_by_task_session_depth_and_cells(folder):
@@ -64,11 +68,10 @@ def test_by_task_session_depth_and_cells(folder):
 
 def test_the_task_is_known_without_a_description(folder, tmp_path):
     for source, task in zip(files(folder)[::2], ("detection", "discrimination"), strict=True):
-        path = tmp_path / source.name
-        path.write_bytes(source.read_bytes())
-        with h5py.File(path, "r+") as file:
-            del file["general/experiment_description"]
-        assert read_session(path).task == task
+        untold = changed_copy(
+            source, tmp_path / source.name, remove("general/experiment_description")
+        )
+        assert read_session(untold).task == task
 
 
 def test_two_tasks_together_are_noted(folder):
@@ -96,10 +99,7 @@ def test_what_cannot_be_selected(asked, said):
 def test_what_nothing_is_left_of(folder, tmp_path):
     with pytest.raises(ConfigError, match="no session of 4 is of nosuch"):
         read_nwb(files(folder), selection=Selection.of(sessions=["nosuch"]))
-    path = tmp_path / "a.nwb"
-    path.write_bytes(files(folder)[0].read_bytes())
-    with h5py.File(path, "r+") as file:
-        del file["units/depth"]
+    path = changed_copy(files(folder)[0], tmp_path / "a.nwb", remove("units/depth"))
     with pytest.raises(ConfigError, match=r"a\.nwb: has no column units/depth to select by"):
         read_nwb([path], selection=Selection.of(depth="L4"))
 

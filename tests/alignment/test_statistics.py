@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.alignment.rdm import rdm
-from tactile_rt.alignment.statistics import (
-    held_out,
-    highest,
-    max_statistic,
-    standard_error,
-)
+from tactile_rt.alignment.statistics import held_out, highest, max_statistic, standard_error
 
 
 def plain_held_out(values):

@@ -8,10 +8,7 @@ pytest.importorskip("onnx")
 
 import onnx
 
-from tactile_rt.alignment.activations import (
-    checkpoint_layers,
-    untrained_card_layers,
-)
+from tactile_rt.alignment.activations import checkpoint_layers, untrained_card_layers
 from tactile_rt.alignment.onnx_activations import onnx_layers
 from tactile_rt.alignment.stimuli_input import read_stimuli
 from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model

@@ -19,7 +19,7 @@ from tactile_rt.classifier.decision_rules import (
     PredictionSetRule,
 )
 from tactile_rt.classifier.model_card import decided, rated_noise
-from tactile_rt.core.errors import ModelError, SpecMismatch
+from tactile_rt.core.errors import SpecMismatch
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import (
@@ -311,20 +311,6 @@ def test_another_array_is_refused_by_where_it_differs(model: Path, change: dict,
         Classifier(model, replace(SPEC, name="mine", **change))
     message = str(caught.value)
     assert message.startswith(f"{model} was made for another array than 'mine': {said}")
-
-
-def test_a_model_of_another_array_size_names_the_elements(model: Path) -> None:
-    with pytest.raises(SpecMismatch, match="A3 unknown"):
-        Classifier(model, small_spec(elements=4))
-
-
-def test_name_and_rate_are_not_the_model_s_business(model: Path) -> None:
-    Classifier(model, replace(SPEC, name="left", rate_hz=200.0))
-
-
-def test_a_model_that_cannot_be_loaded_is_a_model_error(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="no model file"):
-        Classifier(tmp_path / "none.onnx", SPEC)
 
 
 # Several sweeps of one object

@@ -14,8 +14,18 @@ from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.testing import cut
-from tests.helpers.tiny_model import PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
-from tests.helpers.touch_streams import QUIET, SAME_RATE, expected_logits, push_all, signal, stream
+from tests.helpers.refusals import refusal
+from tests.helpers.tiny_model import GRAPH, PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
+from tests.helpers.touch_streams import (
+    QUIET,
+    SAME_RATE,
+    expected_logits,
+    fed_logits,
+    push_all,
+    reordered,
+    signal,
+    stream,
+)
 
 ONSET = QUIET + 1
 
@@ -81,9 +91,7 @@ def test_windows_slide_only_while_the_contact_lasts(model: Path) -> None:
     assert [d.step for d in short][:STEPS] == [1, 2, 3, 4]
     assert {d.final for d in short[STEPS:]} <= {True}
     for d in short[:STEPS]:
-        assert logits_of(d.probabilities) == pytest.approx(
-            expected_logits(values, 401, d.step), abs=2e-6
-        )
+        assert logits_of(d.probabilities) == fed_logits(values, 401, d.step)
 
 
 def test_the_shipped_model_slides_as_it_decides_episodes() -> None:
@@ -166,9 +174,7 @@ def test_a_decision_that_is_sure_ends_the_episode(model: Path) -> None:
     ],
 )
 def test_an_option_that_cannot_be_says_why(model: Path, options: dict, said: str) -> None:
-    with pytest.raises(ConfigError) as caught:
-        Classifier(model, SAME_RATE, **options)
-    assert str(caught.value).startswith(said)
+    assert refusal(Classifier, model, SAME_RATE, **options).startswith(said)
 
 
 def test_a_provider_that_is_not_installed_names_those_that_are(
@@ -181,8 +187,6 @@ def test_a_provider_that_is_not_installed_names_those_that_are(
 
 
 def test_a_graph_for_one_stream_cannot_slide(tmp_path: Path) -> None:
-    from tests.helpers.tiny_model import GRAPH
-
     path = write_model(tmp_path / "one.onnx", GRAPH.replace("[B", "[1"))
     values = signal([(QUIET, 300, 0.1)], 300)
     assert len(push_all(Classifier(path, SAME_RATE), stream(values))) == STEPS
@@ -192,16 +196,12 @@ def test_a_graph_for_one_stream_cannot_slide(tmp_path: Path) -> None:
 
 def test_elements_in_another_order_are_put_in_the_model_s(model: Path) -> None:
     order = [2, 0, 1]
-    per_element = ("elements", "grid", "positions", "orientations")
-    shuffled = replace(
-        SAME_RATE, **{f: tuple(getattr(SAME_RATE, f)[i] for i in order) for f in per_element}
-    )
     chunks = stream(signal([(QUIET, 300, 0.1)], 300))
     for chunk in chunks:
         chunk.valid[chunk.seq > ONSET + 4, 0] = False
     moved = [Chunk(c.seq, c.t_ns, c.values[:, order], c.valid[:, order]) for c in chunks]
     expected = push_all(Classifier(model, SAME_RATE), chunks)
-    classifier = Classifier(model, shuffled)
+    classifier = Classifier(model, reordered(SAME_RATE, order))
     got = push_all(classifier, moved)
     assert len(got) == STEPS
     for a, b in zip(got, expected, strict=True):

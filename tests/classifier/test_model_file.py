@@ -24,6 +24,7 @@ from tactile_rt.classifier.model_file import (
 from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model
+from tests.helpers.touch_streams import reordered
 
 
 def refusal(path: Path, said: str, load: Callable[[Path], object] = load_model) -> str:
@@ -273,16 +274,15 @@ def test_one_thread_runs_the_model(tmp_path: Path) -> None:
 
 def test_loading_a_model_leaves_the_process_s_arithmetic_alone(tmp_path: Path) -> None:
     """A runtime may flush subnormal numbers to zero, for itself; not in the user's simulation."""
-    path = write_model(tmp_path / "m.onnx")
-    code = f"""
+    code = """
 import sys
-from dataclasses import replace
 from pathlib import Path
 from tactile_rt.classifier.model_file import load_model
-load_model(Path({str(path)!r}))
+load_model(Path(sys.argv[1]))
 assert sys.float_info.min / 2 > 0
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-c", code, write_model(tmp_path / "m.onnx")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
@@ -294,11 +294,6 @@ def test_the_shipped_model_can_be_run() -> None:
 
 
 # ---- what may differ between a model and a source
-
-
-def reordered(spec, order):
-    fields = ("elements", "grid", "positions", "orientations")
-    return replace(spec, **{f: tuple(getattr(spec, f)[i] for i in order) for f in fields})
 
 
 def test_a_source_with_the_elements_in_another_order_is_permuted() -> None:
@@ -317,6 +312,7 @@ def test_anything_else_that_differs_is_said_exactly() -> None:
     moved = replace(source, positions=((9.0, 9.0, 9.0), *source.positions[1:]))
     for other, said in [
         (small_spec(elements=3), f"lacks {spec.elements[3]}"),
+        (small_spec(elements=5), "^A4 unknown to the model$"),
         (replace(source, elements=("new", *source.elements[1:])),
          f"lacks {source.elements[0]}; new unknown to the model"),
         (moved, r"positions\[2\] is \(9.0, 9.0, 9.0\), not"),
@@ -356,8 +352,7 @@ def test_a_window_is_loaded_only_where_one_is_wanted(tmp_path: Path) -> None:
     refusal(path, " is a model of kind 'window'; this needs 'step'")
     session, card = load_model(path, kind="window")
     assert probe_logits(session, card).shape == (4, 5)
-    fixed = WINDOW.replace("B,T", "B,7")
-    write_model(path, fixed, kind="window", state=())
+    write_model(path, WINDOW.replace("B,T", "B,7"), kind="window", state=())
     with pytest.raises(ModelError, match=r"disagree with its metadata at samples$"):
         load_model(path, kind=None)
 

@@ -36,9 +36,8 @@ def walk(graph):
 
 @pytest.mark.parametrize("which", ["shipped", "tiny", "branches"])
 def test_what_is_read_is_what_the_onnx_package_reads(which: str) -> None:
-    proto = {"shipped": lambda: onnx.load(shipped_model()), "tiny": tiny, "branches": nested}[
-        which
-    ]()
+    made = {"shipped": lambda: onnx.load(shipped_model()), "tiny": tiny, "branches": nested}
+    proto = made[which]()
     contents = read_onnx(proto.SerializeToString())
     assert contents.producer == proto.producer_name
     assert contents.opset == {o.domain: o.version for o in proto.opset_import}
@@ -66,12 +65,8 @@ def test_the_hash_is_of_all_but_the_metadata() -> None:
 def nested(depth: int = 1) -> onnx.ModelProto:
     """The tiny model with an If of so many levels."""
     proto = tiny()
-    body = helper.make_graph(
-        [helper.make_node("Identity", ["zero"], ["out"])],
-        "body",
-        [],
-        [helper.make_tensor_value_info("out", TensorProto.FLOAT, None)],
-    )
+    out = helper.make_tensor_value_info("out", TensorProto.FLOAT, None)
+    body = helper.make_graph([helper.make_node("Identity", ["zero"], ["out"])], "body", [], [out])
     for _ in range(depth):
         node = helper.make_node("If", ["yes"], ["out"], then_branch=body, else_branch=body)
         body = helper.make_graph([node], "body", [], body.output)
@@ -113,9 +108,8 @@ def initialiser(**fields):
 
 def operator(name, domain="", inputs=("zero",), **attributes):
     def change(proto):
-        proto.graph.node.append(
-            helper.make_node(name, list(inputs), ["made"], domain=domain, **attributes)
-        )
+        node = helper.make_node(name, list(inputs), ["made"], domain=domain, **attributes)
+        proto.graph.node.append(node)
 
     return change
 
@@ -133,9 +127,8 @@ def asks_for(size, how):
 
 
 def absurd_value(proto):
-    proto.graph.value_info.append(
-        helper.make_tensor_value_info("zero", TensorProto.FLOAT, [2**31, 2**31, 2**31])
-    )
+    absurd = helper.make_tensor_value_info("zero", TensorProto.FLOAT, [2**31, 2**31, 2**31])
+    proto.graph.value_info.append(absurd)
 
 
 def function(proto):

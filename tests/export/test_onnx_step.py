@@ -1,5 +1,4 @@
 import errno
-import hashlib
 import json
 import os
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ import tactile_rt
 from bench.inference.full_size import random_model
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
-from tactile_rt.classifier.model_file import ModelCard, file_outputs, load_model
+from tactile_rt.classifier.model_file import ModelCard, file_outputs, hash_of, load_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
@@ -68,13 +67,10 @@ def build() -> TactileClassifier:
 
 @pytest.fixture(scope="module", autouse=True)
 def _cheap() -> Iterator[None]:
-    """One thread, and a transformer of two layers: the exporter takes seconds for each."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    """A transformer of two layers: the exporter takes seconds for each."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gpt, "LAYERS", 2)
         yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -203,13 +199,6 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
         follow(path, exported.model, batch)
 
 
-def test_parity_is_measured_and_stored(exported: SimpleNamespace) -> None:
-    assert 0 < exported.card.figures["parity"] <= PARITY_BAR <= 1e-5
-    found = parity(exported.model, exported.path, episodes=2, seed=7)
-    assert set(found) == {"logits", "embedding"}
-    assert 0 < max(found.values()) <= PARITY_BAR
-
-
 def test_parity_tells_another_network_from_the_file_s(exported: SimpleNamespace) -> None:
     other = build()
     with torch.no_grad():
@@ -235,10 +224,9 @@ def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
     for name in ("clip", "scale"):
         assert card[name] == pytest.approx(getattr(exported.model.inputs, name).tolist())
     assert card["figures"]["validation_top1"] == 0.5
+    assert 0 < card["figures"]["parity"] <= PARITY_BAR <= 1e-5
     provenance = card["provenance"]
-    assert provenance["checkpoint_sha256"] == (
-        hashlib.sha256(exported.checkpoint.read_bytes()).hexdigest()
-    )
+    assert provenance["checkpoint_sha256"] == hash_of(exported.checkpoint)
     assert provenance["unseen_objects"] == ["mug-2", "car-2"]
     assert provenance["sweep_set"] == {"seed": 5}
     assert provenance["network"] == {**asdict(NETWORK), "frame": list(NETWORK.frame)}

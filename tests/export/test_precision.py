@@ -1,7 +1,6 @@
 """Files in fewer bits, and the window form: what they hold, and how far their logits are off."""
 
 from collections import Counter
-from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,14 +31,6 @@ CLASSES = 6
 TOLERANCE = {"fp32": PARITY_BAR, "fp16": 5e-3, "bf16": 5e-2, "int8": 1e-1}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     """One network, traced once, in every precision and in both forms."""
@@ -54,13 +45,10 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
         model.network.decoder.weight *= 8  # logits of a spread of about 1
     proto, state = step_graph(model, card, integer=True)
     cards, paths = {}, {}
-    for precision in PRECISIONS:
-        paths[precision] = folder / f"{precision}.onnx"
-        cards[precision] = write_model(proto, state, model, card, paths[precision], precision)
-    for precision in ("fp32", "int8"):
-        name = f"window {precision}"
-        paths[name] = folder / f"window-{precision}.onnx"
-        cards[name] = write_model(proto, state, model, card, paths[name], precision, "window")
+    forms = [(p, p, "step") for p in PRECISIONS]
+    for name, *form in (*forms, *((f"window {p}", p, "window") for p in ("fp32", "int8"))):
+        paths[name] = folder / f"{name}.onnx"
+        cards[name] = write_model(proto, state, model, card, paths[name], *form)
     return SimpleNamespace(model=model, proto=proto, state=state, cards=cards, paths=paths)
 
 

@@ -12,9 +12,7 @@ import torch
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_parts
-from tactile_rt.export.streaming import (
-    streaming,
-)
+from tactile_rt.export.streaming import streaming
 from tactile_rt.export.streaming_parts import Pointwise
 from tests.helpers.small_networks import TOLERANCE, build, frames, stream
 
@@ -42,12 +40,9 @@ SAMPLE = [
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _one_thread() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+def _inference() -> Iterator[None]:
     with torch.inference_mode():
         yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize(("encoder", "attender", "decoder"), SAMPLE)
@@ -119,50 +114,38 @@ def test_a_step_writes_its_own_rows_of_the_cache_and_no_others() -> None:
         assert rows == [[0, 1], [8, 9], [last, last + 1], [last, last + 1]]
 
 
+GRAPH = """
+readout = "out"
+[inputs.frame]
+channels = 30
+rows = 5
+columns = 7
+[nodes.a]
+channels = 64
+kind = "valid"
+cell = "ugrnn"
+reads = ["frame"]
+[nodes.b]
+channels = 32
+kind = "same"
+reads = ["a"]
+[nodes.out]
+channels = 32
+kind = "dense"
+reads = ["b", {source = "a", fusion = "gate"}]
+"""
+
+
 def test_a_graph_with_sums_and_gates_streams_as_it_was_trained() -> None:
-    graph = """
-    readout = "out"
-    [inputs.frame]
-    channels = 30
-    rows = 5
-    columns = 7
-    [nodes.a]
-    channels = 64
-    kind = "valid"
-    cell = "ugrnn"
-    reads = ["frame"]
-    [nodes.b]
-    channels = 32
-    kind = "same"
-    reads = ["a"]
-    [nodes.out]
-    channels = 32
-    kind = "dense"
-    reads = ["b", {source = "a", fusion = "gate"}]
-    """
-    ead = build("graph", "none", graph=graph, width=1.0)
+    ead = build("graph", "none", graph=GRAPH, width=1.0)
     x = frames()
     assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE
 
 
 @pytest.mark.usefixtures("as_if_wide")
 def test_maps_of_one_row_have_no_site_below() -> None:
-    graph = """
-    readout = "out"
-    [inputs.frame]
-    channels = 30
-    rows = 1
-    columns = 7
-    [nodes.a]
-    channels = 16
-    kind = "same"
-    cell = "intersection"
-    reads = ["frame"]
-    [nodes.out]
-    channels = 16
-    kind = "dense"
-    reads = ["a"]
-    """
-    ead = build("graph", "none", graph=graph, width=1.0, frame=(30, 1, 7))
+    row = GRAPH.replace("rows = 5", "rows = 1").replace('"valid"', '"same"')
+    row = row.replace('"ugrnn"', '"intersection"')
+    ead = build("graph", "none", graph=row, width=1.0, frame=(30, 1, 7))
     x = frames()[..., :1, :]
     assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE

@@ -20,6 +20,13 @@ from scipy.optimize import brentq, fsolve
 Floats = NDArray[np.float64]
 
 
+def about(axis: Any, angle: float) -> Floats:
+    """(3, 3) Rodrigues' rotation about a unit axis."""
+    x, y, z = axis
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
+
+
 class Cone(Protocol):
     """What theory needs to know of a whisker, see `whiskers.Whisker`."""
 

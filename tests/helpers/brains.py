@@ -31,14 +31,9 @@ def animals(rng, number=6, sessions=2, scrambled=False, shared=None, **kwargs):
     for i in range(number):
         order = rng.permutation(6) if scrambled else np.arange(6)
         name = f"mouse-{i}"
+        own = (f"{name}-{k}" for k in range(sessions))
         made.append(
-            Animal(
-                name,
-                tuple(
-                    session(rng, name, f"{name}-{k}", shared[order], **kwargs)
-                    for k in range(sessions)
-                ),
-            )
+            Animal(name, tuple(session(rng, name, k, shared[order], **kwargs) for k in own))
         )
     return made
 

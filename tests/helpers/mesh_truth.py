@@ -1,6 +1,9 @@
 """Closed meshes to cut, and another measure of how far pieces are from them: by brute force."""
 
+import json
+import struct
 from collections.abc import Sequence
+from pathlib import Path
 
 import manifold3d
 import numpy as np
@@ -32,6 +35,21 @@ def one_mesh(pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
         for p in pieces
     ]
     return as_mesh(Manifold.batch_boolean(solids, manifold3d.OpType.Add))
+
+
+def write_glb(path: Path, primitive: dict[str, object], data: bytes, **more: object) -> None:
+    """Write a binary glTF 2.0 of one mesh of one primitive; `more` is of its JSON."""
+    told = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": len(data)}], **more,
+    }  # fmt: skip
+    text = json.dumps(told).encode()
+    chunks = b""
+    for kind, content, fill in ((b"JSON", text, b" "), (b"BIN\0", data, b"\0")):
+        content += fill * (-len(content) % 4)
+        chunks += struct.pack("<I4s", len(content), kind) + content
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Manifold:

@@ -70,6 +70,16 @@ def write_session(
     return path
 
 
+def changed_copy(session, path, change):
+    """Copy a session's file, change what h5py reads of it, and give its path."""
+    import h5py
+
+    path.write_bytes(session.read_bytes())
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
 def write_animals(folder, seed=0, number=8, units=20, sessions=1, **kwargs):
     """Animals of one geometry, a folder of files `sub-NAME_ses-K_behavior+ecephys.nwb`."""
     rng = np.random.default_rng(seed)

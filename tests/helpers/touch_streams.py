@@ -1,12 +1,14 @@
 """Streams of touches for the tiny model, and what it must say of them."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.core.stream import NS_PER_S, Chunk
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import CARD, PERIOD_NS, SUBSTEPS
 
@@ -15,6 +17,12 @@ SAME_RATE = small_spec(rate_hz=NS_PER_S / PERIOD_NS)
 QUIET = 130  # samples before the first touch: more than a baseline holds
 SIGMA = 2e-3
 FACTS = ("onset_ns", "t_ns", "step", "final", "label", "prediction_set", "coverage")
+
+
+def reordered(spec: ArraySpec, order: Sequence[int]) -> ArraySpec:
+    """Put an array's elements into another order, or take some of them."""
+    fields = ("elements", "grid", "positions", "orientations")
+    return replace(spec, **{f: tuple(getattr(spec, f)[i] for i in order) for f in fields})
 
 
 def signal(touches: list[tuple[int, int, float]], n: int, seed: int = 0) -> np.ndarray:

@@ -79,11 +79,8 @@ def test_two_views_of_an_epoch_share_the_sweeps_and_nothing_that_is_drawn() -> N
         (samples, offset, sigma, labels), (samples2, offset2, sigma2, labels2) = one, other
         assert labels.tolist() == labels2.tolist()
         # no window is the same twice, clean ones included: gains differ
-        same = (
-            np.isclose(samples.numpy(), samples2.numpy(), rtol=1e-6, atol=0)
-            & (samples != 0).numpy()
-        )
-        assert same.mean() < 0.01
+        alike = np.isclose(samples.numpy(), samples2.numpy(), rtol=1e-6, atol=0)
+        assert (alike & (samples != 0).numpy()).mean() < 0.01
         assert not np.array_equal(offset, offset2) or not np.array_equal(sigma, sigma2)
 
 

@@ -66,29 +66,25 @@ def test_the_exported_file_refuses_and_has_prediction_sets(run, tmp_path, call):
     assert "4: ball, cube, cone, star" in shown and "swapped channels" in shown
 
 
-def test_a_run_goes_on_with_the_same_sets_only(sets, run, call):
+def test_a_run_goes_on_with_the_same_sets_only(sets, run, call, refused):
     again = ("train", sets / "one", run, *SMALL, *QUICK)
-    code, _, said = call(*again)
-    assert code == 2 and "another configuration (other also)" in said
+    assert "another configuration (other also)" in refused(*again)
     code, _, said = call(*again, "--also", sets / "other")
     assert not code, said
 
 
-def test_sets_of_two_arrays_are_refused(sets, tmp_path, call):
+def test_sets_of_two_arrays_are_refused(sets, tmp_path, refused):
     write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
-    code, _, said = call(
-        "train", sets / "one", tmp_path / "run", "--also", tmp_path / "robot", *SMALL, *QUICK
-    )
-    assert code == 2 and "cannot be joined" in said and not (tmp_path / "run").exists()
+    also = ("--also", tmp_path / "robot", *SMALL, *QUICK)
+    assert "cannot be joined" in refused("train", sets / "one", tmp_path / "run", *also)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp_path, call):
     knew, before = load_checkpoint(run / "best.pt")
     # no rate to speak of: the weights stay what they began as
-    begun = "--set batch=6 --set updates=1 --set learning_rate=1e-12".split()
-    code, _, said = call(
-        "train", sets / "other", tmp_path / "next", "--from", run / "best.pt", *begun
-    )
+    begun = "--set batch=6 --set updates=1 --set learning_rate=1e-12 --from".split()
+    code, _, said = call("train", sets / "other", tmp_path / "next", *begun, run / "best.pt")
     assert not code, said
     model, after = load_checkpoint(tmp_path / "next" / "best.pt")
     assert after["categories"] == ["cone", "star"] and after["refusals"] == []
@@ -102,15 +98,15 @@ def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp
     assert after["network"]["width"] == before["network"]["width"], "the network is the other's"
 
 
-def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
-    code, _, said = call("train", sets / "other", tmp_path / "a", "--from", tmp_path / "no.pt")
-    assert code == 2 and "no checkpoint" in said
-    wide = ("--from", run / "best.pt", "--set", "width=0.0625", *QUICK)
-    code, _, said = call("train", sets / "other", tmp_path / "b", *wide)
-    assert code == 2 and "cannot be begun with: it is of another width" in said
+def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, refused):
     write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
-    code, _, said = call("train", tmp_path / "robot", tmp_path / "c", "--from", run / "best.pt")
-    assert code == 2 and "cannot be begun with: it is of another" in said
+    wide = ("--set", "width=0.0625", *QUICK)
+    for data, begin, more, said in (
+        (sets / "other", tmp_path / "no.pt", (), "no checkpoint"),
+        (sets / "other", run / "best.pt", wide, "cannot be begun with: it is of another width"),
+        (tmp_path / "robot", run / "best.pt", (), "cannot be begun with: it is of another"),
+    ):
+        assert said in refused("train", data, tmp_path / "a", "--from", begin, *more)
 
 
 def test_things_of_no_category_are_what_unknown_is_learnt_from(sets, tmp_path, call):

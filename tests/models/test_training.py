@@ -55,6 +55,11 @@ def equal(a, b):
     return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
 
 
+def history(run):
+    with (run / "history.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
 # Configuration
 
 
@@ -127,10 +132,8 @@ def test_lars_is_a_plain_loop(published):
 def test_norms_that_are_stacked_are_no_layers_to_lars():
     """Their rows move by the plain rate; or, as published, each by one of its own."""
     start, slope = torch.tensor([[3.0, 4.0], [0.3, 0.4]]), torch.tensor([[1.0, 0.0], [0.0, 1.0]])
-    for published, trust in (
-        (False, torch.ones(2, 1)),
-        (True, 1e-3 * torch.tensor([[5.0], [0.5]])),
-    ):
+    trusts = {False: torch.ones(2, 1), True: 1e-3 * torch.tensor([[5.0], [0.5]])}
+    for published, trust in trusts.items():
         parameter = nn.Parameter(start.clone())
         parameter.grad = slope
         LARS([{"params": [parameter], "stacked": True}], 0.1, published=published).step()
@@ -147,10 +150,10 @@ def test_what_asks_for_its_own_rate_may_be_overruled():
 # Schedules
 
 
-def rates(updates, **config):
+def rates(updates, *epoch, **config):
     settings = TrainingConfig("set", optimizer="sgd", learning_rate=1.0, **config)
     optimizer = build_optimizer(nn.Linear(1, 1), settings)
-    schedule, found = build_schedule(optimizer, settings, updates), []
+    schedule, found = build_schedule(optimizer, settings, updates, *epoch), []
     for _ in range(updates):
         found.append(optimizer.param_groups[0]["lr"])
         optimizer.step()
@@ -198,17 +201,9 @@ def test_a_schedule_may_be_as_short_as_one_wants(schedule, updates):
 
 def test_rates_may_change_by_epoch():
     for schedule in ("step", "cosine", "cosine-annealing"):
-        settings = TrainingConfig(
-            "set", optimizer="sgd", schedule=schedule, warmup=0.1, rate_per="epoch"
-        )
-        optimizer = build_optimizer(nn.Linear(1, 1), settings)
-        plan, found = build_schedule(optimizer, settings, 57, 4), []  # the last epoch is short
-        for _ in range(57):
-            found.append(optimizer.param_groups[0]["lr"])
-            optimizer.step()
-            plan.step()
-        epochs = [set(found[k : k + 4]) for k in range(0, 57, 4)]
-        assert all(len(rates) == 1 for rates in epochs)
+        found = rates(57, 4, schedule=schedule, warmup=0.1, rate_per="epoch")
+        epochs = [set(found[k : k + 4]) for k in range(0, 57, 4)]  # the last is short
+        assert all(len(each) == 1 for each in epochs)
         assert len(set.union(*epochs)) > (3 if schedule == "step" else 13)
     with pytest.raises(ConfigError, match="one-cycle changes the rate per update"):
         TrainingConfig("set", rate_per="epoch")
@@ -222,9 +217,8 @@ def test_first_weights_are_drawn_as_published(tiny):
         part = encoder.get_submodule(name)
         bound = part.weight[0].numel() ** -0.5
         spread = float(part.weight.detach().std())
-        assert part.weight.abs().max() <= bound and spread == pytest.approx(
-            bound / 3**0.5, rel=0.05
-        )
+        assert part.weight.abs().max() <= bound
+        assert spread == pytest.approx(bound / 3**0.5, rel=0.05)
         if bias is None:
             assert 0 < part.bias.abs().max() <= bound
         else:
@@ -376,15 +370,13 @@ def test_training_learns(tiny, tmp_path):
     lines = []
     best = train(config, tmp_path / "run", lambda p: lines.append(p.metrics) if p.metrics else None)
     assert lines[-1]["loss"] < 0.6 * lines[0]["loss"]
-    with (tmp_path / "run" / "history.csv").open() as file:
-        history = list(csv.DictReader(file))
-    assert [int(line["epoch"]) for line in history] == list(range(1, 26))
-    scores = [float(h["validation_top1"]) + float(h["validation_top1_noisy"]) for h in history]
-    _, saved = load_checkpoint(best)
+    found = history(tmp_path / "run")
+    assert [int(line["epoch"]) for line in found] == list(range(1, 26))
+    scores = [float(h["validation_top1"]) + float(h["validation_top1_noisy"]) for h in found]
+    model, saved = load_checkpoint(best)
     kept = saved["metrics"]
     assert kept["validation_top1"] + kept["validation_top1_noisy"] == max(scores)
     test = SweepSet.read(Path(tiny), "test")
-    model, _ = load_checkpoint(best)
     assert hits(predict(test, run_on(model))[:, -1], test.sweeps.labels).mean() > 0.6
 
 
@@ -481,12 +473,10 @@ def test_a_killed_run_ends_as_one_that_was_not(tiny, tmp_path):
     train(config, tmp_path / "whole")
     for name in ("last.pt", "best.pt"):
         assert equal(weights(tmp_path / "killed" / name), weights(tmp_path / "whole" / name))
-    histories = []
-    for run in ("killed", "whole"):
-        with (tmp_path / run / "history.csv").open() as file:
-            lines = list(csv.DictReader(file))
-        histories.append([{k: v for k, v in r.items() if k != "seconds"} for r in lines])
-    assert histories[0] == histories[1]
+    killed, whole = (history(tmp_path / run) for run in ("killed", "whole"))
+    for line in (*killed, *whole):
+        line.pop("seconds")
+    assert killed == whole
 
 
 @pytest.mark.slow
@@ -499,10 +489,7 @@ def test_two_devices_train_as_one(tiny, tmp_path, objective):
     train(TrainingConfig(tiny, **whole), tmp_path / "one")
     one, two = weights(tmp_path / "one" / "last.pt"), weights(tmp_path / "two" / "last.pt")
     assert digest(two) == ranks[0]["digest"]
-    losses = []
-    for run in ("one", "two"):
-        with (tmp_path / run / "history.csv").open() as file:
-            losses.append([float(line["loss"]) for line in csv.DictReader(file)])
+    losses = [[float(line["loss"]) for line in history(tmp_path / run)] for run in ("one", "two")]
     if objective == "supervised":  # batch norm sees half of the batch in the other
         assert losses[1] == pytest.approx(losses[0], abs=1e-4), "of both shares"
         for name in one:

@@ -10,29 +10,23 @@ from pathlib import Path
 
 import pytest
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
-from tactile_rt.core.errors import ConfigError, ModelError  # noqa: E402
-from tactile_rt.models.checkpoints import (  # noqa: E402
-    describe_checkpoint,
-    load_checkpoint,
-    network_of,
-)
-from tactile_rt.models.ead_config import CELLS  # noqa: E402
-from tactile_rt.models.encoders import cells  # noqa: E402
-from tactile_rt.models.grid.plan import read_grid  # noqa: E402
-from tactile_rt.models.grid.pool import run_grid  # noqa: E402
-from tactile_rt.models.training import loop  # noqa: E402
-from tactile_rt.models.training.config import (  # noqa: E402
-    DivergedError,
-    ProbeConfig,
-    TrainingConfig,
-)
-from tactile_rt.models.training.loop import Validation, train  # noqa: E402
-from tactile_rt.models.training.probing import probe  # noqa: E402
-from tests.helpers.holding import held_elsewhere  # noqa: E402
-from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402
+import torch
+
+from tactile_rt.core.errors import ConfigError, ModelError
+from tactile_rt.models.checkpoints import describe_checkpoint, load_checkpoint, network_of
+from tactile_rt.models.ead_config import CELLS
+from tactile_rt.models.encoders import cells
+from tactile_rt.models.grid.plan import read_grid
+from tactile_rt.models.grid.pool import run_grid
+from tactile_rt.models.training import loop
+from tactile_rt.models.training.config import DivergedError, ProbeConfig, TrainingConfig
+from tactile_rt.models.training.loop import Validation, train
+from tactile_rt.models.training.probing import probe
+from tests.helpers.holding import held_elsewhere
+from tests.helpers.tiny_sweeps import write_tiny_set
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
 OPTIONS = f"--encoder gru --set decoder=linear --set width={1 / 32} --set batch=6".split()
@@ -100,9 +94,8 @@ def test_a_probe_never_takes_the_place_of_what_it_probes(trained, refused, tmp_p
 
 
 def test_the_probe_s_steps_are_chosen_by_the_command(trained, call, refused, tmp_path):
-    assert "readout is 'all', not one of last, mean" in refused(
-        "probe", trained / "best.pt", tmp_path / "p", "--set", "readout=all"
-    )
+    said = refused("probe", trained / "best.pt", tmp_path / "p", "--set", "readout=all")
+    assert "readout is 'all', not one of last, mean" in said
     found = {}
     for readout in ("last", "mean"):
         options = ("--epochs", 3, "--set", f"readout={readout}")
@@ -222,14 +215,11 @@ def test_what_is_no_checkpoint_is_refused_by_one_wording(trained, tmp_path):
         (tmp_path / name).write_bytes(content)
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("a.txt", "a")
-    for name, content in (
-        ("list", [1, 2]),
-        ("command", _Command(tmp_path / "touched")),
-        ("cut", None),
-    ):
+    pickled = {"list": [1, 2], "command": _Command(tmp_path / "touched"), "cut": None}
+    for name, content in pickled.items():
         with zipfile.ZipFile(tmp_path / name, "w") as archive:
-            pickled = pickle.dumps(content)
-            archive.writestr("archive/data.pkl", pickled[: -1 if name == "cut" else None])
+            data = pickle.dumps(content)
+            archive.writestr("archive/data.pkl", data[: -1 if name == "cut" else None])
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     for path in sorted(tmp_path.iterdir()):
@@ -341,9 +331,7 @@ def test_a_validation_without_a_touch_is_told_before_the_training(tiny, tmp_path
 
 
 def test_a_validation_that_is_no_number_is_a_divergence(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "tactile_rt.models.training.loop.Validation.__call__", lambda *_: ({}, float("nan"))
-    )
+    monkeypatch.setattr(Validation, "__call__", lambda *_: ({}, float("nan")))
     with pytest.raises(DivergedError, match="diverged in epoch 1"):
         train(TrainingConfig(tiny, **SMALL, updates=1), tmp_path / "run")
     assert not (tmp_path / "run" / "best.pt").exists()

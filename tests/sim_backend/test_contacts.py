@@ -19,12 +19,7 @@ from tactile_rt.sets.objects import read_object, read_sweeps
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
-from tactile_rt.sim_backend.datasets.recipes import (
-    ObjectChoice,
-    Range,
-    SweepChoice,
-    SweepRecipe,
-)
+from tactile_rt.sim_backend.datasets.recipes import ObjectChoice, Range, SweepChoice, SweepRecipe
 from tactile_rt.sim_backend.mujoco_world import ContactProbe, contact_distances
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
@@ -63,15 +58,15 @@ def test_a_peg_is_recorded_where_the_elastica_has_it(case) -> None:
     assert force * 1e3 == pytest.approx(normal, rel=0.06)
 
 
-def test_looking_at_contacts_changes_no_load() -> None:
-    def simulation() -> SweepSimulation:
-        sweep = Sweep(gap_mm=0.5)
-        return SweepSimulation(
-            load_array("mouse"), make_object("mug", 0), sweep, PROFILES["realtime"]
-        )
+def simulation(profile: str) -> SweepSimulation:
+    """A mug that passes the mouse."""
+    mug = make_object("mug", 0)
+    return SweepSimulation(load_array("mouse"), mug, Sweep(gap_mm=0.5), PROFILES[profile])
 
-    loads = simulation().advance(240)
-    looking = simulation()
+
+def test_looking_at_contacts_changes_no_load() -> None:
+    loads = simulation("realtime").advance(240)
+    looking = simulation("realtime")
     pieces = [looking.advance_with_contacts(n) for n in (100, 1, 139)]
     assert np.array_equal(np.concatenate([p[0] for p in pieces]), loads)
     contacts = np.concatenate([p[1] for p in pieces])
@@ -88,13 +83,7 @@ def test_looking_at_contacts_changes_no_load() -> None:
 
 
 def test_by_mujoco_contacts_are_looked_at_now_and_then() -> None:
-    sweep, mug = Sweep(gap_mm=0.5), make_object("mug", 0)
-    loads, every, held = (
-        SweepSimulation(load_array("mouse"), mug, sweep, PROFILES["mujoco"]).advance_with_contacts(
-            120, n
-        )
-        for n in (0, 1, 3)
-    )
+    loads, every, held = (simulation("mujoco").advance_with_contacts(120, n) for n in (0, 1, 3))
     assert np.array_equal(loads[0], every[0]) and np.array_equal(loads[0], held[0])
     assert not loads[1].any() and every[1].any()
     assert np.array_equal(held[1][1::3], held[1][::3])

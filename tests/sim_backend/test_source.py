@@ -124,9 +124,7 @@ def test_all_categories_come_when_none_is_named() -> None:
         assert source.passes[0].category in CATEGORIES
 
 
-def test_a_recording_names_the_version_of_the_engine(
-    two_passes: tuple[SimSource, Chunk],
-) -> None:
+def test_a_recording_names_the_version_of_the_engine(two_passes: tuple[SimSource, Chunk]) -> None:
     assert describe(two_passes[0], session={"who": "Ada"}).session == {"engine": "2", "who": "Ada"}
 
 

@@ -56,10 +56,8 @@ def test_the_face_is_the_analytic_arc(name):
     surface = Surface.named(name)
     model, data = world_of(surface.pieces())
     turn = np.radians(surface.facing_deg)
-    out, side = (
-        np.array([np.cos(turn), np.sin(turn), 0]),
-        np.array([-np.sin(turn), np.cos(turn), 0]),
-    )
+    out = np.array([np.cos(turn), np.sin(turn), 0])
+    side = np.array([-np.sin(turn), np.cos(turn), 0])
     at = np.array(surface.position_mm)
     # Centre of the circle: behind a convex face, in front of a concave one.
     centre = at + out * surface.radius_mm * (-1 if surface.shape == "convex" else 1)
@@ -85,10 +83,7 @@ def test_concave_stays_concave():
     assert sagitta == pytest.approx(5.30, abs=0.02)  # of the published mesh, at its scale
     turn = np.radians(surface.facing_deg)
     out = np.array([np.cos(turn), np.sin(turn), 0])
-    for pieces, filled in (
-        (surface.pieces(), False),
-        ((np.concatenate(surface.pieces()),), True),
-    ):
+    for pieces, filled in ((surface.pieces(), False), ((np.concatenate(surface.pieces()),), True)):
         model, data = world_of(pieces)
         d = distance_along(model, data, np.array(surface.position_mm) + 30 * out, -out)
         assert d == pytest.approx(30 - sagitta if filled else 30, abs=0.05)
@@ -96,9 +91,8 @@ def test_concave_stays_concave():
 
 def test_distances_go_away_from_the_array_in_steps():
     for shape in ("convex", "concave"):
-        at = [
-            np.array(Surface.named(f"{shape}-{d}").position_mm) for d in ("close", "medium", "far")
-        ]
+        named = (Surface.named(f"{shape}-{d}") for d in ("close", "medium", "far"))
+        at = [np.array(surface.position_mm) for surface in named]
         np.testing.assert_allclose(at[1] - at[0], [1, 1, 0])
         np.testing.assert_allclose(at[2] - at[1], [1, 1, 0])
         normal = np.radians(Surface.named(f"{shape}-far").facing_deg)
@@ -176,13 +170,13 @@ def test_the_window_begins_with_the_contact():
     assert not values[:, [0, 2]].any()
 
 
+NOTHING = Touch(np.zeros((1400, 3, 6), np.float32), np.zeros((1400, 3), bool))
+
+
 @pytest.mark.parametrize(
     ("felt", "said"),
     [
-        (
-            Touch(np.zeros((1400, 3, 6), np.float32), np.zeros((1400, 3), bool)),
-            "no whisker touches",
-        ),
+        (NOTHING, "no whisker touches"),
         (made_up(500), "must last 1491 ms or more, not 1400 ms"),
         (made_up(4), "begin 9 ms or more before the contact"),
     ],

@@ -131,9 +131,8 @@ def test_a_sample_is_the_mean_over_its_millisecond() -> None:
     raw = np.array([d.sensordata.copy() for _, d in stepped(by_hand, sweep, 60)])
     steps = round(1 / profile.timestep_ms)
     assert len(raw) == 60 * steps and np.abs(loads[-1]).max() > 0
-    np.testing.assert_allclose(
-        loads, read_base_loads(raw.reshape(60, steps, 6).mean(axis=1)), atol=1e-15
-    )
+    means = read_base_loads(raw.reshape(60, steps, 6).mean(axis=1))
+    np.testing.assert_allclose(loads, means, atol=1e-15)
 
 
 # The face that slides along the whisker is parallel to the motion and faces -x, whatever the yaw.
@@ -200,9 +199,7 @@ def test_an_object_of_several_pieces_is_felt_as_their_union() -> None:
     halves = tuple(box((x, 0, 0), (0.5, 1, 1)) for x in (-0.25, 0.25))
     sweep = Sweep(gap_mm=0.2)
     whole = SweepSimulation(C2, block(), sweep, REALTIME).advance(300)
-    cut = SweepSimulation(C2, TactileObject("halves", "halves", halves), sweep, REALTIME).advance(
-        300
-    )
+    cut = SweepSimulation(C2, TactileObject("cut", "cut", halves), sweep, REALTIME).advance(300)
     assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.05 * np.sqrt(np.mean(whole**2))
 
 

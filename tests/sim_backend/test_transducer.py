@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
+from tactile_rt import testing
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError
@@ -40,10 +41,7 @@ def chunk_of(values: np.ndarray) -> Chunk:
 
 def cut(chunk: Chunk, at: list[int]) -> list[Chunk]:
     edges = [0, *sorted({a % len(chunk) for a in at} - {0}), len(chunk)]
-    return [
-        Chunk(*(getattr(chunk, f)[a:b] for f in ("seq", "t_ns", "values", "valid")))
-        for a, b in itertools.pairwise(edges)
-    ]
+    return [chunk.select(slice(a, b)) for a, b in itertools.pairwise(edges)]
 
 
 def test_a_dipole_on_its_axis_and_beside_it() -> None:
@@ -99,17 +97,10 @@ def test_cutting_the_stream_changes_nothing(at: list[int], rate_hz: float) -> No
 
 def test_the_noise_has_the_density_that_is_described() -> None:
     sensor = SensorSpec(channels=(MZ,), rate_hz=200)
-    animals = load_animals("mouse")
-    spec = dataclasses.replace(
-        device_spec(animals), channels=("mz",), units=("N m",), rate_hz=200.0
-    )
+    mouse = device_spec(load_animals("mouse"))
+    spec = dataclasses.replace(mouse, channels=("mz",), units=("N m",), rate_hz=200.0)
     n = 20_000
-    still = Chunk(
-        np.arange(n),
-        np.arange(n) * 5_000_000,
-        np.zeros((n, *spec.shape), dtype=np.float32),
-        np.ones((n, len(spec.elements)), dtype=bool),
-    )
+    (still,) = testing.cut(np.zeros((n, *spec.shape)), 200.0, samples=n)
     read = Sensor(SensorModel(), spec, 0, sensor).push(still)
     assert read is not None
     _, density = welch(read.values[:, :, 0], fs=200, nperseg=256, axis=0)

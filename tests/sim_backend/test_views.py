@@ -32,6 +32,7 @@ from tactile_rt.sim_backend.views.film import (
 from tactile_rt.sim_backend.views.footage import VIEWS, Camera, Footage, framing, record
 from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
+from tests.helpers.refusals import refusal
 
 SCALE = ForceScale(1.0, 10.0)
 SIDE = 200  # pixels of a test picture
@@ -186,9 +187,7 @@ def test_without_a_way_to_draw_it_is_one_line(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("MUJOCO_GL", "glfw")
-    with pytest.raises(ConfigError, match="no OpenGL to draw with") as refused:
-        Stage(still(), AHEAD, SCALE, 64, 64)
-    assert "\n" not in str(refused.value)
+    assert "no OpenGL to draw with" in refusal(Stage, still(), AHEAD, SCALE, 64, 64)
 
 
 # ---- recording and scale
@@ -328,9 +327,8 @@ def test_an_image_is_what_was_drawn(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write_image(path, FRAMES[3])
     with Image.open(path) as image:
-        assert abs(np.asarray(image).astype(int) - FRAMES[3]).max() <= (
-            3 if suffix == ".jpg" else 0
-        )
+        most = 3 if suffix == ".jpg" else 0
+        assert abs(np.asarray(image).astype(int) - FRAMES[3]).max() <= most
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -1,7 +1,4 @@
-"""The array's model: poses, signs, units, rest and profiles.
-
-Stiffness and resonance are tested in `test_beams.py`, contact in `test_contact_mechanics.py`.
-"""
+"""The array's model: poses, signs, units, rest and profiles; its mechanics are `bench/sim`'s."""
 
 from dataclasses import replace
 
@@ -74,11 +71,8 @@ def test_the_step_itself_over_damps_only_the_short_whiskers() -> None:
         }
         assert len(free) <= most
         # 2 zeta / omega below the step, and no other whisker
-        assert free == {
-            n
-            for n, f in resonances.items()
-            if 0.64 / (2e-3 * np.pi * f) <= (PROFILES[profile].timestep_ms)
-        }
+        step = PROFILES[profile].timestep_ms
+        assert free == {n for n, f in resonances.items() if 0.64 / (2e-3 * np.pi * f) <= step}
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -11,7 +11,6 @@ from tactile_rt.classifier.model_card import EmbeddingStatistics
 from tactile_rt.classifier.model_file import file_outputs, load_model, shipped_model, verify_model
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.teaching.class_incremental import (
-    EARLY,
     fit_new_classes,
     join_features,
     leave_one_out_new_classes,
@@ -78,7 +77,6 @@ def test_the_graph_computes_the_scores_and_leaves_the_network_alone(base, taught
         np.testing.assert_allclose(new[-1], last, rtol=1e-4, atol=1e-3)
         # before the last step a new class is farther away than the scores say
         assert (new[:-1] < (top + classes.scores(features))[:-1]).all()
-    assert EARLY > 0
 
 
 def test_what_lies_where_a_class_was_taught_is_that_class_and_what_is_known_is_not(base, taught):

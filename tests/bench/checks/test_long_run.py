@@ -93,10 +93,7 @@ def test_the_faults_are_there() -> None:
 
 @pytest.mark.parametrize(
     ("fault", "found"),
-    [
-        (LEAKS, "decisions as in a fresh classifier"),
-        (FORGETS, r"posteriors within (?!0\.0e\+00)"),
-    ],
+    [(LEAKS, "decisions as in a fresh classifier"), (FORGETS, r"posteriors within (?!0\.0e\+00)")],
 )
 def test_growth_and_other_decisions_are_found(fault: str, found: str) -> None:
     status, said = run(400, 300, fault)

@@ -41,9 +41,7 @@ def test_it_makes_what_it_evaluates(quick, monkeypatch):
 @pytest.mark.slow
 def test_from_nothing_to_every_barred_figure():
     records = {r.name: r for r in area.run(quick=True)}
-    assert [name for name, r in records.items() if r.bar] == [
-        "models.calibration error",
-        "models.step.parity",
-    ]
+    barred = [name for name, r in records.items() if r.bar]
+    assert barred == ["models.calibration error", "models.step.parity"]
     assert records["models.top-1"].value > 20  # in any pose; a broken model guesses: 2 %
     assert records["models.step.parity"].met

@@ -40,17 +40,15 @@ def data() -> Data:
 def test_it_is_small_and_has_kinds_and_objects_enough(data: Data) -> None:
     assert FILE.stat().st_size <= 5e6
     assert len(data.kinds) >= 25
-    unknown = {o.category for o in data.origins.values() if o.split in (OUTLIERS, WITHHELD)}
+    of_split = defaultdict(set)
+    for origin in data.origins.values():
+        of_split[origin.split].add(origin.category)
+    unknown = of_split[OUTLIERS] | of_split[WITHHELD]
     assert len(unknown) >= 20 and not unknown & set(data.kinds)
-    both = [
-        {o.category for o in data.origins.values() if o.split == split}
-        for split in (OUTLIERS, WITHHELD)
-    ]
-    assert not both[0] & both[1]
-    shared = {o.category for o in data.origins.values() if o.split == SOURCE}
-    assert len(shared) >= 8 and shared <= set(data.kinds)
+    assert not of_split[OUTLIERS] & of_split[WITHHELD]
+    assert len(of_split[SOURCE]) >= 8 and of_split[SOURCE] <= set(data.kinds)
     for split in ("train", "validation", "test"):
-        assert {o.category for o in data.origins.values() if o.split == split} == set(data.kinds)
+        assert of_split[split] == set(data.kinds)
     assert all(o.licence in ("MIT", "CC0-1.0") for o in data.origins.values())
     assert all(len(data.sets[split].sweeps) for split in SPLITS)
 
@@ -85,9 +83,7 @@ def test_what_is_packed_is_what_was_felt_to_a_fifth_of_the_noise(
     data: Data, tmp_path: Path
 ) -> None:
     origins = data.origins
-    few = {
-        split: [n for n, o in origins.items() if o.split == split][:2] for split in SPLITS
-    }  # two objects of each split
+    few = {split: [n for n, o in origins.items() if o.split == split][:2] for split in SPLITS}
     manifest = data.sets["train"].manifest
     names = [n for split in SPLITS for n in few[split]]
     small = replace(
@@ -118,9 +114,8 @@ def test_what_is_packed_is_what_was_felt_to_a_fifth_of_the_noise(
         step = 0.2 * manifest.limits.noise
         error = np.abs(there.values[there.objects == name] - felt[name]) / step
         assert error.max() <= 0.51
-        expected = (
-            data.kinds.index(origins[name].category) if origins[name].category in data.kinds else -1
-        )
+        kind = origins[name].category
+        expected = data.kinds.index(kind) if kind in data.kinds else -1
         assert set(there.labels[there.objects == name]) == {expected}
 
 

@@ -13,13 +13,7 @@ from scipy.optimize import curve_fit
 
 from bench.sim.beams import GRAVITY, ORIGIN, beams, flat, measure, ring
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
-from tactile_rt.sim_backend.world import (
-    PROFILES,
-    Profile,
-    add_whiskers,
-    empty_world,
-    set_damping,
-)
+from tactile_rt.sim_backend.world import PROFILES, Profile, add_whiskers, empty_world, set_damping
 from tests.helpers import beams as theory
 
 Floats = NDArray[np.float64]

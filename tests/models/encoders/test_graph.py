@@ -1,12 +1,14 @@
 """Networks from data: paths, loops, fusion, and what is refused."""
 
+import re
+
 import pytest
 import torch
 
-from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node, parse_graph
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.zhuang import GRAPH
+from tests.helpers.refusals import refusal
 from tests.helpers.small_networks import frames, stir
 
 TEXT = """
@@ -113,11 +115,7 @@ def test_width_scales_every_node_but_not_the_frame():
         ("rows = 5", "rows = 0", "frame: 0 x 7 sites"),
         ("rows = 5", "rows = 1", "first: .* no site|reads no map|no site is left"),
         ("channels = 64", "channels = 0", "up: channels is 0"),
-        (
-            "channels = 64",
-            "chanels = 64",
-            r"nodes\.up has no key 'chanels'; did you mean channels\?",
-        ),
+        ("channels = 64", "chanels = 64", r"nodes\.up has no key 'chanels'; did you mean channel"),
         ("[nodes.first]", "[nodes.frame]", "'frame' must be a name of its own"),
         ("[nodes.first]", '[nodes."a-b"]', "'a-b' must be a name"),
         ('["up", { source = "down"', '["first", { source = "first"', "reads the same node twice"),
@@ -133,7 +131,5 @@ def test_width_scales_every_node_but_not_the_frame():
 )
 def test_a_mistake_is_named_in_one_line(old, new, match):
     assert old in TEXT
-    with pytest.raises(ConfigError, match=match) as error:
-        parse_graph(TEXT.replace(old, new, 1), "my graph")
-    assert str(error.value).startswith("my graph")
-    assert "\n" not in str(error.value)
+    said = refusal(parse_graph, TEXT.replace(old, new, 1), "my graph")
+    assert said.startswith("my graph") and re.search(match, said)

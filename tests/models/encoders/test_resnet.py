@@ -7,13 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.encoders.resnet import ConvNorm, ResidualBlock, ResNet18Encoder
 
 TOLERANCE = 2e-6
-
-
-def count(module: nn.Module) -> int:
-    return sum(p.numel() for p in module.parameters())
 
 
 def build(width: float = 1 / 16) -> ResNet18Encoder:
@@ -39,14 +36,8 @@ def oracle(encoder: ResNet18Encoder, x: Tensor) -> Tensor:
     def layer(conv: ConvNorm, x: Tensor, stride: int) -> Tensor:
         norm, padding = conv.norm, conv.weight.shape[-1] // 2
         x = F.conv2d(x, conv.weight, stride=stride, padding=padding)
-        return F.batch_norm(
-            x,
-            None if norm.training else norm.running_mean,
-            None if norm.training else norm.running_var,
-            norm.weight,
-            norm.bias,
-            norm.training,
-        )
+        known = (None, None) if norm.training else (norm.running_mean, norm.running_var)
+        return F.batch_norm(x, *known, norm.weight, norm.bias, norm.training)
 
     x = F.max_pool2d(F.relu(layer(encoder.stem, x, 2)), 3, 2, 1)
     for i, block in enumerate(encoder.blocks):
@@ -85,4 +76,4 @@ def test_deployed_gives_the_same():
 
 
 def test_deployed_is_small():
-    assert count(ResNet18Encoder().deployed()) < 3_000_000
+    assert count_parameters(ResNet18Encoder().deployed()) < 3_000_000

@@ -11,12 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers, rat_whiskers
-from tactile_rt.sim_backend.arrays.whiskers import (
-    OPTIONAL,
-    REQUIRED,
-    Whisker,
-    keratin_radii,
-)
+from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, Whisker, keratin_radii
 
 WHISKERS = {w.name: w for w in mouse_whiskers()}
 every = pytest.mark.parametrize("whisker", WHISKERS.values(), ids=WHISKERS)

@@ -12,7 +12,6 @@ pytest.importorskip("mujoco")
 pytest.importorskip("numba")
 
 from tactile_rt.core.errors import SpecMismatch
-from tactile_rt.core.stream import Chunk
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.measuring.fitting import Fitted, fit_array, read_described
 from tactile_rt.sim_backend.sensor import Sensor
@@ -183,10 +182,7 @@ def test_where_the_mount_gives_more_it_is_the_mount_that_is_fitted(magnets) -> N
     described, device = magnets
     fitted = fit_array(described, *plucked(device, ("A0", "B1"), rest_s=20, angle=0.3))
     intervals = found(fitted)
-    for what, truth in (
-        ("mount_stiffness_nm_rad", 3e-4),
-        ("mount_damping_nms_rad", 6e-8),
-    ):
+    for what, truth in (("mount_stiffness_nm_rad", 3e-4), ("mount_damping_nms_rad", 6e-8)):
         low, high = intervals[what]
         assert low <= truth <= high
         assert high < 1.25 * low
@@ -277,16 +273,12 @@ def test_what_is_not_of_the_file_is_refused(described: Path, recorded, tmp_path:
         read_described(MAGNETS, spec)
 
 
-def cut(chunk: Chunk, which: slice | np.ndarray) -> Chunk:
-    return Chunk(chunk.seq[which], chunk.t_ns[which], chunk.values[which], chunk.valid[which])
-
-
 def test_what_holds_too_little_is_refused(described: Path, recorded) -> None:
     spec, chunk = recorded
-    assert "has 50 samples" in refusal(fit_array, described, spec, cut(chunk, slice(50)))
-    assert "at rest for 3 s" in refusal(fit_array, described, spec, cut(chunk, slice(1000)))
+    assert "has 50 samples" in refusal(fit_array, described, spec, chunk.select(slice(50)))
+    assert "at rest for 3 s" in refusal(fit_array, described, spec, chunk.select(slice(1000)))
     some = np.random.default_rng(0).random(len(chunk)) < 0.8
-    said = refusal(fit_array, described, spec, cut(chunk, some))
+    said = refusal(fit_array, described, spec, chunk.select(some))
     assert re.search(r"lacks \d+ of \d+ samples", said)
     still = replace(chunk, t_ns=np.zeros_like(chunk.t_ns))
     assert "do not advance" in refusal(fit_array, described, spec, still)
@@ -296,7 +288,7 @@ def test_a_few_lost_samples_change_nothing_much(described: Path, recorded, fitte
     spec, chunk = recorded
     some = np.random.default_rng(0).random(len(chunk)) < 0.98
     some[[0, -1]] = True
-    again = fit_array(described, spec, cut(chunk, some))
+    again = fit_array(described, spec, chunk.select(some))
     before = {f.what: f.measured.value for f in fitted.findings if f.measured}
     for f in again.findings:
         if f.what in ("rate", "noise density of my", "damping_ratio", "young_modulus_pa"):

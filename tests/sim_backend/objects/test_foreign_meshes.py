@@ -4,9 +4,6 @@ The solid is a box of 40 x 20 x 10 mm with a smaller one on one corner, so that 
 turned one is told from it: only one of its eight octants is filled higher than the others.
 """
 
-import json
-import struct
-
 import numpy as np
 import pytest
 
@@ -16,7 +13,7 @@ import trimesh
 from manifold3d import Manifold
 
 from tactile_rt.sim_backend.objects.meshes import load_mesh
-from tests.helpers.mesh_truth import one_mesh
+from tests.helpers.mesh_truth import one_mesh, write_glb
 
 FILLED = np.array([0.75, 0.75, 0.75])  # of the extents: inside
 EMPTY = [np.array(share) for share in ([0.25, 0.75, 0.75], [0.75, 0.25, 0.75], [0.25, 0.25, 0.75])]
@@ -50,36 +47,21 @@ def gltf(path, positions, indices, mode=4, node=None):
     """Write a glTF 2.0 of one mesh, y up: positions of shape (n, 3) in m, indices."""
     points = np.asarray(positions, "<f4")
     order = np.asarray(indices, "<u4").ravel()
-    data = points.tobytes() + order.tobytes()
+    ends = {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
+    corners = {"componentType": 5126, "count": len(points), "type": "VEC3", **ends}
     told = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **(node or {})}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": mode}]}],
-        "buffers": [{"byteLength": len(data)}],
         "bufferViews": [
             {"buffer": 0, "byteLength": points.nbytes},
             {"buffer": 0, "byteOffset": points.nbytes, "byteLength": order.nbytes},
         ],
         "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": 5126,
-                "count": len(points),
-                "type": "VEC3",
-                "min": points.min(axis=0).tolist(),
-                "max": points.max(axis=0).tolist(),
-            },
+            {"bufferView": 0, **corners},
             {"bufferView": 1, "componentType": 5125, "count": len(order), "type": "SCALAR"},
         ],
     }
-    text = json.dumps(told).encode()
-    text += b" " * (-len(text) % 4)
-    data += b"\0" * (-len(data) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
-    chunks += struct.pack("<II", len(data), 0x004E4942) + data
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1, "mode": mode}
+    write_glb(path, primitive, points.tobytes() + order.tobytes(), **told)
 
 
 def y_up(points):
@@ -135,18 +117,3 @@ def test_ascii_stl_of_inches_with_capitals_and_a_name_is_read(tmp_path):
         lines += ["    ENDLOOP", "  ENDFACET"]
     (tmp_path / "a.stl").write_text("\r\n".join([*lines, "ENDSOLID", ""]))
     is_right(tmp_path / "a.stl")
-
-
-def test_an_obj_of_quads_with_groups_normals_and_comments_is_read(tmp_path):
-    text = "# a slab\no slab\nv 0 0 0\nv 40 0 0\nv 40 20 0\nv 0 20 0\n"
-    text += (
-        "v 0 0 10\nv 40 0 10\nv 40 20 10\nv 0 20 10\nvn 0 0 1\nvt 0 0\ng all\nusemtl none\ns off\n"
-    )
-    for face in ("4 3 2 1", "5 6 7 8", "1 2 6 5", "2 3 7 6", "3 4 8 7", "4 1 5 8"):
-        text += "f " + " ".join(f"{v}/1/1" for v in face.split()) + "\n"
-    (tmp_path / "a.obj").write_text(text)
-    thing = load_mesh(tmp_path / "a.obj")
-    (piece,) = thing.pieces
-    scale = piece.extents[0] / 40
-    np.testing.assert_allclose(piece.extents / scale, [40, 20, 10])
-    assert piece.is_watertight and piece.volume / scale**3 == pytest.approx(8000)

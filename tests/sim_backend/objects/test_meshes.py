@@ -1,5 +1,3 @@
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -65,44 +63,20 @@ def test_a_hollow_solid_survives_draco(tmp_path: Path) -> None:
     packed = draco.encode(
         mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), quantization_bits=16
     )
-    packed += b"\0" * (-len(packed) % 4)
+    attributes = {"attributes": {"POSITION": 0}}
+    ends = dict(zip(("min", "max"), mesh.bounds.tolist(), strict=True))
     told = {
-        "asset": {"version": "2.0"},
         "extensionsUsed": [name],
         "extensionsRequired": [name],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "buffers": [{"byteLength": len(packed)}],
         "bufferViews": [{"buffer": 0, "byteLength": len(packed)}],
         "accessors": [
-            {
-                "componentType": 5126,
-                "count": len(mesh.vertices),
-                "type": "VEC3",
-                "min": mesh.bounds[0].tolist(),
-                "max": mesh.bounds[1].tolist(),
-            },
+            {"componentType": 5126, "count": len(mesh.vertices), "type": "VEC3", **ends},
             {"componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"},
         ],
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "attributes": {"POSITION": 0},
-                        "indices": 1,
-                        "extensions": {name: {"bufferView": 0, "attributes": {"POSITION": 0}}},
-                    }
-                ]
-            }
-        ],
     }
-    text = json.dumps(told).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(packed), b"BIN\0") + packed
+    extended = {**attributes, "indices": 1, "extensions": {name: {"bufferView": 0, **attributes}}}
     path = tmp_path / "packed.glb"
-    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    mesh_truth.write_glb(path, extended, packed, **told)
     packed_one = load_mesh(path, MeshDetail(up="z"))
     plain = load_mesh(save(mesh, tmp_path / "plain.stl"))
     assert packed_one.made_by == plain.made_by
@@ -244,12 +218,6 @@ def test_garbage_is_refused(tmp_path: Path, suffix: str, content: bytes) -> None
     path = tmp_path / f"garbage{suffix}"
     path.write_bytes(content)
     refuse(path, "cannot be read as|holds no triangles|file is empty")
-
-
-def test_a_file_cut_short_is_refused(tmp_path: Path) -> None:
-    path = save(trimesh.creation.icosphere(), tmp_path / "ball.stl")
-    path.write_bytes(path.read_bytes()[:-1000])
-    refuse(path, "cannot be read|not watertight|holds no triangles")
 
 
 def test_points_without_faces_are_refused(tmp_path: Path) -> None:

@@ -11,9 +11,7 @@ import pytest
 pytest.importorskip("manifold3d")
 
 import trimesh
-from manifold3d import Manifold, OpType
 
-from tactile_rt.core.errors import ConfigError
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
@@ -22,6 +20,7 @@ from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.object_sets import open_objects
 from tests.helpers import mesh_truth
+from tests.helpers.refusals import refusal
 
 MM = 40.0  # largest extent that errors are given at
 
@@ -54,15 +53,6 @@ def test_pieces_are_within_a_tenth_of_a_millimetre(name: str, tmp_path: Path) ->
         assert far >= 0.5 * thing.surface_error
     assert all(p.is_convex and p.is_watertight and p.volume > 0 for p in thing.pieces)
     assert thing.made_by == "pieces"
-
-
-def test_flat_faced_shapes_are_cut_exactly(tmp_path: Path) -> None:
-    thing = load_mesh(saved(mesh_truth.bracket(), tmp_path / "bracket.stl"))
-    assert len(thing.pieces) == 2
-    together = Manifold.batch_boolean(
-        [Manifold.hull_points(np.array(p.vertices)) for p in thing.pieces], OpType.Add
-    )
-    assert together.volume() * MM**3 == pytest.approx(40 * 20 * 6 + 6 * 20 * 24, rel=1e-5)
 
 
 def test_a_limit_on_pieces_widens_the_error_and_says_so(tmp_path: Path) -> None:
@@ -152,8 +142,7 @@ def test_a_shapenet_folder_without_its_taxonomy(shapenet: Path) -> None:
     (shapenet / "taxonomy.json").unlink()
     assert open_objects(shapenet).names[0] == "02876657/c3"
     (shapenet / "taxonomy.json").write_text('{"not": "a list"}')
-    with pytest.raises(ConfigError, match=r"taxonomy\.json is not ShapeNet's taxonomy"):
-        open_objects(shapenet)
+    assert "taxonomy.json is not ShapeNet's taxonomy" in refusal(open_objects, shapenet)
 
 
 def test_a_folder_of_folders(tmp_path: Path) -> None:
@@ -164,19 +153,15 @@ def test_a_folder_of_folders(tmp_path: Path) -> None:
     objects = open_objects(root)
     assert objects.names == ("bracket/one", "gear/my_gear")
     assert objects.load("gear/my_gear").name == "gear-my_gear"
-    with pytest.raises(ConfigError, match="holds no object 'gear/other'"):
-        objects.load("gear/other")
+    assert "holds no object 'gear/other'" in refusal(objects.load, "gear/other")
 
 
 def test_wrong_folders_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no such folder of objects"):
-        open_objects(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match=r"holds no objects: expected category/object\.obj"):
-        open_objects(tmp_path)
+    assert "no such folder of objects" in refusal(open_objects, tmp_path / "nowhere")
+    assert "holds no objects: expected category/object.obj" in refusal(open_objects, tmp_path)
     for suffix in (".obj", ".stl"):
         saved(mesh_truth.bracket(), tmp_path / "bracket" / f"one{suffix}")
-    with pytest.raises(ConfigError, match="would have the same name: rename one"):
-        open_objects(tmp_path)
+    assert "would have the same name: rename one" in refusal(open_objects, tmp_path)
 
 
 RECIPE = """

@@ -23,13 +23,13 @@ from tests.helpers import beams
 
 Floats = NDArray[np.float64]
 G = EARTH * 1e-3  # mm/ms^2
+ROOT = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]  # of a whisker at the origin
 
 
 def alone(name: str, profile: str, gravity: tuple[float, float, float]) -> RodWorld:
-    root = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
     own = PROFILES[profile]
     steps = round(1 / own.timestep_ms)
-    return RodWorld((flat(name),), root, (), own.links, steps, np.array(gravity))
+    return RodWorld((flat(name),), ROOT, (), own.links, steps, np.array(gravity))
 
 
 @pytest.mark.parametrize(("profile", "bar"), [("realtime", 0.03), ("dataset", 0.01)])
@@ -85,10 +85,8 @@ def test_weight_rests_and_is_tared() -> None:
     np.testing.assert_allclose(moved[-1], still[-1], atol=2e-3 * abs(still).max())
     # a weight that lay along -z lies along +y in the frame of a head that turned about x
     weight = np.linalg.norm(still[0, :, :3], axis=1)
-    s = np.linspace(0, 24.0, 2001)
-    one = np.trapezoid(
-        robot.whiskers[0].density(s) * np.pi * (robot.whiskers[0].radius(s) * 1e-3) ** 2, s * 1e-3
-    )
+    s, whisker = np.linspace(0, 24.0, 2001), robot.whiskers[0]
+    one = np.trapezoid(whisker.density(s) * np.pi * (whisker.radius(s) * 1e-3) ** 2, s * 1e-3)
     assert weight[0] == pytest.approx(np.sqrt(2) * one * EARTH, rel=1e-3)
 
 
@@ -97,18 +95,16 @@ def test_weightless_arrays_stay_so() -> None:
     assert mouse.gravity == (0, 0, 0)
     with pytest.raises(ConfigError, match="too soft to carry"):
         soft = replace(flat("long nitinol"), young_modulus=1e6)
-        root = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
-        RodWorld((soft,), root, (), 10, 4, np.array([0.0, -G, 0.0]))
+        RodWorld((soft,), ROOT, (), 10, 4, np.array([0.0, -G, 0.0]))
 
 
 @pytest.mark.parametrize("profile", ["realtime", "dataset"])
 def test_a_shaken_whisker_answers_in_proportion(profile: str) -> None:
     """Near rest, whole samples by the linear answers give what single steps give."""
-    mug, how = make_object("mug", 3), {"shake_g": 0.5, "shake_hz": 60.0, "distance_mm": 9.0}
-    mouse = load_array("mouse")
-    fast = SweepSimulation(mouse, mug, Sweep(**how), PROFILES[profile])
+    mouse, mug = load_array("mouse"), make_object("mug", 3)
+    shaken = Sweep(shake_g=0.5, shake_hz=60.0, distance_mm=9.0)
+    fast, slow = (SweepSimulation(mouse, mug, shaken, PROFILES[profile]) for _ in range(2))
     loads = fast.advance(300)
-    slow = SweepSimulation(mouse, mug, Sweep(**how), PROFILES[profile])
     args = list(slow._world._advance.args)
     args[5] = args[5]._replace(answers=args[5].answers[:0])
     args[1] = args[1]._replace(answers=np.zeros_like(args[1].answers))
@@ -128,8 +124,7 @@ def test_a_fast_plate_is_felt(profile: str, bar: float, speed: float) -> None:
 def test_what_is_too_fast_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"speed_mm_s must be 0\.001 to 3000"):
         Sweep(speed_mm_s=3001)
-    root = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
-    world = RodWorld((flat("C2"),), root, (PEG,), 7, 2)
+    world = RodWorld((flat("C2"),), ROOT, (PEG,), 7, 2)
     with pytest.raises(ConfigError, match=r"moves at 4 m/s; at most 3"):
         world.advance(np.outer(np.arange(3), [0.0, 4.0, 0.0]))
 
@@ -139,10 +134,9 @@ def test_a_body_of_many_corners_is_as_far_as_its_hull() -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=4.0)
     piece = Piece.of(ball)
     assert len(piece.corners) > FEW_CORNERS and len(piece.edges) == 2 * len(ball.edges_unique)
-    root = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
     way = np.array([9.0, 5.0, 0.7]) + np.outer(np.linspace(0, 1, 121), [2.0, -2.5, 0.0])
     one, other = (
-        RodWorld((flat("C2"),), root, (p,), 10, 4).advance(way)
+        RodWorld((flat("C2"),), ROOT, (p,), 10, 4).advance(way)
         for p in (piece, replace(piece, edges=piece.edges[:0]))
     )
     assert one[1][:, 0, 0].any()
@@ -155,10 +149,9 @@ def test_a_whisker_without_room_is_told() -> None:
         Piece.of(trimesh.creation.box(bounds=[[5, -3, -2], [9, -0.01, 2]])),
     )
     whisker = flat("robot A0")  # 0.12 mm thick
-    root = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
-    world = RodWorld((whisker,), root, slit, 10, 4)
+    world = RodWorld((whisker,), ROOT, slit, 10, 4)
     world.advance(np.zeros((51, 3)))
     assert world.overlap[-10:].min() > 0.01
-    free = RodWorld((whisker,), root, slit[:1], 10, 4)
+    free = RodWorld((whisker,), ROOT, slit[:1], 10, 4)
     free.advance(np.outer(np.linspace(0, 1, 51), [0.0, -0.5, 0.0]))
     assert free.overlap[-10:].max() < 1e-3

@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 from bench.sim.beams import beams, flat
 from bench.sim.ringing import release_error, rod_ring
 from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, make_object
 from tactile_rt.sim_backend.rods.chains import Pose, place
@@ -97,10 +98,10 @@ def test_nothing_overlaps_after_a_fall() -> None:
     assert np.ptp(settled) < 0.05 * abs(settled.mean())
 
 
-def sweep(name: str = "mug", profile: str = "realtime", **how: float) -> SweepSimulation:
-    return SweepSimulation(
-        load_array("mouse"), make_object(name, 3), Sweep(gap_mm=0.5, **how), PROFILES[profile]
-    )
+def passing(profile: str, array: WhiskerArray | None = None, **how: float) -> SweepSimulation:
+    """A mug that passes an array, by default the mouse's."""
+    mug = make_object("mug", 3)
+    return SweepSimulation(array or load_array("mouse"), mug, Sweep(**how), PROFILES[profile])
 
 
 def test_the_other_side_feels_the_mirror_image() -> None:
@@ -187,9 +188,7 @@ def test_a_base_turns_by_its_moment_and_its_damping_counts() -> None:
     ],
 )  # fmt: skip
 def test_an_object_comes_in_any_pose(pose: dict[str, float]) -> None:
-    simulation = SweepSimulation(
-        load_array("mouse"), make_object("mug", 3), Sweep(gap_mm=1.0, **pose), PROFILES["realtime"]
-    )
+    simulation = passing("realtime", gap_mm=1.0, **pose)
     assert simulation.touches
     before = round(0.7 / (pose.get("speed_mm_s", 34.0) * 1e-3))
     assert not simulation.advance(before).any(), "clear of the whiskers at first"
@@ -221,13 +220,7 @@ def test_the_way_s_direction_turns_with_the_world() -> None:
 
 def test_a_head_that_moves_feels_what_the_object_s_motion_gives_and_its_own_acceleration() -> None:
     how = {"ramp_ms": 40.0, "gap_mm": 5.0, "speed_mm_s": 60.0}
-    still, moving = (
-        SweepSimulation(
-            load_array("mouse"), make_object("mug", 3), Sweep(head_moves=m, **how),
-            PROFILES["dataset"],
-        )
-        for m in (0.0, 1.0)
-    )  # fmt: skip
+    still, moving = (passing("dataset", head_moves=m, **how) for m in (0.0, 1.0))
     calm, shaken = still.advance(40), moving.advance(40)
     assert not calm.any(), "nothing is touched while it speeds up"
     # all that a whisker weighs, times the acceleration: mean over the ramp of what it came to
@@ -246,8 +239,7 @@ def test_a_head_that_moves_feels_what_the_object_s_motion_gives_and_its_own_acce
 def test_a_shaken_whisker_weighs_what_its_mass_does_in_the_shaking() -> None:
     """Slowly shaken, every base holds mass times acceleration, whether it touches or not."""
     mouse = load_array("mouse")
-    sweep = Sweep(gap_mm=30.0, shake_g=0.5, shake_hz=5.0)
-    loads = SweepSimulation(mouse, make_object("mug", 3), sweep, PROFILES["dataset"]).advance(400)
+    loads = passing("dataset", gap_mm=30.0, shake_g=0.5, shake_hz=5.0).advance(400)
     for k in (0, 5, 29):
         whisker = mouse.whiskers[k]
         s = np.linspace(0, whisker.length, 2001)
@@ -255,24 +247,16 @@ def test_a_shaken_whisker_weighs_what_its_mass_does_in_the_shaking() -> None:
         mass = np.trapezoid(whisker.density(s) * section, s * 1e-3)  # kg
         size = np.linalg.norm(loads[200:, k, :3], axis=1)
         assert size.max() == pytest.approx(mass * 0.5 * 9.80665, rel=0.1)
-        assert size.argmax() % 100 == pytest.approx(
-            50, abs=5
-        )  # a quarter of 200 ms, twice a period
+        # a quarter of 200 ms, twice a period
+        assert size.argmax() % 100 == pytest.approx(50, abs=5)
 
 
 def test_a_surface_has_a_friction_of_its_own() -> None:
-    slippery = tuple(replace(w, friction=0.0) for w in load_array("mouse").whiskers)
-    one, other = (
-        SweepSimulation(array, make_object("mug", 3), sweep, PROFILES["realtime"]).advance(300)
-        for array, sweep in (
-            (load_array("mouse"), Sweep(surface_friction=0.0)),
-            (replace(load_array("mouse"), whiskers=slippery), Sweep()),
-        )
-    )
-    np.testing.assert_array_equal(one, other)
-    rough = SweepSimulation(
-        load_array("mouse"), make_object("mug", 3), Sweep(), PROFILES["realtime"]
-    ).advance(300)
+    mouse = load_array("mouse")
+    slippery = replace(mouse, whiskers=tuple(replace(w, friction=0.0) for w in mouse.whiskers))
+    one = passing("realtime", surface_friction=0.0).advance(300)
+    np.testing.assert_array_equal(one, passing("realtime", slippery).advance(300))
+    rough = passing("realtime").advance(300)
     assert abs(rough - one).max() > 0.02 * abs(one).max()
 
 

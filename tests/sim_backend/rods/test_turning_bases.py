@@ -18,17 +18,11 @@ from tactile_rt.sim_backend.trajectories import base_angles
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, Profile
+from tests.helpers.beams import about
 
 Floats = NDArray[np.float64]
 
 FINE = Profile(10, 0.1, 0.01)
-
-
-def about(axis: tuple[float, float, float], angle: float) -> Floats:
-    """Rodrigues' rotation: written here so as to share nothing with what is tested."""
-    x, y, z = axis
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def alone(whisker: Whisker, profile: Profile, pieces: tuple[Piece, ...] = ()) -> RodWorld:
@@ -123,11 +117,8 @@ def test_whisking_in_air_is_as_mujoco_has_it() -> None:
     turned = np.empty((*angles.shape[:2], 3, 3))
     for at in np.ndindex(angles.shape[:2]):
         theta, phi, zeta = angles[at]
-        turned[at] = (
-            about((0, 0, 1), theta - np.pi / 2)
-            @ about((0, 1, 0), -phi)
-            @ about((1, 0, 0), zeta + np.pi / 2)
-        )
+        azimuth, elevation = about((0, 0, 1), theta - np.pi / 2), about((0, 1, 0), -phi)
+        turned[at] = azimuth @ elevation @ about((1, 0, 0), zeta + np.pi / 2)
     turned = HEAD.rotation @ turned
     roots = np.concatenate([np.zeros((len(whiskers), 1, 3)), turned[1]], axis=1)
     loads, _ = RodWorld(whiskers, roots, (), 10, 4).advance(np.zeros((251, 3)), turning=turned)
