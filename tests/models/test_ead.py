@@ -9,6 +9,7 @@ import torch
 from torch.nn import functional as F
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.models.attenders import GPT
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, READOUTS, EADConfig
 from tests.helpers.small_networks import STEPS, TOLERANCE, build, frames, stream
 
@@ -73,6 +74,11 @@ def test_the_frames_that_can_count(encoder, attender):
 
 
 # A stream equals a window
+
+
+def test_gpt_refuses_a_window_past_its_positions():
+    with pytest.raises(ValueError, match="5 steps, but this attender ends at 4"):
+        GPT(32, 0.1, 4)(torch.zeros(2, 5, 32))
 
 
 @pytest.mark.parametrize(("encoder", "attender"), COMBINATIONS)
