@@ -77,6 +77,13 @@ def _threads() -> set[threading.Thread]:
 
 
 @pytest.fixture
+def cwd(tmp_path, monkeypatch):
+    """A folder of the test's own, which it is in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def call(capsys, monkeypatch):
     """Call `tactile-rt` in this process with these arguments: (exit code, stdout, stderr).
 
@@ -104,6 +111,18 @@ def call(capsys, monkeypatch):
     yield run
     for number, handler in handlers.items():  # a daemon takes them for good
         signal.signal(number, handler)
+
+
+@pytest.fixture
+def done(call):
+    """Call `tactile-rt` with these arguments, expect exit code 0, return stdout and stderr."""
+
+    def run(*arguments):
+        code, out, err = call(*arguments)
+        assert code == 0, err
+        return out, err
+
+    return run
 
 
 @pytest.fixture

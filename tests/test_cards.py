@@ -53,9 +53,8 @@ def test_the_model_s_card_has_the_figures_of_its_page() -> None:
     (model,) = card["model-index"]
     assert model["name"] == read_model(shipped_model())[0].name
     found = [float(m["value"]) for r in model["results"] for m in r["metrics"]]
-    row = re.search(
-        r"^\| top-1, one sweep \|[^|]*\| \*\*([\d.]+)\*\*[^|]*\| \*\*([\d.]+)", text, re.M
-    )
+    bold = r"\| \*\*([\d.]+)"
+    row = re.search(rf"^\| top-1, one sweep \|[^|]*{bold}\*\*[^|]*{bold}", text, re.M)
     upright = re.search(r"^\| upright; .*?\|.*?\| ([\d.]+)", text, re.M)
     assert row and upright
     assert found == [float(row[1]), float(row[2]), float(upright[1])]

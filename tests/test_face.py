@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import tactile_rt
+from tests.helpers.processes import run_program
 
 README = Path(tactile_rt.__file__).parents[1] / "README.md"
 IMPORT_CPU_S = 0.2
@@ -30,10 +31,7 @@ def test_names_are_loaded_when_they_are_used() -> None:
         "assert 'onnxruntime' in sys.modules and 'torch' not in sys.modules\n"
         "print(spent)"
     )
-    spent = [
-        float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
-        for _ in range(3)
-    ]
+    spent = [float(run_program(program=code, check=True).stdout) for _ in range(3)]
     assert min(spent) <= IMPORT_CPU_S
 
 

@@ -127,9 +127,6 @@ def test_no_two_public_classes_share_a_name() -> None:
     assert {name: places for name, places in where.items() if len(places) > 1} == {}
 
 
-# names in back-ticks
-
-
 @cache
 def known_words() -> set[str]:
     """Every name that the package defines or takes anywhere."""
@@ -155,11 +152,8 @@ def resolves(name: str) -> bool:
     if all(part in known_words() for part in name.split(".")):
         return True
     place, _, last = name.rpartition(".")
-    return (
-        bool(place)
-        and find_spec(name.partition(".")[0]) is not None
-        and (hasattr(import_module(place), last))
-    )
+    there = bool(place) and find_spec(name.partition(".")[0]) is not None
+    return there and hasattr(import_module(place), last)
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -178,9 +172,6 @@ def test_names_in_back_ticks_lead_somewhere(room: str) -> None:
 def test_a_name_that_leads_nowhere_is_found() -> None:
     assert all(map(resolves, ("Chunk", "ArraySpec.elements", "stream.Chunk", "numpy.load", "list")))
     assert not any(map(resolves, ("Chnk", "ArraySpec.lements", "strem.Chunk", "numpy.lod")))
-
-
-# tests mirror the tree
 
 
 def test_every_test_lies_where_its_subject_does() -> None:

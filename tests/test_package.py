@@ -3,7 +3,6 @@
 import importlib
 import pkgutil
 import subprocess
-import sys
 import tomllib
 from importlib.metadata import distributions
 from importlib.util import find_spec
@@ -13,21 +12,13 @@ import pytest
 from packaging.specifiers import SpecifierSet
 
 import tactile_rt
+from tests.helpers.processes import run_program
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = Path(tactile_rt.__file__).parent
 LINKS = ("drivers", "export", "models", "sim_backend")
 # What a robot has none of.
-HEAVY = (
-    "torch",
-    "mujoco",
-    "trimesh",
-    "scipy",
-    "onnx",
-    "onnxscript",
-    "sklearn",
-    "matplotlib",
-)
+HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
     "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session",
     "cli", "daemon.daemon", "drivers.opening", "recording", "core.settings", "sources.combined",
@@ -99,7 +90,7 @@ def test_the_version_is_the_project_s() -> None:
 def modules_after(code: str) -> set[str]:
     """The top-level modules that a fresh interpreter has loaded after running some code."""
     code += "\nimport sys; print('\\n'.join({m.partition('.')[0] for m in sys.modules}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = run_program(program=code)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.split("\n"))
 

@@ -66,9 +66,6 @@ def text_of(page: Path) -> str:
     return "\n\n".join(f"```python\n{text}\n```" if code else text for code, text in texts)
 
 
-# links
-
-
 def anchors(page: Path) -> set[str]:
     """What headings of a page are linked by, as GitHub makes it of their words."""
     text = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.M | re.S)
@@ -123,14 +120,10 @@ def test_every_command_of_a_page_is_there_with_its_options(page: Path) -> None:
         if name not in every:
             wrong.append(f"{call.strip()}: no command {name!r}")
             continue
-        known = {*options_of(every[name]), "--help"} | {
-            o for p in every[name].params for o in p.secondary_opts
-        }
+        negated = {o for p in every[name].params for o in p.secondary_opts}
+        known = {*options_of(every[name]), "--help", *negated}
         wrong += [f"{call.strip()}: no option {one}" for one in asked if one not in known]
     assert wrong == []
-
-
-# the site
 
 
 def test_every_page_is_in_the_site_s_navigation() -> None:
@@ -178,10 +171,7 @@ def test_the_site_is_built_offline_without_a_warning(tmp_path, monkeypatch, capf
         page = tmp_path / "notebooks" / f"{notebook.stem}.html"
         shown = re.findall(r"<img alt=\"([^\"]+)\" src=\"([\w-]+\.png)\"", page.read_text("utf-8"))
         assert len(shown) >= 3 and all((page.parent / name).is_file() for _, name in shown)
-    html = [p.read_text("utf-8") for p in tmp_path.rglob("*.html")]
-    fetched = {
-        u for t in html for u in re.findall(r"(?:src|<link[^>]*href)=\"(https?://[^\"]+)", t)
-    }
-    assert fetched == set(), "a page that is read offline fetches nothing"
-    for page in html:
+    for page in (p.read_text("utf-8") for p in tmp_path.rglob("*.html")):
+        fetched = re.findall(r"(?:src|<link[^>]*href)=\"(https?://[^\"]+)", page)
+        assert fetched == [], "a page that is read offline fetches nothing"
         assert not re.search(r"<thead>\s*<tr>(\s*<th[^>]*></th>)+\s*</tr>", page), "an empty band"

@@ -76,9 +76,7 @@ def test_what_is_installed_is_what_is_written() -> None:
             wrong[str(pin)] = version(pin.name)
     assert wrong == {}
     extras = ("sim", "gym", "train", "publish", "ros2", "lerobot", "test", "dev")
-    missing = [r.name for r in asked_for(*extras)
-               if not is_installed(r.name)]  # fmt: skip
-    assert missing == []
+    assert [r.name for r in asked_for(*extras) if not is_installed(r.name)] == []
 
 
 def is_installed(name: str) -> bool:

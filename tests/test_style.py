@@ -37,11 +37,8 @@ def offences() -> Iterator[str]:
             if not isinstance(node, (*FUNCTIONS, ast.ClassDef)):
                 continue
             name = ".".join(filter(None, (module.name, owner and owner.name, node.name)))
-            gives = {ast.unparse(one) for one in node.decorator_list} & {
-                "property",
-                "cached_property",
-            }
-            verb = isinstance(node, FUNCTIONS) and not gives
+            marks = {ast.unparse(one) for one in node.decorator_list}
+            verb = isinstance(node, FUNCTIONS) and not marks & {"property", "cached_property"}
             if verb and PARTICIPLE.fullmatch(node.name):
                 yield f"participle {name}"
             first = re.split(r"\.\s|\n\n", ast.get_docstring(node) or "")[0]

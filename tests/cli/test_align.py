@@ -67,18 +67,17 @@ def test_the_gate_without_neural_data(call):
     assert out.startswith("fidelity: pass")
 
 
-def test_a_baseline_of_other_stimuli_is_no_baseline(call, frozen, tmp_path):
+def test_a_baseline_of_other_stimuli_is_no_baseline(call, done, frozen, tmp_path):
     arrays = dict(np.load(SHIPPED))
     np.savez(tmp_path / "felt.npz", **arrays | {"values": 1.1 * arrays["values"]})
     scores, benchmark = tmp_path / "scores.json", ("--benchmark", frozen / "6.json")
     felt = ("--stimuli", tmp_path / "felt.npz")
-    code, _, err = call("align", "score", MODEL, *benchmark, *felt, "--json", scores)
-    assert code == 0, err
+    done("align", "score", MODEL, *benchmark, *felt, "--json", scores)
     code, _, err = call("align", "gate", MODEL, *benchmark, "--baseline", scores)
     assert code == 3 and "scored on other stimuli (felt.npz)" in err
 
 
-def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, tmp_path):
+def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, done, tmp_path):
     rng = np.random.default_rng(0)
     patterns = brains.geometry(rng)
     rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(6)}
@@ -88,8 +87,7 @@ def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, tmp_path):
         found, out, err = call("align", command, MODEL, *benchmark)
         assert (found, out) == (code, "")
         assert "paper.json is of protocol paper-code" in err and err.count("\n") == 1
-    code, out, _ = call("align", "score", MODEL, *benchmark, "--json", "-")
-    assert code == 0
+    out, _ = done("align", "score", MODEL, *benchmark, "--json", "-")
     (model,) = json.loads(out)["models"]
     assert model["score"] is not None and model["turing"] == model["turing_why"] == ""
 
@@ -165,17 +163,14 @@ def test_decode(call, frozen, tmp_path):
     assert rows[0]["shape_chance"] == pytest.approx(0.5)
 
 
-def test_the_row_of_animals_as_published(call, refused, tmp_path):
+def test_the_row_of_animals_as_published(done, refused, tmp_path):
     """Decoded by mouse, then the mean: the paper's last row."""
     rng = np.random.default_rng(0)
     patterns = brains.geometry(rng)
     rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(3)}
     source, table = tmp_path / "rates.npz", tmp_path / "table.json"
     np.savez_compressed(source, **rates)
-    code, out, err = call(
-        "align", "decode", MODEL, "--animals", source, "--paper", "--json", table
-    )  # fmt: skip
-    assert code == 0, err
+    out, _ = done("align", "decode", MODEL, "--animals", source, "--paper", "--json", table)
     rows = {(r["name"], r["variant"]): r for r in json.loads(table.read_text())}
     for variant in ("balanced", "paper"):
         mean = rows["animals, mean of 3", variant]

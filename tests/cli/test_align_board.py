@@ -25,14 +25,13 @@ def brain(tmp_path_factory):
     return folder
 
 
-def test_a_board_of_a_model_its_untrained_network_and_responses(call, brain, tmp_path):
+def test_a_board_of_a_model_its_untrained_network_and_responses(done, brain, tmp_path):
     board, page = tmp_path / "board.json", tmp_path / "board.html"
-    code, out, err = call(
+    out, _ = done(
         "align", "board", MODEL, brain / "models" / "another-mouse.npz",
         "--data", f"example={brain / 'recordings'}", "--metric", "rsa", "--metric", "crossnobis",
         "--part", "all", "--part", "L5", "--json", board, "--out", page,
     )  # fmt: skip
-    assert code == 0, err
     made = json.loads(board.read_text())
     assert [row["kind"] for row in made["rows"]] == [
         "model", "untrained", "model", "input", "animal"
@@ -45,37 +44,32 @@ def test_a_board_of_a_model_its_untrained_network_and_responses(call, brain, tmp
     assert "another animal" in out and page.read_text().startswith("<!doctype html>")
 
 
-def test_recordings_of_one_name_are_told_apart(call, brain, tmp_path):
+def test_recordings_of_one_name_are_told_apart(done, brain, tmp_path):
     other = shutil.copytree(brain / "recordings", tmp_path / "others")
     files = ("--data", f"example={brain / 'recordings'}", "--data", f"example={other}")
     board, page = tmp_path / "board.json", tmp_path / "board.html"
-    code, out, err = call(
-        "align", "board", *files, "--metric", "rsa", "--json", board, "--out", page
-    )
-    assert code == 0, err
+    out, _ = done("align", "board", *files, "--metric", "rsa", "--json", board, "--out", page)
     made = json.loads(board.read_text())
     names = [one["name"] for one in made["datasets"]]
     assert names == [c["dataset"] for c in made["columns"]] == ["example", "example (others)"]
     assert out.count("shares of") == page.read_text().count("<table>") == 2
 
 
-def test_another_seed_is_another_untrained_network(call, brain, tmp_path):
+def test_another_seed_is_another_untrained_network(done, brain, tmp_path):
     scores = []
     for seed in (0, 1):
         board = tmp_path / "board.json"
-        code, _, err = call(
+        done(
             "align", "board", MODEL, "--data", f"example={brain / 'recordings'}",
             "--metric", "rsa", "--seed", seed, "--json", board,
         )  # fmt: skip
-        assert code == 0, err
         made = json.loads(board.read_text())
         scores.append([row[0]["score"] for row in made["cells"][:2]])
     assert scores[0][0] == scores[1][0] and scores[0][1] != scores[1][1]
 
 
-def test_the_datasets_are_listed(call):
-    code, out, _ = call("align", "datasets")
-    assert code == 0
+def test_the_datasets_are_listed(done):
+    out, _ = done("align", "datasets")
     for said in ("000231", "example", "CC0-1.0"):
         assert said in out
 

@@ -16,14 +16,13 @@ TINY = ("--encoder", "gru", "--set", "attender=none", "--epochs", 1, "--set", "b
 
 
 @pytest.fixture
-def trained(call, tmp_path):
+def trained(done, tmp_path):
     """A tiny network on a tiny set: (the set, best.pt)."""
 
     def train(spec=ROBOT, name="robot", **more):
         data, run = tmp_path / name, tmp_path / f"{name}-run"
         write_tiny_set(data, spec=spec, **more)
-        code, _, err = call("train", data, run, *TINY)
-        assert code == 0, err
+        done("train", data, run, *TINY)
         return data, run / "best.pt"
 
     return train

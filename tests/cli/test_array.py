@@ -35,11 +35,10 @@ def device(tmp_path_factory) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def project(device, tmp_path: Path, monkeypatch) -> Project:
+def project(device, cwd: Path) -> Project:
     """The page's project, where the page's commands are given."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "plucks.mcap").symlink_to(device[1])
-    made = new_project(tmp_path / "whiskers")
+    (cwd / "plucks.mcap").symlink_to(device[1])
+    made = new_project(cwd / "whiskers")
     made.array.write_text(device[0].read_text())
     return Project(Path("whiskers"))
 
@@ -71,20 +70,16 @@ def test_the_page_s_commands_measure_and_then_write(project: Project, call) -> N
     assert (code, err) == (0, "")
     assert re.search(r"whiskers/array.toml: \d values brought to what was measured\n$", out)
     array = load_array(str(project.array))
-    assert array.sensor is not None
     assert [c.noise_density for c in array.sensor.channels] == pytest.approx([3e-9] * 2, rel=0.1)
     assert array.whiskers[0].young_modulus == pytest.approx(4.1e9, rel=0.05)
     assert array.whiskers[0].damping_ratio == pytest.approx(0.03, rel=0.25)
 
 
-def test_another_file_is_written_whole_and_nothing_kept(project: Project, call, tmp_path) -> None:
+def test_another_file_is_written_whole_and_nothing_kept(project: Project, done, tmp_path) -> None:
     alone = tmp_path / "alone.toml"
     alone.write_text(project.array.read_text())
     out = tmp_path / "fitted.toml"
-    code, said, _ = call(
-        "array", "fit", "replay:plucks.mcap?speed=0", "--array", alone, "--out", out
-    )
-    assert code == 0
+    said, _ = done("array", "fit", "replay:plucks.mcap?speed=0", "--array", alone, "--out", out)
     assert "fitted.toml: " in said
     assert load_array(str(out)).whiskers[0].young_modulus == pytest.approx(4.1e9, rel=0.05)
     assert sorted(p.name for p in tmp_path.iterdir()) == [

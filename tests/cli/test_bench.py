@@ -13,9 +13,8 @@ from tactile_rt.cli import bench
 
 
 def test_an_unknown_area_lists_the_areas(refused):
-    assert "there are sim, drivers, models, inference, daemon, align, perception" in refused(
-        "bench", "speed"
-    )
+    said = refused("bench", "speed")
+    assert "there are sim, drivers, models, inference, daemon, align, perception" in said
 
 
 def ask(code, folder, *path):
@@ -54,9 +53,8 @@ def test_each_area_is_found_from_any_folder(area, strange):
 
 
 def test_a_folder_that_is_not_there_is_named_before_measuring(refused, tmp_path):
-    assert f"no folder {tmp_path / 'not'}" in refused(
-        "bench", "inference", "--json", tmp_path / "not" / "figures.json"
-    )
+    said = refused("bench", "inference", "--json", tmp_path / "not" / "figures.json")
+    assert f"no folder {tmp_path / 'not'}" in said
 
 
 def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch):

@@ -65,9 +65,6 @@ def loads():
     return np.random.default_rng(2).uniform(-1, 1, size=(30, 2)) * [1, 0.1]
 
 
-# ---- tare
-
-
 def test_a_tare_is_stored_under_the_name_of_the_array(call, device, home):
     code, out, err = call("tare", "gauges:", "--seconds", 0.2)
     assert (code, err) == (0, "")
@@ -110,12 +107,11 @@ def test_of_a_calibrated_source_the_device_is_tared(call, device):
     np.testing.assert_allclose(stored.tare["A1"], OFFSET[1], atol=0.3)
 
 
-def test_an_array_that_shakes_is_told_from_its_last_tare(call, device):
+def test_an_array_that_shakes_is_told_from_its_last_tare(call, done, device):
     assert call("tare", "gauges:")[0] == 0
     shaking = 20 * np.sin(np.arange(300) * 0.8)  # fast: no block of the tare sees it move
     device.values = device.values + shaking[:, None, None] * [[0, 0], [0, 1]]
-    code, _, err = call("tare", "gauges:")
-    assert code == 0
+    _, err = done("tare", "gauges:")
     assert "more than 3 times as noisy as when last tared: A1; did" in err
 
 
@@ -145,9 +141,6 @@ def test_where_it_cannot_be_written_is_told_before_it_is_read(refused, device, t
     assert "3 valid samples" in refused("tare", "gauges:")
 
 
-# ---- calibrate
-
-
 def test_a_table_of_readings_is_fitted_and_stored(call, tmp_path, loads):
     table = write_table(tmp_path / "loads.csv", loads, noise=0.01)
     path = tmp_path / "cell.toml"
@@ -165,13 +158,12 @@ def test_a_table_of_readings_is_fitted_and_stored(call, tmp_path, loads):
     )
 
 
-def test_a_known_device_s_element_gets_its_matrix(call, device, tmp_path, loads):
+def test_a_known_device_s_element_gets_its_matrix(call, done, device, tmp_path, loads):
     """Tare, then both elements, then the calibrated source reads the loads."""
     assert call("tare", "gauges:", "--device", "cell")[0] == 0
     for element in (0, 1):
         table = write_table(tmp_path / "loads.csv", loads, element=element)
-        code, _, err = call("calibrate", table, "--device", "cell", "--element", f"A{element}")
-        assert code == 0
+        _, err = done("calibrate", table, "--device", "cell", "--element", f"A{element}")
         assert ("never valid: A1" in err) == (element == 0)
     stored = load_calibration("cell")
     assert stored.channels == ("s0", "s1"), "the device's order, not the table's"
@@ -216,19 +208,17 @@ def test_samples_that_were_calibrated_as_they_were_recorded_are_no_readings(refu
     assert not (tmp_path / "cell.toml").exists()
 
 
-def test_without_a_name_nothing_is_written(call, home, tmp_path, loads):
+def test_without_a_name_nothing_is_written(done, home, tmp_path, loads):
     table = write_table(tmp_path / "loads.csv", loads)
-    code, out, _ = call("calibrate", table)
-    assert code == 0
+    out, _ = done("calibrate", table)
     assert "not written: name a --device or a file" in out
     assert not home.exists()
     assert [p.name for p in tmp_path.iterdir()] == ["loads.csv"]
 
 
-def test_loads_that_do_not_span_the_axes_are_warned_of(call, tmp_path, loads):
+def test_loads_that_do_not_span_the_axes_are_warned_of(done, tmp_path, loads):
     loads[:, 1] = 0.05 * loads[:, 0]
-    code, out, _ = call("calibrate", write_table(tmp_path / "loads.csv", loads, noise=0.1))
-    assert code == 0
+    out, _ = done("calibrate", write_table(tmp_path / "loads.csv", loads, noise=0.1))
     assert "warning: fy and mz were always loaded together" in out
 
 

@@ -4,7 +4,6 @@ import io
 import json
 import os
 import re
-import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -17,6 +16,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.messages import StateMessage
 from tests.cli.test_top import busy_snapshot
 from tests.helpers.commands import commands, options_of
+from tests.helpers.processes import run_program
 from tests.helpers.source_tree import ROOT
 
 # Those that print neither a table nor figures, and what they do instead. Whoever adds a command
@@ -112,14 +112,13 @@ TABLES = [
 
 
 @pytest.fixture
-def at_work(tmp_path, monkeypatch):
+def at_work(cwd, monkeypatch):
     """A folder with what the commands above read."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(cwd))
     rows = ["fx,fy,raw_a,raw_b"]
     rows += [f"{x},{y},{2 * x + 0.1 * y},{3 * y}" for x in (0, 1, 2) for y in (0, 1, 3)]
-    (tmp_path / "loads.csv").write_text("\n".join(rows))
-    (tmp_path / "touches.bin").write_bytes(b"0.1,0.2,0.3\r\n" * 200)
+    (cwd / "loads.csv").write_text("\n".join(rows))
+    (cwd / "touches.bin").write_bytes(b"0.1,0.2,0.3\r\n" * 200)
 
 
 @pytest.mark.parametrize("words", TABLES, ids=lambda words: " ".join(map(str, words[:2])))
@@ -178,10 +177,8 @@ def test_no_word_of_a_help_is_cut(columns):
         "    except SystemExit:\n"
         "        pass\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], env={**os.environ, "COLUMNS": columns, "NO_COLOR": "1"},
-        capture_output=True, text=True, cwd=ROOT, timeout=120,
-    )  # fmt: skip
+    narrow = {**os.environ, "COLUMNS": columns, "NO_COLOR": "1"}
+    done = run_program(program=program, env=narrow, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert "…" not in done.stdout
     if columns != "40":  # where a column of options leaves too little for some words

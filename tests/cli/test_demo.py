@@ -15,8 +15,8 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import demo as demo_module
 from tactile_rt.cli.demo import Demonstration, draw, watch
 from tactile_rt.core.packages import install_extra
-from tactile_rt.core.stream import Chunk
 from tactile_rt.recording.replay import DEMO
+from tactile_rt.testing import cut
 
 simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
 
@@ -73,9 +73,8 @@ def test_view_fits_a_terminal_and_says_what_it_shows():
 
 
 def decision(onset_ns, t_ns, label, final=True):
-    return Classification(
-        onset_ns, t_ns, 22, final, label, ("mug", "car"), np.array([0.5, 0.5], np.float32), 1e-3
-    )
+    p = np.array([0.5, 0.5], np.float32)
+    return Classification(onset_ns, t_ns, 22, final, label, ("mug", "car"), p, 1e-3)
 
 
 @simulated
@@ -92,21 +91,14 @@ def test_only_the_first_episode_of_each_pass_is_scored():
         decision(210, 310, "mug"),  # ends while the next object is on its way
         decision(340, 390, "car"),
     ]
-    sample = Chunk(
-        np.zeros(1, np.int64),
-        np.zeros(1, np.int64),
-        np.zeros((1, 1, 1), np.float32),
-        np.ones((1, 1), bool),
-    )
+    (sample,) = cut(np.zeros((1, 1, 1)), 1000.0)
     demo._session = [(sample, [d]) for d in decisions]
     settled = [outcome.said for outcomes in demo.run() for outcome in outcomes]
     assert settled == [None, "mug", "mug", "car", None, None]
     assert demo.right == 2
 
 
-def test_without_mujoco_a_recording_is_played_over_a_serial_port(
-    call, refused, monkeypatch
-) -> None:
+def test_without_mujoco_a_recording_is_played_over_a_serial_port(call, refused, monkeypatch):
     monkeypatch.setattr(demo_module, "find_spec", lambda name: None)
     code, out, err = call("demo", "--sweeps", "2")
     first, second, summary = out.splitlines()

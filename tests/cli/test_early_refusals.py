@@ -2,11 +2,10 @@
 
 import json
 import resource
-import subprocess
-import sys
 
 import pytest
 
+from tests.helpers.processes import run_program
 from tests.helpers.tiny_sweeps import write_tiny_set
 
 torch = pytest.importorskip("torch")
@@ -36,9 +35,7 @@ MOST_S = 1.2  # of CPU time, on a machine that is busy; it takes 0.3, and with t
 def children(commands):
     lines = "".join(json.dumps([str(word) for word in one]) + "\n" for one in commands)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD], input=lines, capture_output=True, text=True, timeout=120
-    )
+    done = run_program(program=CHILD, input=lines)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert not done.stderr
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
@@ -54,7 +51,10 @@ def made(tmp_path_factory):
     train(TrainingConfig(str(folder / "set"), **small), folder / "run")
     for name in ("junk.pt", "junk.onnx", "junk.json", "junk.npz"):
         (folder / name).write_text("junk\n")
-    (folder / "plan.toml").write_text(f'data = "{folder}/none"\n[[cell]]\nencoder = "gru"\n')
+    plan = f'data = "{folder}/none"\n[[cell]]\nencoder = "gru"\n'
+    (folder / "plan.toml").write_text(plan)
+    (folder / "gptt.toml").write_text(plan + 'attender = "gptt"\n')
+    (folder / "utf16.toml").write_bytes(b"\xff\xfe")
     moved = torch.load(folder / "run" / "best.pt")
     moved["config"]["data"] = str(folder / "moved")
     torch.save(moved, folder / "moved.pt")
@@ -84,6 +84,8 @@ def test_what_cannot_be_is_refused_before_torch_is_loaded(made):
         (("eval", made / "junk.onnx", data), "is not a readable ONNX model"),
         (("grid", "wide42", out), "no grid wide42: name a TOML file, or one of"),
         (("grid", made / "plan.toml", out), f"{made}/none {no_set}"),
+        (("grid", made / "gptt.toml", out), "attender is 'gptt', not one of"),
+        (("grid", made / "utf16.toml", out), "utf16.toml:1: not UTF-8 text"),
         (("grid", made / "junk.pt", out), "junk.pt:1: not TOML"),
         (("align", "score", best, "--benchmark", made / "none.json"), "none.json: cannot be read"),
         (("align", "score", best, "--benchmark", made / "junk.json"), "junk.json"),
@@ -120,9 +122,6 @@ def test_a_refusal_takes_little_time(command):
 )
 def test_a_wrong_word_is_told_before_an_extra_is_asked_for(words, said):
     without = "import sys; sys.modules.update(trimesh=None, mujoco=None)\n"
-    done = subprocess.run(
-        [sys.executable, "-c", without + CHILD], input=json.dumps(words), capture_output=True,
-        text=True, check=True,
-    )  # fmt: skip
+    done = run_program(program=without + CHILD, input=json.dumps(words), check=True)
     code, told, _ = json.loads(done.stdout)
     assert code == 2 and said in told and told.count("\n") == 1

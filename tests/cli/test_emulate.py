@@ -3,8 +3,6 @@
 import os
 import select
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -12,17 +10,13 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial
-from tests.helpers.processes import PROGRAM
+from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S
 
 
 def started(*arguments):
     """(process, the URL that it prints)."""
-    command = [sys.executable, "-c", PROGRAM, "emulate", *map(str, arguments)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )  # fmt: skip
+    process = start_program("emulate", *arguments, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     line = process.stdout.readline()
     assert line.startswith("connect to "), process.communicate()
     return process, line.removeprefix("connect to ").strip()

@@ -96,18 +96,17 @@ TABLES = {
 }  # fmt: skip
 
 
-def imported(call, folder, name, content, arguments):
+def imported(done, folder, name, content, arguments):
     path = folder / name
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     out = folder / "out.mcap"
-    code, said, err = call("import", path, out, *arguments)
-    assert code == 0, err
+    said, _ = done("import", path, out, *arguments)
     return concatenate(list(Recording(out))), Recording(out).description.spec, said
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_a_table_is_read(call, tmp_path, name):
-    whole, spec, said = imported(call, tmp_path, *TABLES[name])
+def test_a_table_is_read(done, tmp_path, name):
+    whole, spec, said = imported(done, tmp_path, *TABLES[name])
     assert spec.channels == ("fx", "fy") and spec.units == ("N", "N")
     np.testing.assert_allclose(whole.values[:, 0, 0], FX, atol=1e-5)
     np.testing.assert_allclose(whole.values[:, 0, 1], FY, atol=1e-5)
@@ -116,9 +115,9 @@ def test_a_table_is_read(call, tmp_path, name):
     assert spec.rate_hz == pytest.approx(100, rel=0.01)
 
 
-def test_a_cell_that_is_empty_is_no_value_and_a_short_row_is_damage(call, tmp_path):
+def test_a_cell_that_is_empty_is_no_value_and_a_short_row_is_damage(done, tmp_path):
     text = "0.00,1,2\n0.01,,2\n0.02,1\n0.03,nan,2\n0.04,1,2\n0.05,1,2\n"
-    whole, _, said = imported(call, tmp_path, "a.csv", text, ["--columns", COLUMNS])
+    whole, _, said = imported(done, tmp_path, "a.csv", text, ["--columns", COLUMNS])
     assert "1 corrupt" in said
     assert whole.valid[:, 0].tolist() == [True, False, False, True, True]
 
@@ -159,11 +158,10 @@ LOGS = {
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_a_log_of_a_bus_is_read(call, tmp_path, name):
+def test_a_log_of_a_bus_is_read(done, tmp_path, name):
     suffix = {"asc": "asc", "csv of python-can": "csv", "SavvyCAN": "csv"}.get(name, "log")
-    whole, spec, said = imported(
-        call, tmp_path, f"can.{suffix}", LOGS[name], ["--as", "codec=aft200"]
-    )
+    words = ["--as", "codec=aft200"]
+    whole, spec, said = imported(done, tmp_path, f"can.{suffix}", LOGS[name], words)
     assert len(whole) == 10 and "10 samples in, 20 intact, 0 corrupt" in said
     assert spec.channels == ("fx", "fy", "fz", "mx", "my", "mz")
     steps = np.diff(whole.values[:, 0], axis=0)
@@ -182,19 +180,13 @@ def wrench_bag(folder, form, count=N):
         writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[form.upper()])
     serialize = store.serialize_ros1 if form == "ros1" else store.serialize_cdr
     kind = store.types["geometry_msgs/msg/WrenchStamped"]
-    wrench, vector = (
-        store.types["geometry_msgs/msg/Wrench"],
-        store.types["geometry_msgs/msg/Vector3"],
-    )
+    wrench, vector = (store.types[f"geometry_msgs/msg/{n}"] for n in ("Wrench", "Vector3"))
     header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     with writer:
         topic = writer.add_connection("/ft/wrench", kind.__msgtype__, typestore=store)
         for k in range(count):
-            head = header(
-                **seq,
-                stamp=time(sec=UTC + k // 100, nanosec=k % 100 * 10_000_000),
-                frame_id="tool0",
-            )
+            stamp = time(sec=UTC + k // 100, nanosec=k % 100 * 10_000_000)
+            head = header(**seq, stamp=stamp, frame_id="tool0")
             load = wrench(force=vector(x=0.5 * k - 3, y=-0.25 * k, z=1.0), torque=vector(0, 0, -k))
             message = serialize(kind(header=head, wrench=load), kind.__msgtype__)
             writer.write(topic, UTC * 10**9 + k * 10_000_000 + 777, message)
@@ -202,10 +194,9 @@ def wrench_bag(folder, form, count=N):
 
 
 @pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
-def test_a_bag_is_read(call, tmp_path, form):
+def test_a_bag_is_read(done, tmp_path, form):
     out = tmp_path / "out.mcap"
-    code, said, err = call("import", wrench_bag(tmp_path, form), out)
-    assert code == 0, err
+    said, _ = done("import", wrench_bag(tmp_path, form), out)
     whole = concatenate(list(Recording(out)))
     assert whole.values[:, 0].tolist() == [[0.5 * k - 3, -0.25 * k, 1, 0, 0, -k] for k in range(N)]
     assert np.diff(whole.t_ns).tolist() == [10_000_000] * (N - 1)
@@ -213,12 +204,11 @@ def test_a_bag_is_read(call, tmp_path, form):
 
 
 @pytest.mark.parametrize("part", [0.8, 0.5])
-def test_what_is_left_of_a_bag_that_was_cut_is_read(call, tmp_path, part):
+def test_what_is_left_of_a_bag_that_was_cut_is_read(done, tmp_path, part):
     path = wrench_bag(tmp_path, "mcap", 4000) / "a.mcap"
     path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
     out = tmp_path / "out.mcap"
-    code, _, err = call("import", path, out)
-    assert code == 0, err
+    _, err = done("import", path, out)
     whole = concatenate(list(Recording(out)))
     assert 1000 < len(whole) < 4000 and "its end is missing or damaged" in err
     assert np.array_equal(whole.values[:, 0, 0], [0.5 * k - 3 for k in range(len(whole))])

@@ -32,9 +32,7 @@ def test_the_command_compares_a_sweep(call) -> None:
     assert rows["identical decisions"] == rows["same labels"] == "22 of 22 (100.00 %)"
 
 
-def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(
-    call, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(call, monkeypatch):
     asked = []
 
     def refuse(url: str) -> None:

@@ -9,18 +9,14 @@ from tests.helpers.dbc_mappings import map_signal
 
 
 @pytest.fixture
-def raw(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def raw(cwd):
     packets = wire_of(make_codec("serial", "bota", {}))
-    (tmp_path / "raw.bin").write_bytes(
-        b"".join(packets[:20]) + b"\xaa" * 9 + b"".join(packets[20:])
-    )
-    return tmp_path / "raw.bin"
+    (cwd / "raw.bin").write_bytes(b"".join(packets[:20]) + b"\xaa" * 9 + b"".join(packets[20:]))
+    return cwd / "raw.bin"
 
 
-def test_bytes_become_a_recording_of_their_name(call, raw):
-    code, said, _ = call("import", "raw.bin", "--as", "codec=bota")
-    assert code == 0
+def test_bytes_become_a_recording_of_their_name(call, done, raw):
+    said, _ = done("import", "raw.bin", "--as", "codec=bota")
     assert said.splitlines()[:3] == [
         "raw.mcap: 40 samples in, 40 intact, 0 corrupt, 0 missing; 0.39 s at 100 Hz",
         "  1489 bytes: 1480 read, 9 passed over, 0 out of order; 0 samples have an invalid element",
@@ -37,21 +33,19 @@ def test_what_is_there_is_replaced_only_if_forced(call, refused, raw):
     assert call("import", "raw.bin", "--as", "codec=bota", "--force")[0] == 0
 
 
-def test_half_a_log_has_a_note(call, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_half_a_log_has_a_note(call, cwd):
     frames = [f for p in wire_of(make_codec("can", "aft200", {})) for f in p]
     text = "".join(
         f"({k / 2000:.6f}) can0 {f.id:03X}#{f.data.hex()}\n" for k, f in enumerate(frames)
     )
-    (tmp_path / "can.log").write_text(text[:-4])
+    (cwd / "can.log").write_text(text[:-4])
     code, said, told = call("import", "can.log", "out.mcap", "--as", "codec=aft200")
     assert code == 0 and "39 samples in, 79 intact" in said
     assert told == "can.log: passed over, no line of a candump log: 1 (line 80)\n"
 
 
-def test_a_table_and_a_rate(call, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "t.csv").write_text("Fx;Fy\n" + "1,5;2\n" * 9)
+def test_a_table_and_a_rate(call, cwd):
+    (cwd / "t.csv").write_text("Fx;Fy\n" + "1,5;2\n" * 9)
     code, said, _ = call("import", "t.csv", "--columns", "Fx=S.fx,Fy=S.fy", "--rate", "50")
     assert code == 0 and "9 samples in" in said and "at 50 Hz" in said
 
@@ -92,17 +86,16 @@ BO_ 416 Force: 4 FT
 
 
 @pytest.fixture
-def bus(tmp_path, monkeypatch):
+def bus(cwd):
     """A folder with a good and an odd log of a bus, and what describes its frames."""
     pytest.importorskip("cantools")
-    monkeypatch.chdir(tmp_path)
     good = [GOOD.format(k=k) for k in range(90)]
-    (tmp_path / "good.log").write_text("".join(good))
+    (cwd / "good.log").write_text("".join(good))
     good[40:50] = [ODD.format(k=40)]
-    (tmp_path / "odd.log").write_text("".join(good))
-    (tmp_path / "f.dbc").write_text(DBC)
-    (tmp_path / "f.toml").write_text(map_signal("f.dbc", "fx", "Force.Fx"))
-    return tmp_path
+    (cwd / "odd.log").write_text("".join(good))
+    (cwd / "f.dbc").write_text(DBC)
+    (cwd / "f.toml").write_text(map_signal("f.dbc", "fx", "Force.Fx"))
+    return cwd
 
 
 AS = ("--as", "codec=can-dbc&mapping=f.toml")
@@ -123,9 +116,8 @@ def test_names_of_an_asc_log_are_those_of_the_dbc_file(call, bus):
     (bus / "named.asc").write_text(head + line * 50 + line.replace("Force", "Gear"))
     code, said, told = call("import", "named.asc", *AS)
     assert code == 0 and "50 samples in, 50 intact" in said and "0.49 s at 100 Hz" in said
-    assert told == (
-        "named.asc: identifiers are names here (Gear), not read in 1 frames: not in the DBC file\n"
-    )
+    names = "identifiers are names here (Gear), not read in 1 frames: not in the DBC file"
+    assert told == f"named.asc: {names}\n"
 
 
 def test_the_report_as_json_has_all_of_it(call, bus):
@@ -134,9 +126,8 @@ def test_the_report_as_json_has_all_of_it(call, bus):
     code, said, told = call("import", "odd.log", *AS, "--json", "-")
     report = json.loads(said)
     assert code == 0 and "1 (line 41)" in told
-    assert (
-        report["odd"] == report["notes"] == ["passed over, no line of a candump log: 1 (line 41)"]
-    )
+    note = "passed over, no line of a candump log: 1 (line 41)"
+    assert report["odd"] == report["notes"] == [note]
     assert [report[k] for k in ("unit", "total", "read", "passed_over")] == ["lines", 81, 80, 1]
     assert report["ranges"]["S.fx"] == pytest.approx([0, 0.89]) and report["units"] == {"fx": "N"}
     assert (report["first"], report["last"], report["said_hz"]) == ("0 s", "0.89 s", 100)

@@ -5,12 +5,7 @@ import hashlib
 import pytest
 
 from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
-from tactile_rt.classifier.model_file import (
-    load_model,
-    probe_logits,
-    read_model,
-    shipped_model,
-)
+from tactile_rt.classifier.model_file import load_model, probe_logits, read_model, shipped_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 
 pytest.importorskip("onnx")
@@ -85,15 +80,14 @@ def test_verify_finds_a_graph_that_remembers_bad_samples(call, tmp_path):
     assert f"{path}: a sample that is no number is not taken for no load" in err
 
 
-def test_a_stranger_s_text_cannot_command_the_terminal(call, tmp_path):
+def test_a_stranger_s_text_cannot_command_the_terminal(done, tmp_path):
     path = write_model(
         tmp_path / "m.onnx",
         name="\x1b[2Jgone",
         labels=("[red]a", "b", "c", "d", "e"),
         provenance={"network": "x\x1b]0;x\x07", "commands": ["\x1b[2J", 5]},
     )
-    code, out, _ = call("model", "show", path)
-    assert code == 0
+    out, _ = done("model", "show", path)
     assert "?[2Jgone" in out
     assert "[red]a" in out
     assert not set(out) & {"\x1b", "\x07"}
@@ -144,9 +138,8 @@ def test_a_bad_file_is_one_line(refused, tmp_path, what):
         assert said in refused("model", what, path)
 
 
-def test_bench_times_steps(call, sealed):
-    code, out, _ = call("model", "bench", shipped_model(), "--steps", 50)
-    assert code == 0
+def test_bench_times_steps(done, sealed):
+    out, _ = done("model", "bench", shipped_model(), "--steps", 50)
     for said in ("step_p50", "step_tail", "load", "size", "memory"):
         assert f"inference.model.{said}" in out
 

@@ -3,8 +3,6 @@
 import os
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
 import typer
@@ -13,7 +11,7 @@ from bench.pages.cli import example
 from tactile_rt.cli import load_app
 from tactile_rt.cli.panels import PANELS, WELCOME
 from tests.helpers.commands import commands
-from tests.helpers.processes import PROGRAM
+from tests.helpers.processes import run_program
 from tests.helpers.source_tree import ROOT
 
 WIDEST = 72  # characters of a sentence
@@ -72,12 +70,9 @@ def test_no_sentence_is_cut(columns):
         "except SystemExit: pass"
         for words in (["--help"], *([name, "--help"] for name in groups() if " " not in name))
     )
-    done = subprocess.run(
-        [sys.executable, "-c", f"from typer.main import get_command\n"
-         f"from tactile_rt.cli import load_app\n{program}"],
-        env={**os.environ, "COLUMNS": str(columns), "NO_COLOR": "1"},
-        capture_output=True, text=True, cwd=ROOT, timeout=60,
-    )  # fmt: skip
+    program = f"from typer.main import get_command\nfrom tactile_rt.cli import load_app\n{program}"
+    narrow = {**os.environ, "COLUMNS": str(columns), "NO_COLOR": "1"}
+    done = run_program(program=program, env=narrow, cwd=ROOT)
     assert "…" not in done.stdout
     shown = re.sub(r"[│─╭╮╰╯\s]", "", done.stdout)
     for name, group in groups().items():
@@ -88,10 +83,7 @@ def test_no_sentence_is_cut(columns):
 
 
 def test_an_example_stands_on_a_line_of_its_own_in_a_narrow_pipe():
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "emulate", "--help"], env={**os.environ, "COLUMNS": "40"},
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
+    done = run_program("emulate", "--help", env={**os.environ, "COLUMNS": "40"})
     *_, heading, last = done.stdout.rstrip().splitlines()
     assert heading.strip() == "Example:"
     assert last.strip() == example(commands()["emulate"])

@@ -31,10 +31,9 @@ def test_a_source_is_recorded_to_its_end(call, path):
     assert about.session == {"who": "Ada", "why": "a=b"}
 
 
-def test_a_device_s_packets_are_recorded_and_it_tells_how_it_goes(call, path):
+def test_a_device_s_packets_are_recorded_and_it_tells_how_it_goes(done, path):
     with FakeSerial(np.zeros((5000, 2, 3))) as fake:
-        code, out, err = call("record", fake.url, path, "--seconds", "1.3")
-    assert code == 0
+        out, err = done("record", fake.url, path, "--seconds", "1.3")
     assert err.count("\n") == 1
     assert err.startswith("streaming, ")
     assert " packets, " in err
@@ -102,9 +101,8 @@ def test_a_lerobot_dataset_is_made(call, refused, path):
     assert (code, out, err) == (0, f"{made}: 300 samples, 1 episodes\n", "")
     precious = path.with_name("precious")
     precious.mkdir()
-    assert "nothing that --to lerobot made" in refused(
-        "convert", path, precious, "--to", "lerobot", "--force"
-    )
+    said = refused("convert", path, precious, "--to", "lerobot", "--force")
+    assert "nothing that --to lerobot made" in said
 
 
 def test_a_file_that_is_there_is_not_written_over(call, refused, path):
@@ -125,14 +123,11 @@ def test_a_file_that_is_there_is_not_written_over(call, refused, path):
     ],
     ids=lambda words: words[0],
 )
-def test_what_another_process_is_recording_is_not_replaced(
-    again, call, refused, path, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "table.csv").write_text("1\n2\n3\n")
+def test_what_another_process_is_recording_is_not_replaced(again, call, refused, path, cwd):
+    (cwd / "table.csv").write_text("1\n2\n3\n")
     assert call("record", SOURCE, "whole.mcap")[0] == 0
-    (tmp_path / "cut.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:-200])
-    there = sorted(tmp_path.iterdir())
+    (cwd / "cut.mcap").write_bytes((cwd / "whole.mcap").read_bytes()[:-200])
+    there = sorted(cwd.iterdir())
     other = start_program("record", "synthetic:2x3", path)
     try:
         assert "samples" in other.stderr.readline()  # it is at it
@@ -143,7 +138,7 @@ def test_what_another_process_is_recording_is_not_replaced(
         out, _ = other.communicate()
     assert other.returncode == 0
     assert f"{samples(path)} samples" in out  # and nothing of it is lost
-    assert sorted(tmp_path.iterdir()) == sorted([*there, path])
+    assert sorted(cwd.iterdir()) == sorted([*there, path])
     assert call(*again, "--force")[0] == 0  # now that it has ended
 
 
@@ -160,8 +155,7 @@ def test_what_another_process_is_recording_is_not_replaced(
         (("convert", "text.mcap", "--to", "ros"), "did you mean ros2?"),
     ],
 )
-def test_a_mistake_is_one_line(arguments, said, refused, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "text.mcap").write_text("no recording at all\n")
+def test_a_mistake_is_one_line(arguments, said, refused, cwd):
+    (cwd / "text.mcap").write_text("no recording at all\n")
     assert said in refused(*arguments)
-    assert [p.name for p in tmp_path.iterdir()] == ["text.mcap"]  # nothing half-written
+    assert [p.name for p in cwd.iterdir()] == ["text.mcap"]  # nothing half-written

@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.daemon.checks import check_config
-from tactile_rt.daemon.daemon import Daemon
-from tactile_rt.daemon.loading import load_config
 from tactile_rt.recording import Recording
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import FakeSerial, small_spec
+from tests.helpers.daemons import load_checked, running_daemon
 from tests.helpers.waiting import until
 
 tiny_model = pytest.importorskip("tests.helpers.tiny_model")
@@ -33,23 +31,17 @@ def daemon_records(folder, text, n=1800):
     """The files that a daemon records of an emulated device, in their order."""
     model = tiny_model.write_model(folder / "tiny.onnx")
     with FakeSerial(touching(n), spec=SPEC) as fake:
-        (folder / "robot.toml").write_text(
+        loaded = load_checked(
+            folder,
             # On a busy machine nothing is dropped, and no step skipped.
             f'version = 1\n[[source]]\nname = "left"\nurl = "{fake.url}&clock=device"\n'
             '[log]\nfile = "log"\n[limits]\nmodel_queue_items = 10000\nqueue_items = 100000\n'
             "queue_mb = 512\nstop_s = 60\n"
-            + text.format(model=model).replace("[[model]]\n", '[[model]]\ncatch_up = "all"\n')
+            + text.format(model=model).replace("[[model]]\n", '[[model]]\ncatch_up = "all"\n'),
         )
-        loaded = load_config(folder / "robot.toml")
-        check_config(loaded)
-        daemon = Daemon(loaded)
-        daemon.start()
-        try:
+        with running_daemon(loaded) as daemon:
             until(lambda: all(m.queue.taken["samples"] == n for m in daemon.snapshot().models))
             until(lambda: all(m.final >= n // 700 for m in daemon.snapshot().models))
-        finally:
-            left = daemon.stop()
-        assert left == []
     return sorted((folder / "rec").glob("*.mcap"), key=lambda p: p.stat().st_mtime_ns)
 
 
@@ -72,10 +64,8 @@ def again(path, to, change=lambda raw: raw, **session):
     notes = {k: v for k, v in {**about.session, **session}.items() if v is not None}
     with to.open("wb") as file:
         made = McapFile(file, replace(about, session=notes))
-        for raw in Recording(path).raw(*TOPICS):
-            for changed in [change(raw)]:
-                if changed is not None:
-                    made.add(changed.topic, changed.data, changed.t_ns)
+        for raw in filter(None, map(change, Recording(path).raw(*TOPICS))):
+            made.add(raw.topic, raw.data, raw.t_ns)
         made.finish()
     return to
 
@@ -97,15 +87,14 @@ def spoil(nth, **fields):
     return change
 
 
-def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
+def test_it_decides_as_the_daemon_did_at_every_speed(call, done, live, tmp_path):
     path, _ = live
     recorded = [d for d in Recording(path).decisions() if d["model"] == "left"]
     assert len(recorded) >= 8
     timing = {"model_ms", "latency_ms", "age_ms", "late", "utc_ns"}
     printed = set()
     for speed in ("max", "max", "4"):
-        code, out, err = call("replay", path, "--name", "left", "--speed", speed)
-        assert code == 0
+        out, err = done("replay", path, "--name", "left", "--speed", speed)
         assert err.startswith("1800 samples, ")
         printed.add(out)
     assert len(printed) == 1
@@ -124,11 +113,10 @@ def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
 
 @pytest.mark.parametrize("name", ["left", "last"])
 @pytest.mark.parametrize("further", [(), ("--codec", "recorded")])
-def test_a_check_passes(name, further, call, live):
+def test_a_check_passes(name, further, call, done, live):
     path, model = live
     n = sum(d["model"] == name for d in Recording(path).decisions())
-    code, out, _ = call("replay", path, "--check", "--name", name, *further)
-    assert code == 0
+    out, _ = done("replay", path, "--check", "--name", name, *further)
     assert out.startswith(f"{n} decisions of {name} are as recorded")
     assert call("replay", path, "--check", "--name", name, "--model", model)[0] == 0
 
@@ -157,16 +145,13 @@ def test_a_check_needs_the_model_that_decided(call, refused, live, tmp_path):
     (key,) = (k for k in Recording(path).description.session if k.endswith(".left"))
     known = again(path, tmp_path / "known.mcap", **{key: f"{model} sha256:{'0' * 64}"})
     for arguments in (("--model", model), ("--model", other)):
-        assert "needs the model that decided, sha256 0000000000000000" in refused(
-            "replay", known, "--check", "--name", "left", *arguments
-        )
-    assert "is not there any more: name one by --model" in refused(
-        "replay", known, "--name", "left"
-    )
+        said = refused("replay", known, "--check", "--name", "left", *arguments)
+        assert "needs the model that decided, sha256 0000000000000000" in said
+    said = refused("replay", known, "--name", "left")
+    assert "is not there any more: name one by --model" in said
     moved = again(path, tmp_path / "moved.mcap", **{key: "/gone/tiny.onnx sha256:"})
-    assert "/gone/tiny.onnx (sha256 unknown), is not there any more" in refused(
-        "replay", moved, "--name", "left"
-    )
+    said = refused("replay", moved, "--name", "left")
+    assert "/gone/tiny.onnx (sha256 unknown), is not there any more" in said
     # another model is what a replay is for, as long as it is not to be the same
     mine = call("replay", path, "--name", "left")
     others = call("replay", path, "--name", "left", "--model", other)
@@ -175,15 +160,14 @@ def test_a_check_needs_the_model_that_decided(call, refused, live, tmp_path):
     assert mine[1].count("\n") == others[1].count("\n")
 
 
-def test_rotated_files_are_one_stream(call, tmp_path):
+def test_rotated_files_are_one_stream(call, done, tmp_path):
     paths = daemon_records(
         tmp_path,
         '[[model]]\nfile = "{model}"\n[recorder]\nfolder = "rec"\nmin_free_mb = 0\nrotate_s = 1\n',
         n=2400,
     )
     assert len(paths) > 1
-    code, out, err = call("replay", *paths[::-1], "--check")
-    assert code == 0, err
+    out, _ = done("replay", *paths[::-1], "--check")
     n = sum(1 for path in paths for _ in Recording(path).decisions())
     assert out.startswith(f"{n} decisions of left are as recorded")
     assert call("replay", *paths, "--codec", "recorded")[0] == 2
@@ -206,12 +190,10 @@ def test_a_piece_of_a_stream_is_named_as_that(call, live, tmp_path):
 def test_a_folder_and_several_sources_are_named(refused, live, tmp_path):
     again(live[0], tmp_path / "left.mcap")
     again(live[0], tmp_path / "right.mcap", daemon_source="right")
-    assert "recordings of left (left.mcap ...), right (right.mcap ...)" in refused(
-        "replay", tmp_path
-    )
-    assert "recordings of several sources: left, right" in refused(
-        "replay", tmp_path / "left.mcap", tmp_path / "right.mcap"
-    )
+    said = refused("replay", tmp_path)
+    assert "recordings of left (left.mcap ...), right (right.mcap ...)" in said
+    said = refused("replay", tmp_path / "left.mcap", tmp_path / "right.mcap")
+    assert "recordings of several sources: left, right" in said
 
 
 def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
@@ -254,6 +236,5 @@ def test_a_mistake_is_one_line(arguments, said, refused, live):
 def test_without_a_daemon_there_is_nothing_to_check(call, refused, tmp_path):
     path = tmp_path / "run.mcap"
     call("record", "synthetic:2x3?pace=fast&seconds=0.3", path)
-    assert "nothing to check: no model decided while it was recorded" in refused(
-        "replay", path, "--check"
-    )
+    said = refused("replay", path, "--check")
+    assert "nothing to check: no model decided while it was recorded" in said

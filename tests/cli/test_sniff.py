@@ -11,12 +11,6 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.opening import open_source
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def next_command(said: str) -> list[str]:
     """The arguments of the last line, which is a command."""
     words = shlex.split(said.splitlines()[-1])
@@ -111,25 +105,24 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_the_command_for_a_file_imports_it(call, here, name):
+def test_the_command_for_a_file_imports_it(call, done, cwd, name):
     made, options = FILES[name]
-    (here / "file.log").write_bytes(made())
-    code, said, _ = call("sniff", "file.log")
-    assert code == 0
+    (cwd / "file.log").write_bytes(made())
+    said, _ = done("sniff", "file.log")
     command = next_command(said)
     assert " ".join(command) == f"import file.log {options}"
     code, told, _ = call(*command)
     assert code == 0 and int(told.split()[1]) >= 15
 
 
-def test_what_cannot_be_read_is_told_and_not_proposed(call, here):
-    (here / "a.csv").write_text(
+def test_what_cannot_be_read_is_told_and_not_proposed(call, cwd):
+    (cwd / "a.csv").write_text(
         "t,Fx\n" + "".join(f"16/9/23 12:00:{k},{k}\n" for k in range(10, 40))
     )
     code, said, _ = call("sniff", "a.csv")
     assert code == 0 and "'16/9/23 12:00:10' in column 1 is no time that is read" in said
     assert "t=time" not in said and "--rate" in said
-    (here / "b.csv").write_text("a,b,a\n" + "".join(f"{k},[{k},x],{k * k}\n" for k in range(40)))
+    (cwd / "b.csv").write_text("a,b,a\n" + "".join(f"{k},[{k},x],{k * k}\n" for k in range(40)))
     code, said, _ = call("sniff", "b.csv")
     assert code == 1 or call(*next_command(said))[0] == 0
 
@@ -141,27 +134,26 @@ def test_what_cannot_be_read_is_told_and_not_proposed(call, here):
         b"".join(b"12:00:%02d INFO worker %d has started\n" % (k % 60, k) for k in range(60)),
     ],
 )  # fmt: skip
-def test_nothing_fits_and_it_says_so(call, here, data):
-    (here / "file.log").write_bytes(data)
+def test_nothing_fits_and_it_says_so(call, cwd, data):
+    (cwd / "file.log").write_bytes(data)
     code, said, _ = call("sniff", "file.log")
     assert code == 1 and said.startswith("nothing fits file.log")
 
 
-def test_frames_that_no_codec_knows_are_shown(call, here):
+def test_frames_that_no_codec_knows_are_shown(call, cwd):
     text = "".join(f"({k / 9:.3f}) can0 3A{k % 2}#{k:08X}\n" for k in range(60))
-    (here / "can.log").write_text(text)
+    (cwd / "can.log").write_text(text)
     code, said, _ = call("sniff", "can.log")
     assert code == 1 and "3A0  30 frames of 4 bytes" in said and "codec=can-dbc" in said
 
 
-def test_a_further_codec_is_tried(call, here):
-    (here / "mine.toml").write_text(
+def test_a_further_codec_is_tried(call, done, cwd):
+    (cwd / "mine.toml").write_text(
         'name = "m"\nrate_hz = 100\nlength = 5\nsync = "A5 5A"\n'
         '[[values]]\nat = 2\ntype = "uint8"\nchannels = ["a", "b", "c"]\nunit = "1"\n'
     )
-    (here / "raw.bin").write_bytes(b"".join(b"\xa5\x5a%03d" % (k * 7 % 501) for k in range(99)))
-    code, said, _ = call("sniff", "raw.bin", "--try", "codec=binary_frame&mapping=mine.toml")
-    assert code == 0
+    (cwd / "raw.bin").write_bytes(b"".join(b"\xa5\x5a%03d" % (k * 7 % 501) for k in range(99)))
+    said, _ = done("sniff", "raw.bin", "--try", "codec=binary_frame&mapping=mine.toml")
     assert next_command(said) == "import raw.bin --as codec=binary_frame&mapping=mine.toml".split()
     assert "--try is codec=NAME" in call("sniff", "raw.bin", "--try", "binary_frame")[2]
 
@@ -205,13 +197,13 @@ def test_it_is_asked_at_the_speed_that_is_named(call, monkeypatch):
     assert code == 0 and next_command(said) == ["run", "--source", url]
 
 
-def test_what_is_nothing_at_all_is_one_line(refused, here):
+def test_what_is_nothing_at_all_is_one_line(refused, cwd):
     assert "is no port, bus or file" in refused("sniff", "nix")
     assert "is a folder" in refused("sniff", ".")
 
 
-def test_a_recording_is_known(call, here):
-    (here / "raw.bin").write_bytes(spoken("serial", "bota"))
+def test_a_recording_is_known(call, cwd):
+    (cwd / "raw.bin").write_bytes(spoken("serial", "bota"))
     call("import", "raw.bin", "--as", "codec=bota")
     code, said, _ = call("sniff", "raw.mcap")
     assert code == 0 and next_command(said) == ["run", "--source", "replay:raw.mcap"]

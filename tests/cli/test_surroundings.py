@@ -18,11 +18,8 @@ SOURCE = "synthetic:2x1?pace=fast&seconds=1"
 
 
 def shell(words: str, streams: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["sh", "-c", f'"$0" -c "$1" {words} {streams}', sys.executable, PROGRAM],
-        capture_output=True,
-        text=True,
-    )
+    command = ["sh", "-c", f'"$0" -c "$1" {words} {streams}', sys.executable, PROGRAM]
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 def test_without_any_stream_it_does_its_work(tmp_path):
@@ -39,8 +36,9 @@ def test_the_disk_of_its_log_may_be_full():
     assert shell("replay none.mcap", "2>/dev/full").returncode == 2
 
 
-def test_a_full_disk_under_its_output_is_one_line():
-    full = shell(f"describe '{SOURCE}'", ">/dev/full")
+@pytest.mark.parametrize("words", [f"describe '{SOURCE}'", "run --source 'replay:demo?speed=0'"])
+def test_a_full_disk_under_its_output_is_one_line(words):
+    full = shell(words, ">/dev/full")
     assert (full.returncode, full.stderr) == (2, "tactile-rt: No space left on device\n")
 
 
@@ -53,20 +51,16 @@ def test_a_full_disk_under_its_output_is_one_line():
         ("align example brain", "brain", "h5py"),
     ],
 )
-def test_what_finds_no_room_is_named_and_not_left(call, tmp_path, monkeypatch, words, made, needs):
+def test_what_finds_no_room_is_named_and_not_left(call, cwd, words, made, needs):
     pytest.importorskip(needs)
-    monkeypatch.chdir(tmp_path)
     call("record", SOURCE, "a.mcap")
     # No file may be larger than 4 KiB: to who writes it is as a disk that is full.
-    full = subprocess.run(
-        ["bash", "-c", f'ulimit -f 4; exec "$0" -c "$1" {words}', sys.executable, PROGRAM],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},  # or halves of it would be kept
-    )
+    command = ["bash", "-c", f'ulimit -f 4; exec "$0" -c "$1" {words}', sys.executable, PROGRAM]
+    whole = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}  # or halves of it would be kept
+    full = subprocess.run(command, capture_output=True, text=True, env=whole)
     said = f"tactile-rt: cannot use {made}: File too large\n"
     assert (full.returncode, full.stdout, full.stderr) == (2, "", said)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+    assert [path.name for path in cwd.iterdir()] == ["a.mcap"]
 
 
 @pytest.fixture
@@ -167,7 +161,6 @@ def test_a_configuration_is_written_whole_or_not(refused, tmp_path, monkeypatch)
 
     monkeypatch.setattr(files.os, "replace", full)
     path = tmp_path / "robot.toml"
-    assert refused("config", "example", path) == (
-        f"tactile-rt: cannot use {path}: No space left on device\n"
-    )
+    said = refused("config", "example", path)
+    assert said == f"tactile-rt: cannot use {path}: No space left on device\n"
     assert os.listdir(tmp_path) == []

@@ -82,32 +82,27 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, refused, recipe,
         (("--set", "objects.validation=nan"), "--set objects.validation=nan: nan is no quantity"),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_nothing(refused, tmp_path, monkeypatch, options, said):
-    monkeypatch.chdir(tmp_path)
-    assert said in refused("sweep", tmp_path / "set", *options)
-    assert not (tmp_path / "set").exists()
+def test_a_mistake_is_one_line_and_leaves_nothing(refused, cwd, options, said):
+    assert said in refused("sweep", cwd / "set", *options)
+    assert not (cwd / "set").exists()
 
 
 @pytest.mark.usefixtures("here")
 def test_another_profile_of_a_set_goes_elsewhere(call, refused, recipe, tmp_path):
     folder = tmp_path / "set"
     assert call("sweep", folder, "--recipe", recipe, "--split", "test", "--processes", 1)[0] == 0
-    assert "holds another sweep set (other recipe.profile, " in refused(
-        "sweep", folder, "--profile", "accurate"
-    )
+    said = refused("sweep", folder, "--profile", "accurate")
+    assert "holds another sweep set (other recipe.profile, " in said
 
 
 @pytest.mark.usefixtures("here")
-def test_sweeps_that_miss_are_told(call, recipe, tmp_path):
+def test_sweeps_that_miss_are_told(done, recipe, tmp_path):
     recipe.write_text(RECIPE + "height_mm = 200\n")
-    code, _, err = call("sweep", tmp_path / "set", "--recipe", recipe, "--processes", 1)
-    assert code == 0
+    _, err = done("sweep", tmp_path / "set", "--recipe", recipe, "--processes", 1)
     assert "6 sweeps at profile realtime; 6 miss the array" in err.replace("\n", " ")
 
 
 def test_a_ray_cluster_is_named_by_host_and_port(refused, recipe, tmp_path):
     pytest.importorskip("ray")
-    options = ("--recipe", recipe, "--ray", "head")
-    assert "no Ray cluster at head: give its HOST:PORT" in refused(
-        "sweep", tmp_path / "set", *options
-    )
+    said = refused("sweep", tmp_path / "set", "--recipe", recipe, "--ray", "head")
+    assert "no Ray cluster at head: give its HOST:PORT" in said

@@ -6,7 +6,6 @@ import shlex
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 import urllib.request
@@ -24,11 +23,11 @@ from tactile_rt.teaching.lesson import Lesson
 from tactile_rt.teaching.page import TeachingPage
 from tactile_rt.testing import FakeSerial
 from tests.helpers.made_up_touches import KINDS, felt
+from tests.helpers.processes import run_program, start_program
 from tests.helpers.source_tree import ROOT
 from tests.helpers.waiting import until
 
 EACH = 4
-COMMAND = [sys.executable, "-c", "from tactile_rt.cli import main; main()", "teach"]
 
 
 def device(kinds, seed, pace="fast"):
@@ -44,10 +43,9 @@ def url(line, clock="device"):
 def lesson(tmp_path_factory):
     folder = tmp_path_factory.mktemp("teach") / "gestures"
     with device([kind for kind in KINDS for _ in range(EACH)], 1) as line:
-        done = subprocess.run(
-            [*COMMAND, url(line), folder, "--classes", ",".join(KINDS), "--touches", str(EACH)],
-            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
+        done = run_program(
+            "teach", url(line), folder, "--classes", ",".join(KINDS), "--touches", EACH
+        )
     assert done.returncode == 0, done.stderr
     return folder, done.stdout
 
@@ -80,19 +78,13 @@ def test_what_was_taught_is_decided_over_the_same_line(lesson):
 def test_a_lesson_goes_on_and_lines_are_orders(lesson):
     folder, _ = lesson
     with device(["twist"] * 3, 5) as line:
-        done = subprocess.run(
-            [*COMMAND, url(line), folder, "--classes", "twist", "--touches", "2"],
-            input="press\ntwist\n", capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
+        words = ("teach", url(line), folder, "--classes", "twist", "--touches", "2")
+        done = run_program(*words, input="press\ntwist\n")
     assert done.returncode == 0, done.stderr
     assert f"there already: {EACH} press, {EACH} slide, {EACH} double" in done.stdout
     assert f"touch it: press ({EACH + 1})" in done.stdout, "stdin's lines are orders"
     assert "touch it: twist (1 of 2)" in done.stdout
     assert load_model(folder / "model.onnx")[1].classes == ("double", "press", "slide", "twist")
-
-
-def _wait_for(said, lines, process):
-    until(lambda: len(said) >= lines or process.poll() is not None)
 
 
 def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
@@ -101,15 +93,14 @@ def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
     draw = random.Random(seed := random.randrange(1000))  # other moments every time
     for k in range(6):
         with device(["press", "slide"] * 20, seed + k) as line:
-            process = subprocess.Popen(
-                [*COMMAND, url(line), folder, "--classes", "press", "--touches", "999"],
-                stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
-            )  # fmt: skip
+            words = ("teach", url(line), folder, "--classes", "press", "--touches", "999")
+            process = start_program(*words, stdin=subprocess.DEVNULL, stderr=None)
             said = []
             reader = threading.Thread(target=lambda p=process, s=said: s.extend(p.stdout))
             reader.start()
             # the last time for long enough that there is something to learn from
-            _wait_for(said, draw.randrange(1, 12) if k < 5 else 12, process)
+            lines = draw.randrange(1, 12) if k < 5 else 12
+            until(lambda p=process, s=said, n=lines: len(s) >= n or p.poll() is not None)
             time.sleep(draw.uniform(0, 0.1))
             process.kill()
             process.wait()
@@ -154,27 +145,23 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
     assert (folder / LABELS).exists()
 
 
-def test_a_folder_of_others_is_refused_before_anything_is_begun(call, tmp_path, monkeypatch):
+def test_a_folder_of_others_is_refused_before_anything_is_begun(refused, tmp_path, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, how: False)
-    code, out, err = call("teach", "synthetic:3x2", tmp_path / "a", "--seconds", "5")
-    assert (code, out, err.count("\n")) == (2, "", 1) and "may not be written into" in err
+    said = refused("teach", "synthetic:3x2", tmp_path / "a", "--seconds", "5")
+    assert "may not be written into" in said
 
 
-def test_an_address_that_is_taken_is_told_before_anything_is_begun(call, tmp_path):
+def test_an_address_that_is_taken_is_told_before_anything_is_begun(refused, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         at = f"127.0.0.1:{taken.getsockname()[1]}"
-        code, out, err = call("teach", "synthetic:3x2", tmp_path / "a", "--page", at)
-    assert (code, out, err.count("\n")) == (2, "", 1) and "already in use" in err
+        assert "already in use" in refused("teach", "synthetic:3x2", tmp_path / "a", "--page", at)
     assert not (tmp_path / "a").exists()
 
 
 def test_ctrl_c_learns_from_what_is_there(tmp_path):
     with device(["press"] * 9, 3, pace="realtime") as line:
-        command = [*COMMAND, line.url, tmp_path / "a", "--classes", "press,slide"]
-        process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True,
-        )  # fmt: skip
+        words = ("teach", line.url, tmp_path / "a", "--classes", "press,slide")
+        process = start_program(*words, stdin=subprocess.DEVNULL, stderr=subprocess.STDOUT)
         for said in process.stdout:
             if "press 2" in said:
                 process.send_signal(signal.SIGINT)
@@ -186,10 +173,7 @@ def test_ctrl_c_learns_from_what_is_there(tmp_path):
 
 def test_ctrl_c_at_rest_leaves_nothing_behind(tmp_path):
     with device([], 3, pace="realtime") as line:
-        process = subprocess.Popen(
-            [*COMMAND, line.url, tmp_path / "a"], stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+        process = start_program("teach", line.url, tmp_path / "a", stdin=subprocess.DEVNULL)
         assert process.stdout.readline() == "touch nothing for 2 s\n"
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=20)
@@ -209,9 +193,8 @@ def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, refused, t
     base = load_model(shipped_model())[1]
     (first, *_) = Lesson.read(tmp_path / "a").touches
     assert first.features.shape == (base.steps, base.embedding + len(base.labels))
-    assert "holds a lesson of another model" in refused(
-        "teach", source, tmp_path / "a", "--model", tmp_path / "a" / "model.onnx"
-    )
+    said = refused("teach", source, tmp_path / "a", "--model", tmp_path / "a" / "model.onnx")
+    assert "holds a lesson of another model" in said
 
 
 def test_the_page_shows_and_obeys():
@@ -245,13 +228,10 @@ def test_the_page_shows_and_obeys():
 def test_letters_and_numbers_are_orders(tmp_path):
     """A number chooses, n goes to the next, u takes back, q learns."""
     with device(["press"] * 2, 1, pace="realtime") as line:
-        done = subprocess.run(
-            [*COMMAND, url(line), tmp_path / "a", "--classes", "press,slide", "--touches", "9"],
-            input="n\nrub\n7\nu\n1\nq\n", capture_output=True, text=True, timeout=60, check=False,
-        )  # fmt: skip
-    assert (
-        done.returncode == 2 and "too few to learn from: two of a class are needed" in done.stderr
-    )
+        words = ("teach", url(line), tmp_path / "a", "--classes", "press,slide", "--touches", "9")
+        done = run_program(*words, input="n\nrub\n7\nu\n1\nq\n")
+    assert done.returncode == 2
+    assert "too few to learn from: two of a class are needed" in done.stderr
     for said in ("touch it: slide (1 of 9)", "touch it: rub (1 of 9)",
                  "there is no class 7: there are 3", "there is no touch to take back"):  # fmt: skip
         assert said in done.stdout
@@ -261,8 +241,7 @@ PAGE = ROOT / "docs" / "how-to" / "teaching.md"
 FIVE = ("press", "slide", "double", "push", "twist")
 
 
-def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_tutorial_does_what_it_says(call, cwd):
     page = PAGE.read_text("utf-8")
     taught, decided, check, _, emulated, again, mouse, met = re.findall(
         r"```sh\n(.*?)```", page, re.S
@@ -277,13 +256,12 @@ def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
         command = decided.replace("serial:///dev/ttyUSB0?codec=bota", url(line, "host"))
         code, out, _ = call(*shlex.split(command)[1:], "--seconds", "6")
     assert code == 0 and '"label":"slide"' in out.replace(" ", "")
-    words = shlex.split(emulated)[1:]
-    with subprocess.Popen([*COMMAND[:-1], *words], stdout=subprocess.PIPE, text=True) as there:
+    with start_program(*shlex.split(emulated)[1:], stderr=None) as there:
         assert "hand?codec=bota" in there.stdout.readline()
         code, out, _ = call(*shlex.split(again)[1:], "--seconds", "7")
         there.terminate()
     assert code == 0 and '"label":"press"' in out.replace(" ", "")
-    (tmp_path / "robot.toml").write_text(table)
+    (cwd / "robot.toml").write_text(table)
     assert call(*shlex.split(check)[1:])[0] == 0
     pytest.importorskip("numba")
     assert call(*shlex.split(mouse)[1:])[0] == 0

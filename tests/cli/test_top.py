@@ -9,6 +9,7 @@ import threading
 import pytest
 from rich.console import Console
 
+from bench.daemon.process import free_port
 from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.config import MetricsConfig
@@ -43,9 +44,7 @@ def text(renderable, width=118):
 @pytest.fixture
 def daemon():
     """URL of one that is being watched."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        port = found.getsockname()[1]
+    port = free_port()
     with running(Metrics("metrics", MetricsConfig(port=port)), View(snapshot=busy_snapshot())):
         yield f"http://127.0.0.1:{port}"
 

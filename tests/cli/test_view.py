@@ -75,10 +75,9 @@ def test_a_video_lasts_as_much_longer_as_it_is_slower(view):
         (("--out", "a.mp4", "--at", 5), "--at is the moment of a picture"),
     ],
 )
-def test_mistakes_are_one_line_and_leave_nothing(refused, tmp_path, monkeypatch, options, said):
-    monkeypatch.chdir(tmp_path)
+def test_mistakes_are_one_line_and_leave_nothing(refused, cwd, options, said):
     assert said in refused("view", "mug-1", *options)
-    assert list(tmp_path.iterdir()) == []
+    assert list(cwd.iterdir()) == []
 
 
 def test_an_object_that_misses_is_said(call, tmp_path):

@@ -24,14 +24,13 @@ def robot(tmp_path):
     return path
 
 
-def test_a_stimulus_is_written_with_its_parameters(call, tmp_path, robot):
+def test_a_stimulus_is_written_with_its_parameters(done, tmp_path, robot):
     out = tmp_path / "out.npz"
-    code, _, err = call(
+    _, err = done(
         *("whisk", out, "--array", robot, "--stimulus", "concave-close,convex-close"),
         *QUICK,
         *("--set", "radius_mm=70"),
     )
-    assert code == 0, err
     assert "first contact at" in err
     with np.load(out) as arrays:
         assert arrays["values"].shape == (2, 110, 2, 6)
@@ -50,24 +49,20 @@ def test_a_stimulus_is_written_with_its_parameters(call, tmp_path, robot):
     assert described["profile"]["name"] == "realtime"
 
 
-def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
+def test_an_object_and_a_recorded_trajectory(done, tmp_path, robot):
     t = np.arange(0, 1.4, 0.01)
     path = tmp_path / "angles.csv"
     lines = [f"{a},{20 - 20 * np.cos(2 * np.pi * 2 * a)}" for a in t]
     path.write_text("\n".join(["time_s,theta_deg", *lines]))
     out = tmp_path / "mug.npz"
-    code, _, err = call(
+    done(
         *("whisk", out, "--array", robot, "--object", "mug-3", "--set", "position_mm=22,8,0"),
         *("--set", "size_mm=14", "--trajectory", path, "--profile", "realtime"),
     )
-    assert code == 0, err
     described = json.loads(out.with_suffix(".json").read_text())
     assert described["stimuli"] == ["mug-3"]
-    assert described["parameters"]["mug-3"] == {
-        "position_mm": [22.0, 8.0, 0.0],
-        "size_mm": 14.0,
-        "yaw_deg": 0.0,
-    }
+    placed = {"position_mm": [22.0, 8.0, 0.0], "size_mm": 14.0, "yaw_deg": 0.0}
+    assert described["parameters"]["mug-3"] == placed
     assert described["trajectory"]["file"] == "angles.csv"
     assert len(described["trajectory"]["sha256"]) == 64
 
@@ -98,7 +93,7 @@ def test_mistakes_are_one_line_and_leave_nothing(refused, tmp_path, robot, monke
     assert [p.name for p in tmp_path.iterdir()] == ["robot.csv"]
 
 
-def test_the_left_side_meets_the_mirror_image(call, tmp_path, robot):
+def test_the_left_side_meets_the_mirror_image(done, tmp_path, robot):
     """The same whiskers mirrored feel the same: fx, fy, mz alike, fz, mx, my of opposite sign."""
     mirrored = tmp_path / "mirrored.csv"
     signs = {"base_x_mm": -1, "base_theta_rad": -1, "base_zeta_rad": -1}
@@ -111,12 +106,10 @@ def test_the_left_side_meets_the_mirror_image(call, tmp_path, robot):
     felt = []
     for array in (robot, mirrored):
         out = tmp_path / f"{array.stem}.npz"
-        code, _, err = call("whisk", out, "--array", array, "--stimulus", "convex-close", *QUICK)
-        assert code == 0, err
+        done("whisk", out, "--array", array, "--stimulus", "convex-close", *QUICK)
         with np.load(out) as arrays:
             felt.append(arrays["values"])
     right, left = felt[0], felt[1] * np.array([1, 1, -1, -1, -1, 1])
     assert np.linalg.norm(left - right) < 0.05 * np.linalg.norm(right)
-    assert json.loads(out.with_suffix(".json").read_text())["parameters"]["convex-close"][
-        "mirrored"
-    ]
+    parameters = json.loads(out.with_suffix(".json").read_text())["parameters"]
+    assert parameters["convex-close"]["mirrored"]

@@ -24,17 +24,16 @@ HEARS = {"describe": [], "echo": [], "hz": [], "record": ["run.mcap"], "tare": [
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch):
+def place(cwd, monkeypatch):
     """A folder with everything that can be wrong with a file, by what it is."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "empty").write_bytes(b"")
-    (tmp_path / "junk").write_bytes(bytes(range(256)) * 8)
-    (tmp_path / FILES[4]).write_bytes(b"\xff\xfe\x00")
-    (tmp_path / "file").write_text("here\n")
-    return tmp_path
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(cwd / "config"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cwd / "cache"))
+    (cwd / "folder").mkdir()
+    (cwd / "empty").write_bytes(b"")
+    (cwd / "junk").write_bytes(bytes(range(256)) * 8)
+    (cwd / FILES[4]).write_bytes(b"\xff\xfe\x00")
+    (cwd / "file").write_text("here\n")
+    return cwd
 
 
 def arguments_of(command):

@@ -7,16 +7,15 @@ from tactile_rt.core.locks import alone_in, device_keys
 from tests.helpers.holding import held_elsewhere
 
 
-def test_a_folder_is_one_process_s_by_all_its_names(tmp_path, monkeypatch):
-    folder, other = tmp_path / "run", tmp_path / "link"
+def test_a_folder_is_one_process_s_by_all_its_names(cwd):
+    folder, other = cwd / "run", cwd / "link"
     other.symlink_to(folder)  # which is not there yet
-    monkeypatch.chdir(tmp_path)
     with held_elsewhere(folder) as pid:
-        for name in (folder, other, folder.relative_to(tmp_path)):
+        for name in (folder, other, folder.relative_to(cwd)):
             with pytest.raises(ConfigError) as refusal, alone_in(name):
                 pytest.fail("two have it")
             assert f"folder {folder} is in use by process {pid}: " in str(refusal.value)
-        with alone_in(tmp_path), alone_in(folder / "probe"):  # above and below: other folders
+        with alone_in(cwd), alone_in(folder / "probe"):  # above and below: other folders
             pass
     with alone_in(folder):
         assert not folder.exists(), "nothing is written"
@@ -28,18 +27,13 @@ def test_a_folder_is_free_again_after_an_error(tmp_path):
             raise ZeroDivisionError
 
 
-def test_a_device_has_one_key_by_all_its_names(tmp_path, monkeypatch):
-    (tmp_path / "tty0").touch()
-    (tmp_path / "port").symlink_to("tty0")
-    (tmp_path / "vcan0").touch()
-    monkeypatch.chdir(tmp_path)
-    port = f"device {tmp_path / 'tty0'}"
-    assert device_keys([f"serial:{tmp_path}/port?baud=9600", "serial:port", "serial:tty0"]) == [
-        port
-    ]
-    assert device_keys(["can:slcan:port", f"can:slcan:{tmp_path}/tty0"]) == [port]
+def test_a_device_has_one_key_by_all_its_names(cwd):
+    (cwd / "tty0").touch()
+    (cwd / "port").symlink_to("tty0")
+    (cwd / "vcan0").touch()
+    port = [f"device {cwd / 'tty0'}"]
+    assert device_keys([f"serial:{cwd}/port?baud=9600", "serial:port", "serial:tty0"]) == port
+    assert device_keys(["can:slcan:port", f"can:slcan:{cwd}/tty0"]) == port
     # A bus is no file, though there is one of its name; a port may not be there yet.
-    assert device_keys(["can:vcan0", "serial:port1", "sim:mouse"]) == [
-        "device vcan0",
-        "device port1",
-    ]
+    found = device_keys(["can:vcan0", "serial:port1", "sim:mouse"])
+    assert found == ["device vcan0", "device port1"]

@@ -1,5 +1,6 @@
 """Configurations: what is right is read whole, what is wrong is refused in one golden line."""
 
+import json
 import string
 from pathlib import Path
 
@@ -35,10 +36,8 @@ def refusal_of(folder, text, *sets):
 def test_a_broken_file_is_refused_by_its_golden_message(name, monkeypatch):
     monkeypatch.chdir(DATA)
     golden = (DATA / name).read_bytes().split(b"\n")[0].decode().removeprefix("# ")
-    with pytest.raises(ConfigError) as caught:
-        check_config(load_config(Path(name)))
-    assert str(caught.value).replace(str(DATA), "HERE") == golden
-    assert "\n" not in golden
+    said = refusal(lambda: check_config(load_config(Path(name))))
+    assert said.replace(str(DATA), "HERE") == golden
 
 
 def test_the_corpus_is_all_there():
@@ -72,10 +71,7 @@ def test_the_example_is_right_and_shows_the_defaults(tmp_path):
 
 
 def test_names_that_are_left_out_are_filled_in(tmp_path):
-    config = load(
-        tmp_path, SMALL + '[[model]]\n[[model]]\n[[publisher]]\nkind="jsonl"\n' * 1 +
-        '[[publisher]]\nkind="jsonl"\n',
-    ).config  # fmt: skip
+    config = load(tmp_path, SMALL + "[[model]]\n" * 2 + '[[publisher]]\nkind="jsonl"\n' * 2).config
     assert [m.name for m in config.model] == ["whiskers", "whiskers-2"]
     assert [m.source for m in config.model] == ["whiskers", "whiskers"]
     assert [p.name for p in config.publisher] == ["jsonl", "jsonl-2"]
@@ -103,9 +99,8 @@ def test_paths_are_meant_from_the_folder_of_the_file_that_they_stand_in(tmp_path
 
 
 def test_a_calibration_that_is_no_file_is_a_devices_name(tmp_path):
-    assert (
-        load(tmp_path, SMALL + 'calibration = "cell-3"\n').config.source[0].calibration == "cell-3"
-    )
+    config = load(tmp_path, SMALL + 'calibration = "cell-3"\n').config
+    assert config.source[0].calibration == "cell-3"
 
 
 @pytest.mark.parametrize(
@@ -120,10 +115,7 @@ def test_a_calibration_that_is_no_file_is_a_devices_name(tmp_path):
         ("page.prot=1", "--set page.prot=1: page has no key 'prot'; did you mean port?"),
         ("page.port=x", "--set page.port=x: page.port: expected a whole number, got 'x'"),
         ("version.a=1", "--set version.a=1: version has a value, not keys"),
-        (
-            "source.whiskers=1",
-            "--set source.whiskers=1: source[0] is a table: say which key of it",
-        ),
+        ("source.whiskers=1", "--set source.whiskers=1: source[0] is a table: say which key of it"),
         ("version=2", "--set version=2: version 2; this release reads 1"),
     ],
 )
@@ -293,8 +285,6 @@ def tables(of=Config):
 
 
 def quoted(text):
-    import json
-
     return json.dumps(text).replace("\x7f", "\\u007f")
 
 

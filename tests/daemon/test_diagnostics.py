@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -66,6 +67,8 @@ def test_who_does_what_it_should_is_not_named():
          "no samples: source.a: the device is lost"),
         ({"part": part("source.a", "waiting", "no such port")},
          "no samples: source.a fails: no such port"),
+        ({"stuck_at_s": 0.4}, "stuck-at fault: source.a: the values do not change at all, as no "
+         "sensor's do: the device hangs"),
         ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),
         ({"part": part("source.a", "failed", "another array")},
          "no samples: source.a has failed: another array"),
@@ -73,11 +76,6 @@ def test_who_does_what_it_should_is_not_named():
 )  # fmt: skip
 def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
     assert told([replace(SOURCE, **changes)]) == [line]
-
-
-def test_a_device_that_is_stuck_is_named():
-    (line,) = told([replace(SOURCE, stuck_at_s=0.4)])
-    assert line.startswith("stuck-at fault: source.a: the values do not change")
 
 
 @pytest.mark.parametrize(
@@ -163,13 +161,8 @@ def test_a_consumer_is_named_by_what_it_did_not_hand_on(changes, words):
     ],
 )  # fmt: skip
 def test_the_recorder_is_named_by_what_is_not_on_the_disk(disk, source, words):
-    found = [
-        line
-        for line in told(
-            [replace(SOURCE, **source)], consumers=[replace(RECORDER, on_disk={"a": disk})]
-        )
-        if line.startswith("no recording")
-    ]
+    lines = told([replace(SOURCE, **source)], consumers=[replace(RECORDER, on_disk={"a": disk})])
+    found = [line for line in lines if line.startswith("no recording")]
     assert found == ([f"no recording: recorder: {words}; acquisition goes on"] if words else [])
 
 
@@ -204,9 +197,8 @@ def test_a_process_without_a_turn_blames_none_of_its_parts():
 def test_a_line_does_not_change_as_long_as_what_it_says_is_true():
     a = told([replace(SOURCE, newest_ns=NOW - S, read_ns=NOW - S)])
     assert a == told([replace(SOURCE, newest_ns=NOW - 7 * S, read_ns=NOW - 7 * S)])
-    assert told([replace(SOURCE, losses=Losses(1, 7))]) == told(
-        [replace(SOURCE, losses=Losses(80, 90))]
-    )
+    few, many = (told([replace(SOURCE, losses=Losses(*n))]) for n in ((1, 7), (80, 90)))
+    assert few == many
 
 
 def test_what_is_wrong_with_the_daemon_itself_is_told():
@@ -233,8 +225,7 @@ class Hand:
 def test_losses_are_those_of_the_newest_second_and_minute(steps):
     """Against a list of all that was ever lost; to a look's length, as nobody looks in between."""
     hand = Hand()
-    before, module.time = module.time, hand
-    try:
+    with mock.patch.object(module, "time", hand):
         window, count, all_lost = LossWindow(), 0, []
         for after_s, lost in steps:
             hand.s += after_s
@@ -248,8 +239,6 @@ def test_losses_are_those_of_the_newest_second_and_minute(steps):
                 last = earlier[-1] if earlier else 1000.0
                 most = sum(n for t, n in all_lost if t > last - module.LOOK_S)
                 assert least <= got <= max(most, least)
-    finally:
-        module.time = before
 
 
 def test_whoever_looks_often_does_not_fill_the_window():
@@ -259,17 +248,18 @@ def test_whoever_looks_often_does_not_fill_the_window():
     assert len(window._seen) < 100
 
 
-# stuck-at faults
-
-
 def chunks(values):
     return cut(np.asarray(values, np.float32), 1000.0, 7)
 
 
+def detector(after_s):
+    made = StuckAtDetector()
+    made.after_s = after_s
+    return made
+
+
 def judged(values, after_s):
-    judge = StuckAtDetector()
-    judge.after_s = after_s
-    found = []
+    judge, found = detector(after_s), []
     for chunk in chunks(values):
         judge.add(chunk)
         found.append(judge.seconds)
@@ -299,8 +289,7 @@ def test_one_value_of_many_that_changes_is_enough():
 
 
 def test_a_sample_without_any_valid_element_says_nothing_of_being_stuck():
-    judge = StuckAtDetector()
-    judge.after_s = 0.05
+    judge = detector(0.05)
     for chunk in chunks(np.zeros((900, 3, 2))):
         judge.add(replace(chunk, valid=np.zeros_like(chunk.valid)))
         assert not judge.seconds
@@ -315,8 +304,7 @@ def test_a_sample_without_any_valid_element_says_nothing_of_being_stuck():
 )
 def test_how_long_nothing_changes_is_counted_sample_by_sample(values, useless, cuts, start, after):
     """By the plainest way to count it, however the stream is cut."""
-    n, judge = len(values), StuckAtDetector()
-    judge.after_s = after / 1000
+    n, judge = len(values), detector(after / 1000)
     loads = np.zeros((n, 3, 2), np.float32)
     loads[:, 1, 1] = values
     valid = ~np.array(useless[:n])[:, None] & np.ones((n, 3), np.bool_)
@@ -333,8 +321,7 @@ def test_how_long_nothing_changes_is_counted_sample_by_sample(values, useless, c
 
 
 def test_another_array_is_not_stuck():
-    judge = StuckAtDetector()
-    judge.after_s = 0.005
+    judge = detector(0.005)
     for at, elements in ((0, 3), (1, 4)):
         chunk = cut(np.zeros((9, elements, 2), np.float32), 1000.0, 9)[0]
         judge.add(replace(chunk, t_ns=chunk.t_ns + at * 9_000_000))
@@ -358,11 +345,8 @@ def test_nothing_is_judged_of_a_sensor_that_nothing_is_known_of():
 
 
 def sensor(noise, resolution):
-    return SensorSpec(
-        channels=(
-            ChannelSpec(name="fy", unit="N", range=1.0, noise_density=noise, resolution=resolution),
-        )
-    )
+    fy = ChannelSpec(name="fy", unit="N", range=1.0, noise_density=noise, resolution=resolution)
+    return SensorSpec(channels=(fy,))
 
 
 def test_from_when_on_equal_samples_are_impossible_follows_from_the_noise():
@@ -393,8 +377,7 @@ def test_no_sensor_of_a_known_noise_is_taken_for_stuck(ratio, seed):
     after_s = derive_stuck_at_s(spec, sensor(density, sigma / ratio))
     noise = np.random.default_rng(seed).normal(scale=sigma, size=(2000, 3, 1))
     rounded = (np.round(noise / (sigma / ratio)) * (sigma / ratio)).astype(np.float32)
-    judge = StuckAtDetector()
-    judge.after_s = after_s
+    judge = detector(after_s)
     for chunk in cut(rounded, rate, 7):
         judge.add(chunk)
         assert judge.seconds == 0.0

@@ -19,15 +19,7 @@ from tactile_rt.daemon.process import ExitCode
 from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
-from tests.helpers.published import (
-    FORCES,
-    View,
-    busy_snapshot,
-    contact,
-    decision,
-    event,
-    running,
-)
+from tests.helpers.published import FORCES, View, busy_snapshot, contact, decision, event, running
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -114,13 +114,10 @@ def test_a_flood_of_connections_costs_no_sample_and_leaves_nothing(
 @pytest.mark.parametrize("unix", [False, True])
 def test_the_first_connections_stay_and_the_rest_are_shut_down(tmp_path, unix):
     with ExitStack() as stack:
-        path = str(tmp_path / "s")
-        if unix:
-            listening = stack.enter_context(socket.socket(socket.AF_UNIX))
-            listening.bind(path)
-            listening.listen()
-        else:
-            listening = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        path, family = str(tmp_path / "s"), socket.AF_UNIX if unix else socket.AF_INET
+        listening = stack.enter_context(socket.socket(family))
+        listening.bind(path if unix else ("127.0.0.1", 0))
+        listening.listen()
         address = listening.getsockname()
         accepted = []
 

@@ -180,16 +180,11 @@ def test_a_body_is_read_as_it_tells_its_length(serve, headers, body, status):
 
 def test_a_body_may_come_in_pieces_and_must_come_whole(serve):
     _, _, port = serve()
+    pieces = [b"POST /body HT", b"TP/1.1\r\nContent-Length: 5\r\n\r", b"\n12", b"3"]
     for end in (b"45", b""):
         with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
             line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            for piece in (
-                b"POST /body HT",
-                b"TP/1.1\r\nContent-Length: 5\r\n\r",
-                b"\n12",
-                b"3",
-                end,
-            ):
+            for piece in (*pieces, end):
                 line.sendall(piece)
             line.shutdown(socket.SHUT_WR)
             assert line.recv(100).startswith(b"HTTP/1.1 200 " if end else b"HTTP/1.1 400 ")

@@ -8,15 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.daemons import load_checked, running_daemon
 from tests.helpers.waiting import until
 
 pytest.importorskip("zmq", reason="needs pyzmq: pip install '.[publish]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
 from bench.daemon.process import free_port
-from tactile_rt.daemon.checks import check_config
-from tactile_rt.daemon.daemon import Daemon
-from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions
 from tactile_rt.daemon.publishers.zmq import ZmqOptions
 
@@ -54,8 +52,8 @@ def test_with_everything_on_nothing_listens_beyond_loopback(tmp_path):
     bind = re.sub(r"\d+\Z", str(zmq), ZmqOptions().bind)
     (listen,) = (re.sub(r"\d+\Z", str(zen), e) for e in ZenohOptions().listen)
     before = own_sockets()
-    file = tmp_path / "robot.toml"
-    file.write_text(
+    loaded = load_checked(
+        tmp_path,
         f"""version = 1
 [[source]]
 name = "a"
@@ -84,17 +82,11 @@ min_free_mb = 1
 stop_s = 60
 [log]
 file = "log"
-"""
+""",
     )
-    loaded = load_config(file)
-    check_config(loaded)
-    daemon = Daemon(loaded)
-    daemon.start()
-    try:
+    with running_daemon(loaded) as daemon:
         until(lambda: daemon.snapshot().state == "running")
         found = own_sockets() - before
-    finally:
-        assert daemon.stop() == []
     assert {port for _, _, port in found} == set(ports)
     assert all(address.is_loopback for _, address, _ in found), found
     assert "exposed" not in (tmp_path / "log").read_text()

@@ -1,10 +1,7 @@
 """A daemon that was stopped, or whose model is too slow: what it decides is about now, what it left
 out is recorded, and a replay decides the same."""
 
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -14,6 +11,7 @@ pytest.importorskip("onnx")
 
 from bench.daemon.process import DaemonProcess, free_port, messages_of
 from tactile_rt.recording.reader import Recording
+from tests.helpers.processes import run_program
 
 CONFIGURATION = """version = 1
 [[source]]
@@ -66,12 +64,7 @@ def decided(state: dict) -> list[int]:
 def replayed(folder: Path) -> str:
     """What `tactile-rt replay --check` says."""
     (file,) = (folder / "recordings").glob("*.mcap")
-    done = subprocess.run(
-        [sys.executable, "-c", "from tactile_rt.cli import main; main()", "replay", str(file),
-         "--check"],
-        capture_output=True, text=True, timeout=300,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-    )  # fmt: skip
+    done = run_program("replay", file, "--check", timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 

@@ -5,6 +5,7 @@ import http.client
 import json
 import re
 import socket
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -120,9 +121,6 @@ def floats(text):
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(SPEC.shape)
 
 
-# what is sent
-
-
 def test_a_frame_holds_the_newest_sample_and_the_extremes_since_the_last(monkeypatch):
     monkeypatch.setattr(feed_module.time, "monotonic", iter([100.0, 100.001, 100.1]).__next__)
     values = np.random.default_rng(0).normal(size=(30, *SPEC.shape)).astype(np.float32)
@@ -172,11 +170,9 @@ def test_arrows_are_right_and_down_on_the_map_however_elements_are_turned():
     rng = np.random.default_rng(1)
     turns = rng.normal(size=(6, 4))
     turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    places = tuple((0.3, 0.01 * c, -0.02 * r) for r, c in grid)
     spec = replace(
-        small_spec(6),
-        grid=tuple(grid),
-        positions=tuple((0.3, 0.01 * c, -0.02 * r) for r, c in grid),
-        orientations=tuple(map(tuple, turns)),
+        small_spec(6), grid=tuple(grid), positions=places, orientations=tuple(map(tuple, turns))
     )
     force = np.array([5.0, 2.0, -3.0])  # of the mount frame: 2 to the right, 3 down
 
@@ -209,8 +205,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_and_they_are_counted():
 
 def test_a_browser_sees_what_happens(serve):
     page, port = serve()
-    stream = Stream(port)
-    try:
+    with closing(Stream(port)) as stream:
         assert stream.until("hello")["control"] is False
         assert stream.until("array")["source"] == "a"
         assert stream.until("state")["snapshot"]["state"] == "running"
@@ -218,12 +213,7 @@ def test_a_browser_sees_what_happens(serve):
         assert stream.until("decision")["label"] == "<b>y"
         assert stream.until("frame")["samples"] == 4
         assert page.details()["browsers"] == 1
-    finally:
-        stream.close()
     until(lambda: page.details()["browsers"] == 0)
-
-
-# who is refused
 
 
 @pytest.mark.parametrize("token", ["", "short"])
@@ -297,12 +287,8 @@ def test_a_cookie_is_good_after_a_restart_and_bad_for_another_token():
     ],
 )
 def test_only_this_page_may_ask_under_this_hosts_names(headers, good):
-    guard = Guard("127.0.0.1", 8765, "")
-    if good:
-        guard.check(headers, "GET")
-    else:
-        with pytest.raises(Refused):
-            guard.check(headers, "GET")
+    with nullcontext() if good else pytest.raises(Refused):
+        Guard("127.0.0.1", 8765, "").check(headers, "GET")
 
 
 def test_the_server_refuses_other_sites_and_wrong_methods(serve):
@@ -350,13 +336,8 @@ def test_every_answer_carries_the_policy(serve):
         assert headers["x-frame-options"] == "DENY"
         # Nothing is asked of another host, and no text ever becomes markup or code.
         text = body.decode().replace("http://www.w3.org/2000/svg", "")
-        found = re.findall(
-            r"https?://|innerHTML|outerHTML|insertAdjacent|eval\(|document\.write", text
-        )
-        assert not found, (path, found)
-
-
-# many at once
+        wrong = r"https?://|innerHTML|outerHTML|insertAdjacent|eval\(|document\.write"
+        assert not re.findall(wrong, text), path
 
 
 def test_at_most_so_many_browsers_and_a_flood_of_connections_ends_with_the_flood(serve):
@@ -386,7 +367,6 @@ def test_a_fault_of_the_page_is_told_in_the_log(serve):
     view = FakeView()
     view.streams = SimpleNamespace()  # not callable
     _, port = serve(view)
-    stream = Stream(port)
-    stream.close()
+    Stream(port).close()
     until(lambda: view.reports)
     assert view.reports[0][:2] == ("page", "request") and "TypeError" in view.reports[0][2]

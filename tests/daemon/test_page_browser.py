@@ -1,7 +1,6 @@
 """The page in a real Chromium: live, alone, by itself back after a restart, and deaf to markup."""
 
 import shutil
-import socket
 import threading
 import time
 from dataclasses import replace
@@ -15,14 +14,14 @@ pytest.importorskip(
 
 from playwright.sync_api import sync_playwright
 
+from bench.daemon.process import free_port
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import ModelState, PartState, Snapshot, SourceState
 from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
-from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.page import Page
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.daemons import load_checked, running_daemon
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
@@ -88,21 +87,14 @@ def tab(chromium):
 
 @pytest.fixture
 def port():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
+    return free_port()
 
 
 @pytest.fixture
 def configured(port, tmp_path):
     """Load a configuration with a page."""
-
-    def load(text):
-        file = tmp_path / "robot.toml"
-        file.write_text(f'version = 1\n{text}[page]\nport = {port}\n[log]\nfile = "log"\n')
-        return load_config(file)
-
-    return load
+    more = f'[page]\nport = {port}\n[log]\nfile = "log"\n'
+    return lambda text: load_checked(tmp_path, f"version = 1\n{text}{more}")
 
 
 LIVE = "+document.getElementById('link').dataset.rate > 0"
@@ -113,9 +105,7 @@ def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, configured
         '[[source]]\nname = "first"\nurl = "synthetic:30x6"\n'
         '[[source]]\nname = "second"\nurl = "synthetic:5x2?rate_hz=50"\n'
     )
-    daemon = Daemon(loaded)
-    daemon.start()
-    try:
+    with running_daemon(loaded):
         one = tab()
         one.page.goto(f"http://127.0.0.1:{port}/")
         one.has(LIVE)
@@ -132,27 +122,19 @@ def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, configured
         one.page.select_option("#source", "second")
         one.has("document.getElementById('subtitle').textContent.startsWith('5 elements')")
         one.has(LIVE)
-    finally:
-        assert daemon.stop() == []
     one.has("document.getElementById('banner').textContent.includes('lost')")
     assert one.text("#link") == "not connected"
-    again = Daemon(loaded)
-    again.start()
-    try:
+    with running_daemon(loaded):
         one.has("document.getElementById('banner').textContent.includes('restarted')")
         one.has(LIVE)
         assert "5 elements" in one.text("#subtitle")
-    finally:
-        assert again.stop() == []
     assert all(url.startswith(f"http://127.0.0.1:{port}/") for url in one.asked)
     assert one.faults() == []
 
 
 def test_without_an_array_it_says_why(tab, port, configured):
     source = '[[source]]\nname = "finger"\nurl = "{}"\n'
-    daemon = Daemon(configured(source.format("serial:/dev/gone?codec=native")))
-    daemon.start()
-    try:
+    with running_daemon(configured(source.format("serial:/dev/gone?codec=native"))) as daemon:
         one = tab()
         one.page.goto(f"http://127.0.0.1:{port}/")
         one.has("document.getElementById('empty').textContent.includes('/dev/gone: no such port')")
@@ -163,8 +145,6 @@ def test_without_an_array_it_says_why(tab, port, configured):
         assert one.page.locator("#map-card").is_visible()
         assert one.page.locator("#empty-card").is_hidden()
         assert one.faults() == []
-    finally:
-        assert daemon.stop() == []
 
 
 class HostileView:
@@ -274,12 +254,8 @@ def test_a_wrong_token_opens_nothing_and_the_right_one_lasts(tab, port):
 
 @pytest.mark.parametrize(("url", "shown"), [("synthetic:mouse", True), ("replay:demo", False)])
 def test_beside_decisions_on_made_up_touches_it_says_so(tab, port, configured, url, shown):
-    daemon = Daemon(configured(f'[[source]]\nname = "a"\nurl = "{url}"\n[[model]]\n'))
-    daemon.start()
-    try:
+    with running_daemon(configured(f'[[source]]\nname = "a"\nurl = "{url}"\n[[model]]\n')):
         one = tab()
         one.page.goto(f"http://127.0.0.1:{port}/")
         one.has("!document.getElementById('by-model').hidden && document.title.includes('mouse')")
         assert one.page.locator("#made-up").is_visible() == shown
-    finally:
-        daemon.stop()

@@ -9,7 +9,8 @@ import sys
 import threading
 import time
 import types
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
@@ -38,6 +39,7 @@ from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
@@ -59,9 +61,6 @@ def event(reason="", part="source.a", state="waiting", level="warning"):
 def decision():
     d = Classification(10, 20, 3, True, "y", ("x", "y"), np.array([0.25, 0.75], np.float32), 0.0012)
     return Decision("a", "m", "mount", d, 1_000_000, 3_500_000, OFFSET_NS)
-
-
-# mailbox
 
 
 def test_a_mailbox_is_bounded_in_bytes_but_takes_one_of_any_size():
@@ -119,9 +118,6 @@ def test_every_item_has_a_class():
     assert box.state.waiting == {"samples": 4, "packets": 1, "decisions": 1, "events": len(others)}
 
 
-# hub
-
-
 def test_an_item_s_size_is_that_of_its_arrays_and_what_is_around_them():
     box = Mailbox({SourceChunk, Packet}, 100, 10**9)
     chunk = samples(5)
@@ -165,9 +161,6 @@ def test_who_joins_late_hears_of_open_streams_once_and_of_closed_ones_not_at_all
     assert box.take() == []
 
 
-# latency
-
-
 def test_percentiles_are_those_of_the_newest_and_buckets_of_all():
     meter = LatencyMeter()
     for _ in range(50):
@@ -184,9 +177,6 @@ def test_percentiles_are_those_of_the_newest_and_buckets_of_all():
     expected = np.histogram(values, [-1, *EDGES_S, np.inf])[0]
     assert list(state.buckets[:-1]) == list(expected[:-1])
     assert LatencyMeter().state.p99_ms == 0
-
-
-# messages
 
 
 @pytest.mark.usefixtures("still_clock")
@@ -232,9 +222,6 @@ def test_an_array_is_described_and_the_rest_is_not_published():
     assert topic_of(message_of(event()), "robot") == "robot/health"
     for item in (Closed("a", 1), Packet("a", b"", 1), Control("start")):
         assert message_of(item) is None
-
-
-# log
 
 
 def logged(path, *batches, **options):
@@ -284,26 +271,29 @@ def test_the_level_is_the_least_that_is_written(tmp_path):
     assert len(logged(tmp_path / "log", events, level="warning")) == 2
 
 
-# locks
+@contextmanager
+def held_by_another(key, user=None):
+    """A process, of another user if one is given, that holds a lock."""
+    become = "" if user is None else f"import os; os.setuid({user}); "
+    code = (
+        f"import sys; from tactile_rt.core.locks import Locks; {become}held = Locks(); "
+        "held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
+    )
+    with start_program(key, program=code, stdin=subprocess.PIPE) as other:
+        assert other.stdout.readline() == "held\n"
+        yield other
+        other.kill()
 
 
 def test_a_lock_ends_with_its_process_and_is_anothers_until_then(tmp_path):
     device = f"device {tmp_path}/tty"
     keys = [f"configuration {tmp_path}/robot.toml", device]
-    code = (
-        "import sys; from tactile_rt.core.locks import Locks; held = Locks(); "
-        "held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, device], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdout.readline() == b"held\n"
+    with held_by_another(device) as other:
         mine = Locks()
         for _ in range(3):  # whoever asks takes nothing from who asks next
             with pytest.raises(AlreadyRunning, match=f"/tty is in use by process {other.pid}$"):
                 mine.hold(keys)
         mine.hold(keys[:1])
-        other.kill()
     mine.hold(keys)
     with pytest.raises(AlreadyRunning):
         Locks().hold(keys[:1])
@@ -328,11 +318,9 @@ def test_many_start_at_once_and_one_of_them_is_alone(tmp_path):
         except AlreadyRunning:
             lost.append(locks)
 
-    threads = [threading.Thread(target=start) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(8) as threads:
+        for _ in range(8):
+            threads.submit(start)
     assert (len(won), len(lost)) == (1, 7)
     won[0].close()
 
@@ -340,17 +328,9 @@ def test_many_start_at_once_and_one_of_them_is_alone(tmp_path):
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
 def test_a_lock_of_another_user_is_a_lock_and_names_the_user(tmp_path):
     key = f"device {tmp_path}/tty"
-    code = (
-        "import os, sys; from tactile_rt.core.locks import Locks; os.setuid(65534); "
-        "held = Locks(); held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", code, key], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
-        assert other.stdout.readline() == b"held\n"
+    with held_by_another(key, user=65534) as other:
         with pytest.raises(AlreadyRunning, match=f"process {other.pid} of user 65534"):
             Locks().hold([key])
-        other.kill()
 
 
 def bound(key):
@@ -404,21 +384,17 @@ def test_ports_that_differ_after_a_hash_are_two():
     assert len(device_keys(["serial:///dev/null#1?codec=bota", "serial:///dev/null#2"])) == 2
 
 
-def test_two_names_of_a_configuration_or_a_port_are_one(tmp_path, monkeypatch):
-    link, file = tmp_path / "whiskers", tmp_path / "robot.toml"
+def test_two_names_of_a_configuration_or_a_port_are_one(cwd):
+    link, file = cwd / "whiskers", cwd / "robot.toml"
     link.symlink_to("/dev/null")
-    monkeypatch.chdir(tmp_path)
     urls = ["serial:///dev/null?codec=bota", f"serial:{link}?codec=native", "can:slcan:/dev/null"]
     urls += ["serial://whiskers?codec=bota"]
     assert device_keys([*urls, "synthetic:"]) == ["device /dev/null"]
     assert lock_keys(file, urls) == [f"configuration {file}", "device /dev/null"]
     # A link may lead elsewhere by the time a second one starts, so its own name is held, too.
-    named = tmp_path / "named.toml"
+    named = cwd / "named.toml"
     named.symlink_to(file)
     assert lock_keys(named, []) == [f"configuration {file}", f"configuration {named}"]
-
-
-# supervision
 
 
 class Fragile(Part):

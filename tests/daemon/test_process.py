@@ -15,6 +15,7 @@ import pytest
 
 from bench.daemon.process import free_port, messages_of
 from tactile_rt.daemon.config import ADMISSION, EXAMPLE
+from tests.helpers.processes import run_program, start_program
 from tests.helpers.waiting import PATIENCE_S, until
 
 RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
@@ -57,13 +58,7 @@ def started(folder):
     processes = []
 
     def start(*arguments, until=("source.a", "running")):
-        process = subprocess.Popen(
-            [*RUN, "run", str(folder / "robot.toml"), *arguments],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        )
+        process = start_program("run", folder / "robot.toml", *arguments)
         processes.append(process)
         await_told(folder, *until)
         return process
@@ -114,12 +109,8 @@ def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, ca
 
 def second(folder, file="robot.toml", *arguments, **environment):
     """(exit code, errors) of a daemon that is started beside the first one."""
-    paths = os.pathsep.join(sys.path)
-    done = subprocess.run(
-        [*RUN, "run", str(folder / file), "--seconds", "0.1", *arguments],
-        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
-        env={**os.environ, "PYTHONPATH": paths, **environment},
-    )  # fmt: skip
+    environment = {**os.environ, **environment}
+    done = run_program("run", folder / file, "--seconds", "0.1", *arguments, env=environment)
     return done.returncode, done.stderr
 
 
@@ -143,12 +134,8 @@ def test_a_second_one_is_refused_whatever_its_environment(folder, started):
 
 def signalled(folder, at, number, seconds):
     """A process that is signalled while it starts."""
-    return subprocess.Popen(
-        [sys.executable, "-c", SIGNALLED, str(at), str(int(number)), "run",
-         str(folder / "robot.toml"), "--seconds", str(seconds)],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )  # fmt: skip
+    words = ("run", folder / "robot.toml", "--seconds", seconds)
+    return start_program(at, int(number), *words, program=SIGNALLED)
 
 
 def test_a_signal_at_any_moment_of_the_start_ends_it_in_order(folder):
@@ -197,11 +184,10 @@ def test_what_is_made_up_is_said_to_be(folder, monkeypatch, call):
     assert err.startswith("synthetic:mouse?seconds=0.1 is made up: what is decided on it means")
 
 
-def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, call):
+def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, done):
     url = "source.a.url=synthetic:2x2?seconds=1&pace=fast"
     samples = "publisher.jsonl.options.samples=true"
-    code, _, err = call("run", folder / "robot.toml", "--set", url, "--set", samples)
-    assert code == 0, err
+    done("run", folder / "robot.toml", "--set", url, "--set", samples)
     assert sum(len(m["seq"]) for m in messages_of(folder / "out.jsonl", "samples")) == 1000
     code, err = second(folder)
     assert code == 0 and "source.a stopped" in err
@@ -280,10 +266,9 @@ def test_what_hangs_at_the_end_is_left_behind(folder, started):
         (["config", "example", "gone/robot.toml"], "no folder gone to write"),
     ],
 )
-def test_a_users_mistake_is_one_line(folder, monkeypatch, call, arguments, message):
+def test_a_users_mistake_is_one_line(folder, monkeypatch, refused, arguments, message):
     monkeypatch.chdir(folder)
-    code, out, err = call(*arguments)
-    assert code == 2 and out == "" and message in err and err.count("\n") == 1
+    assert message in refused(*arguments)
 
 
 def test_config_commands(folder, monkeypatch, call):
@@ -307,11 +292,7 @@ def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
         "tactile_rt.daemon.publishers.jsonl, tactile_rt.recording.importing.bag\n"
         "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib', 'rosbags'} & {*sys.modules})"
     )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "set()\n"
+    assert run_program(program=code, check=True).stdout == "set()\n"
 
 
 @pytest.mark.parametrize("ends", [True, False])

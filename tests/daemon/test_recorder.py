@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.daemon.items import (
-    Closed,
-    Contact,
-    Control,
-    Decision,
-    Event,
-    Packet,
-    SourceChunk,
-)
+from tactile_rt.daemon.items import Closed, Contact, Control, Decision, Event, Packet, SourceChunk
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.opening import open_source

@@ -10,7 +10,6 @@ import sys
 import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.cli import main
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
@@ -65,29 +64,19 @@ def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path):
     assert "strictly" in done.stdout + done.stderr
 
 
-def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, monkeypatch, capsys):
+def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, done, refused):
     file, _ = configured(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["tactile-rt", "install-service", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            main()
-        return left.value.code or 0, *capsys.readouterr()
-
-    code, out, err = call(file, "--out", tmp_path / "to")
-    assert code == 0, err
+    out, _ = done("install-service", file, "--out", tmp_path / "to")
     assert "sudo sh" in out
     written = {p.name for p in (tmp_path / "to").iterdir()}
     assert written == {"tactile-rt.service", "99-tactile.rules", "install.sh"}
     assert f"{file}" in (tmp_path / "to" / "tactile-rt.service").read_text()
     assert "latency_timer" in (tmp_path / "to" / "99-tactile.rules").read_text()
-    code, _, err = call(file, "--out", tmp_path / "to")
-    assert code == 2 and "is there already" in err
-    code, _, err = call(file, "--out", tmp_path / "new", "--user", "a; rm -rf /")
-    assert code == 2 and "--user" in err and not (tmp_path / "new").exists()
+    assert "is there already" in refused("install-service", file, "--out", tmp_path / "to")
+    new = ("install-service", file, "--out", tmp_path / "new")
+    assert "--user" in refused(*new, "--user", "a; rm -rf /")
     file.write_text("version = 2\n")
-    code, _, err = call(file, "--out", tmp_path / "new")
-    assert code == 2 and "robot.toml:1" in err and not (tmp_path / "new").exists()
+    assert "robot.toml:1" in refused(*new) and not (tmp_path / "new").exists()
 
 
 # The script, as root, on a copy of the whole file system
@@ -135,10 +124,14 @@ def log(file):
     return f"[log]\nfile = {json.dumps(file)}\n"
 
 
-def prepared(config="", before="", after=""):
-    """Shell: the stubs, what `before` makes, the configuration, the service, what `after` makes."""
-    write = f"printf %s {shlex.quote(SMALL + config)} > {CONFIG}\n"
-    return f"{PREPARE}\n{before}\n{write}{WRITE} /root/service\n{after}"
+def prepared(config="", before=""):
+    """Shell: the stubs, what `before` makes, the configuration."""
+    return f"{PREPARE}\n{before}\nprintf %s {shlex.quote(SMALL + config)} > {CONFIG}\n"
+
+
+def written(config="", before="", after=""):
+    """Shell: the same, the service, what `after` makes."""
+    return f"{prepared(config, before)}{WRITE} /root/service\n{after}"
 
 
 def check_installed(changed):
@@ -157,7 +150,7 @@ def check_installed(changed):
 
 
 def test_installing_changes_accounts_unit_and_rules_and_nothing_else(on_a_copy):
-    changed = on_a_copy(prepared(), RUN)
+    changed = on_a_copy(written(), RUN)
     check_installed(changed)
     assert "\ntactile:" in changed.after["/etc/passwd"][3]
     assert f"{STUBS}/systemctl restart tactile-rt.service" in changed.said
@@ -165,13 +158,13 @@ def test_installing_changes_accounts_unit_and_rules_and_nothing_else(on_a_copy):
 
 def test_installing_again_changes_nothing(on_a_copy):
     keeps = recorder("/var/lib/tactile-rt/recordings")
-    changed = on_a_copy(prepared(keeps, after=RUN), RUN)
+    changed = on_a_copy(written(keeps, after=RUN), RUN)
     assert (changed.code, changed.after) == (0, {}), changed.said
 
 
 def test_a_folder_of_the_services_own_is_left_as_it_is(on_a_copy):
     before = f"{USER}install -d -m 0700 -o tactile /var/lib/tactile-rt"
-    check_installed(on_a_copy(prepared(recorder("/var/lib/tactile-rt/rec"), before), RUN))
+    check_installed(on_a_copy(written(recorder("/var/lib/tactile-rt/rec"), before), RUN))
 
 
 OTHERS = "useradd bob; mkdir -m 0750 /srv/bobs; chown bob: /srv/bobs\n"
@@ -206,8 +199,7 @@ REFUSED = [
 def test_a_folder_that_is_not_the_services_is_refused_before_anything_is_written(on_a_copy):
     """All in one copy: each is written, refused in one line, and nothing is left of it."""
     for config, before, said in REFUSED:
-        write = f"printf %s {shlex.quote(SMALL + config)} > {CONFIG}\n"
-        changed = on_a_copy(f"{PREPARE}\n{before}\n{write}", f"{WRITE} /root/service")
+        changed = on_a_copy(prepared(config, before), f"{WRITE} /root/service")
         assert changed.code == 2 and changed.said.count("\n") == 1, (config, changed.said)
         assert said in changed.said and changed.after == {}, (config, changed)
 
@@ -230,12 +222,12 @@ def test_a_folder_that_is_not_the_services_is_refused_before_anything_is_written
     ],
 )
 def test_what_has_changed_since_is_seen_before_anything_is_changed(on_a_copy, meanwhile, said):
-    changed = on_a_copy(prepared(recorder("/var/lib/tactile-rt/rec"), after=meanwhile), RUN)
+    changed = on_a_copy(written(recorder("/var/lib/tactile-rt/rec"), after=meanwhile), RUN)
     assert (changed.code, changed.after) == (1, {}), changed.said
     assert said in changed.said and "nothing has been changed\n" in changed.said
 
 
 def test_without_root_nothing_is_tried(on_a_copy):
     run = f"chmod 755 /root; exec setpriv --reuid 65534 --clear-groups sh -c {shlex.quote(RUN)}"
-    changed = on_a_copy(prepared(after="chmod 755 /root"), run)
+    changed = on_a_copy(written(after="chmod 755 /root"), run)
     assert changed.code == 1 and "run it as root" in changed.said and changed.after == {}

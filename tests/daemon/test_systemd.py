@@ -12,13 +12,12 @@ import pytest
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Source
-from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import Snapshot
-from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.process import _serve
 from tactile_rt.daemon.systemd import Systemd, hanging, status_of
 from tactile_rt.testing import small_spec
+from tests.helpers.daemons import load_checked, running_daemon
 from tests.helpers.published import View, busy_snapshot, event, running
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -58,9 +57,7 @@ def notifier(address, **environment):
 def test_it_tells_ready_reloading_and_stopping_once_each(manager):
     address, told = manager
     view = View(snapshot=Snapshot("0", 1, "x", 5, 5, 1, 0, "starting"))
-    with running(notifier(address), view) as view:
-        consumer = notifier(address)
-        consumer.open(view)
+    with running(consumer := notifier(address), view):
         consumer.handle([event(state="starting")])
         assert told() == ["STATUS=starting: 0 sources, 0 models, 0 publishers"]
         view.shown = Snapshot("0", 1, "x", 5, 5, 1, 0, "running")
@@ -78,17 +75,13 @@ def test_it_tells_ready_reloading_and_stopping_once_each(manager):
         assert [x.partition("=")[0] for x in told()] == ["RELOADING", "MONOTONIC_USEC", "READY"]
         consumer.handle([event(state="stopping")])
         assert told() == ["STOPPING=1"]
-        consumer.close()
 
 
 def test_a_daemon_that_starts_degraded_is_ready_and_says_what_it_lacks(manager):
     address, told = manager
-    with running(notifier(address), View(snapshot=busy_snapshot())) as view:
-        consumer = notifier(address)
-        consumer.open(view)
+    with running(consumer := notifier(address), View(snapshot=busy_snapshot())):
         consumer.handle([])
         lines = told()
-        consumer.close()
     assert lines[0] == "READY=1"
     assert lines[1] == "STATUS=degraded: no samples: source.finger: the device is lost"
 
@@ -157,17 +150,13 @@ def test_a_real_daemon_tells_a_manager_that_goes_and_comes(manager, tmp_path, mo
     address, told = manager
     monkeypatch.setenv("NOTIFY_SOCKET", address)
     monkeypatch.setenv("WATCHDOG_USEC", "1000000")
-    file = tmp_path / "robot.toml"
-    file.write_text(SMALL + f'[limits]\nstop_s = 60\n[log]\nfile = "{tmp_path}/log"\n')
-    loaded = load_config(file)
-    check_config(loaded)
-    daemon = Daemon(loaded)
-    daemon.start()
     lines = []
     # On a busy machine it is ready before its log keeps up, and says so.
     wanted = {"READY=1", "STATUS=running: 1 source, 0 models, 0 publishers"}
-    until(lambda: lines.extend(told()) or (wanted <= {*lines} and lines.count("WATCHDOG=1") > 1))
-    assert daemon.stop() == []
+    text = f'{SMALL}[limits]\nstop_s = 60\n[log]\nfile = "{tmp_path}/log"\n'
+    with running_daemon(load_checked(tmp_path, text)):
+        until(lambda: lines.extend(told()) or {*wanted, "WATCHDOG=1"} <= {*lines})
+        until(lambda: lines.extend(told()) or lines.count("WATCHDOG=1") > 1)
     lines += told()
     assert lines.index("READY=1") < lines.index("STOPPING=1")
 
@@ -193,11 +182,8 @@ def watched(tmp_path, monkeypatch):
     started = []
 
     def start(text):
-        file = tmp_path / "robot.toml"
-        file.write_text(f'version = 1\n[log]\nfile = "{tmp_path}/log"\n{text}')
-        loaded = load_config(file)
-        check_config(loaded)
-        started.append(Daemon(loaded))
+        text = f'version = 1\n[log]\nfile = "{tmp_path}/log"\n{text}'
+        started.append(Daemon(load_checked(tmp_path, text)))
         started[0].start()
         notifies = started[0]._consumers["systemd"][1].consumer
         until(lambda: notifies.details()["pings"] > 1)

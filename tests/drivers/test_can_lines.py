@@ -115,10 +115,8 @@ def test_names_need_a_dbc_file(tmp_path):
     (tmp_path / "log.asc").write_text(GOOD["names"])
     log = read_log(tmp_path / "log.asc")
     assert list(log.packets()) == []
-    assert log.notes == [
-        "identifiers are names here (Force), not read in 4 frames: "
-        "codec=can-dbc knows those of its DBC file"
-    ]
+    names = "identifiers are names here (Force), not read in 4 frames"
+    assert log.notes == [f"{names}: codec=can-dbc knows those of its DBC file"]
 
 
 EDITS = st.lists(

@@ -167,25 +167,24 @@ def test_a_passive_device_has_no_whisking_command():
             source.set_whisking(8.0, 0.6, 0.0)
 
 
-# what a user does wrong
-
-
-def test_a_port_that_is_not_there():
-    with pytest.raises(SourceError, match="/dev/ttyUSB77: no such port: is it plugged in"):
-        open_source("serial:///dev/ttyUSB77?codec=native")
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("serial:///dev/ttyUSB77?codec=native", "/dev/ttyUSB77: no such port: is it plugged in"),
+        ("serial://{}/notes.txt?codec=native", r"notes\.txt: not a serial port"),
+        ("can:socketcan:can77?codec=xela", "can:socketcan:can77: "),
+    ],
+)
+def test_a_line_that_is_not_there(url, said, tmp_path):
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(SourceError, match=said):
+        open_source(url.format(tmp_path))
 
 
 def test_a_port_in_use():
     with FakeSerial(signal(20_000)) as fake, open_source(fake.url):
         with pytest.raises(SourceError, match="in use by another program"):
             open_source(fake.url)
-
-
-def test_a_file_that_is_no_port(tmp_path):
-    path = tmp_path / "notes.txt"
-    path.write_text("hello")
-    with pytest.raises(SourceError, match=r"notes\.txt: not a serial port"):
-        open_source(f"serial://{path}?codec=native")
 
 
 @pytest.mark.parametrize(
@@ -242,17 +241,17 @@ def test_a_wrong_url_is_explained(url, said):
         open_source(url)
 
 
-def test_a_codec_without_time_has_no_device_clock():
-    with (
-        FakeSerial(np.zeros((100, 1, 6)), "bota") as fake,
-        pytest.raises(ConfigError, match="clock must be host or device, not 'none'"),
-    ):
-        open_source(fake.url + "&clock=none")
-    with (
-        FakeSerial(np.zeros((100, 1, 3)), "optoforce") as fake,
-        pytest.raises(ConfigError, match="codec optoforce sends no time: it needs clock=host"),
-    ):
-        open_source(fake.url + "&clock=device")
+@pytest.mark.parametrize(
+    ("codec", "clock", "said"),
+    [
+        ("bota", "none", "clock must be host or device, not 'none'"),
+        ("optoforce", "device", "codec optoforce sends no time: it needs clock=host"),
+    ],
+)
+def test_a_clock_that_a_device_has_not(codec, clock, said):
+    values = np.zeros((100, 1, 6 if codec == "bota" else 3))
+    with FakeSerial(values, codec) as fake, pytest.raises(ConfigError, match=said):
+        open_source(f"{fake.url}&clock={clock}")
 
 
 @pytest.mark.skipif(not os.path.isdir("/sys/class/net/vcan0"), reason="no kernel CAN (vcan0)")
@@ -261,8 +260,3 @@ def test_socketcan():
     with FakeCan(values, bus="socketcan:vcan0", pace="fast") as fake:
         with open_source(fake.url) as source:
             assert len(np.concatenate([c.seq for c in take(source, 100)])) >= 100
-
-
-def test_a_bus_that_is_not_there():
-    with pytest.raises(SourceError, match="can:socketcan:can77: "):
-        open_source("can:socketcan:can77?codec=xela")

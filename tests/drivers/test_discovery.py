@@ -53,27 +53,30 @@ def port_at(path, usb=(0x0403, 0x6014), serial_number="FT3X"):
     return Port(str(path), "", usb, serial_number, "", "")
 
 
+@pytest.fixture
+def port(tmp_path):
+    """An adapter that is plugged in."""
+    (tmp_path / "ttyUSB0").touch()
+    return port_at(tmp_path / "ttyUSB0")
+
+
 def quiet(command):
     return ""
 
 
-def test_a_port_that_may_not_be_opened_is_explained(tmp_path, monkeypatch):
-    path = tmp_path / "ttyUSB0"
-    path.touch()
+def test_a_port_that_may_not_be_opened_is_explained(port, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
-    (finding,) = diagnose([port_at(path)], [], tmp_path, quiet)
+    (finding,) = diagnose([port], [], tmp_path, quiet)
     assert not finding.good and "no permission" in finding.says
     assert finding.do.startswith("sudo usermod -aG ")
 
 
 @pytest.mark.parametrize(("ms", "good"), [(1, True), (16, False)])
-def test_a_slow_adapter_is_named(tmp_path, ms, good):
-    path = tmp_path / "ttyUSB0"
-    path.touch()
+def test_a_slow_adapter_is_named(port, tmp_path, ms, good):
     timer = tmp_path / "bus/usb-serial/devices/ttyUSB0/latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text(f"{ms}\n")
-    finding = diagnose([port_at(path)], [], tmp_path, quiet)[-1]
+    finding = diagnose([port], [], tmp_path, quiet)[-1]
     assert finding.good is good and f"{ms} ms" in finding.says
     assert good or str(timer) in finding.do
 
@@ -87,11 +90,8 @@ def test_a_slow_adapter_is_named(tmp_path, ms, good):
     ],
 )
 def test_a_bus_says_how_it_is(tmp_path, state, tx, good, do):
-    info = {
-        "state": state,
-        "bittiming": {"bitrate": 1_000_000},
-        "berr_counter": {"tx": tx, "rx": 0},
-    }
+    counted = {"bittiming": {"bitrate": 1_000_000}, "berr_counter": {"tx": tx, "rx": 0}}
+    info = {"state": state, **counted}
     said = json.dumps([{"linkinfo": {"info_data": info}}])
     (finding,) = diagnose([], [CanBus("can0", True, 0, "")], tmp_path, lambda _: said)
     assert finding.good is good and state in finding.says and do in finding.do
@@ -104,12 +104,10 @@ def test_a_bus_that_is_down_and_no_device_at_all(tmp_path):
     assert not nothing.good and "emulate" in nothing.do
 
 
-def test_a_modem_manager_is_noticed(tmp_path):
-    path = tmp_path / "ttyUSB0"
-    path.touch()
-    findings = diagnose([port_at(path)], [], tmp_path, lambda _: "active\n")
+def test_a_modem_manager_is_noticed(port, tmp_path):
+    findings = diagnose([port], [], tmp_path, lambda _: "active\n")
     assert findings[-1].what == "ModemManager" and not findings[-1].good
-    findings = diagnose([port_at(path)], [], tmp_path, lambda _: "inactive\n")
+    findings = diagnose([port], [], tmp_path, lambda _: "inactive\n")
     assert all(f.good for f in findings)
 
 

@@ -9,10 +9,11 @@ import pytest
 import serial
 import serial.rfc2217
 
+from tactile_rt.core.stream import concatenate
 from tactile_rt.drivers.health import State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import FakeSerial
-from tests.helpers.waiting import PATIENCE_S, until
+from tests.helpers.waiting import PATIENCE_S, read_chunks, until
 
 SAMPLES = 600
 
@@ -109,11 +110,6 @@ def test_a_port_on_another_host_is_read_bit_for_bit_and_known_to_be_gone(scheme,
     with FakeSerial(values) as fake, served(fake.port, protocol) as (port, hang_up):
         url = f"serial:{scheme}://127.0.0.1:{port}?codec=native&start_s={PATIENCE_S:g}"
         with open_source(url) as source:
-            got = []
-            while sum(map(len, got)) < SAMPLES:
-                chunk = source.read(PATIENCE_S)
-                assert chunk is not None, source.health
-                got.append(chunk)
-            assert np.array_equal(np.concatenate([c.values for c in got]), values)
+            assert np.array_equal(concatenate(read_chunks(source, SAMPLES)).values, values)
             hang_up()
             until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.05))

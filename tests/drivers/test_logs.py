@@ -28,6 +28,21 @@ def messages():
     )
 
 
+def frames_sent():
+    return [CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id) for m in messages()]
+
+
+@pytest.fixture
+def log_of(tmp_path):
+    """The log that a file of this text is."""
+
+    def read(text, name="can.log", **options):
+        (tmp_path / name).write_text(text)
+        return read_log(tmp_path / name, **options)
+
+    return read
+
+
 def written(path):
     with can.Logger(path) as log:
         for message in messages():
@@ -40,9 +55,7 @@ def test_what_python_can_wrote_is_read(tmp_path, suffix):
     log = read_log(written(tmp_path / f"run{suffix}"))
     assert (log.wire, log.form) == ("can", WRITERS[suffix])
     packets = list(log.packets())
-    assert [frame for packet, _ in packets for frame in packet] == [
-        CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id) for m in messages()
-    ]
+    assert [frame for packet, _ in packets for frame in packet] == frames_sent()
     gaps = [b - a for (_, a), (_, b) in itertools.pairwise(packets)]
     assert all(abs(gap - 10_000_000) < 300_000 for gap in gaps[: N - 1])
     assert abs(packets[0][1] - T0 * 1e9) < 1e6 and log.notes == []
@@ -85,13 +98,12 @@ def test_damage_never_raises(tmp_path, suffix):
                 pass
 
 
-def test_a_log_of_several_buses_is_of_the_one_that_is_named(tmp_path):
-    path = tmp_path / "two.log"
-    path.write_text("(1.0) can0 123#AA\n(1.1) can1 123#BB\n(1.2) can0 124#\n")
-    log = read_log(path, bus="can0")
+def test_a_log_of_several_buses_is_of_the_one_that_is_named(log_of):
+    text = "(1.0) can0 123#AA\n(1.1) can1 123#BB\n(1.2) can0 124#\n"
+    log = log_of(text, bus="can0")
     assert [f.data for packet, _ in log.packets() for f in packet] == [b"\xaa", b""]
     assert log.notes == ["frames of several buses: can0 (2), can1 (1); those of can0 are taken"]
-    assert list(read_log(path, bus="can7").packets()) == []
+    assert list(log_of(text, bus="can7").packets()) == []
 
 
 # One line of each, by hand: what tools print.
@@ -109,22 +121,19 @@ LINES = [
 
 
 @pytest.mark.parametrize(("line", "number", "data", "t_ns"), LINES)
-def test_a_line_of_a_can_log(tmp_path, line, number, data, t_ns):
-    path = tmp_path / "can.txt"
-    path.write_text(f"{line}\n" * 3)
-    ((frame,), at), *_ = read_log(path).packets()
+def test_a_line_of_a_can_log(log_of, line, number, data, t_ns):
+    ((frame,), at), *_ = log_of(f"{line}\n" * 3, "can.txt").packets()
     assert (frame.id, frame.data.hex(), at) == (number, data, t_ns)
     assert frame.extended == (number > 0x7FF) and frame.fd == ("##" in line)
 
 
-def test_what_savvycan_saved_is_read(tmp_path):
-    path = tmp_path / "run.csv"
-    path.write_text(
+def test_what_savvycan_saved_is_read(log_of):
+    log = log_of(
         "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
         "166064000,0000021A,false,Rx,0,3,FE,36,12,\n"
-        "166065500,00ABCDEF,true,Rx,1,1,0C,\n"
+        "166065500,00ABCDEF,true,Rx,1,1,0C,\n",
+        "run.csv",
     )
-    log = read_log(path)
     assert [(bytes(p[0].data), p[0].id, p[0].extended, t) for p, t in log.packets()] == [
         (b"\xfe\x36\x12", 0x21A, False, 166_064_000_000),
         (b"\x0c", 0xABCDEF, True, 166_065_500_000),
@@ -145,11 +154,8 @@ def test_a_table_of_python_can_s_is_read(tmp_path):
             table.execute("INSERT INTO messages VALUES(?, ?, ?, ?, ?, ?, ?)", row)
     table.close()
     log = read_log(path)
-    packets = list(log.packets())
     assert log.form == "db" and log.notes == []
-    assert [frame for packet, _ in packets for frame in packet] == [
-        CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id) for m in messages()
-    ]
+    assert [frame for packet, _ in log.packets() for frame in packet] == frames_sent()
     path.write_bytes(path.read_bytes()[:100] + bytes(4000))
     assert list(log.packets()) == [] and len(log.notes) == 1
 
@@ -159,10 +165,9 @@ def test_a_table_of_python_can_s_is_read(tmp_path):
     [("0 .5 .25 .75 .125 .5", "0 .5 .75 1.5 1.625 2.125"), ("0 .5 .5 .5", "0 .5 1 1.5"),
      ("0 .5 .75 1.5", "0 .5 .75 1.5"), ("7 .5 .25 .75", "7 7 7 7")],
 )  # fmt: skip
-def test_times_since_the_frame_before_are_added_up(tmp_path, apart, times):
-    path = tmp_path / "td.log"
-    path.write_text("".join(f" ({float(t):010.6f})  can0  123   [1]  AA\n" for t in apart.split()))
-    assert [t / 1e9 for _, t in read_log(path).packets()] == [float(t) for t in times.split()]
+def test_times_since_the_frame_before_are_added_up(log_of, apart, times):
+    lines = (f" ({float(t):010.6f})  can0  123   [1]  AA\n" for t in apart.split())
+    assert [t / 1e9 for _, t in log_of("".join(lines)).packets()] == [*map(float, times.split())]
 
 
 HEX = [
@@ -175,38 +180,29 @@ HEX = [
 
 
 @pytest.mark.parametrize(("line", "data", "t_ns"), HEX)
-def test_bytes_in_hexadecimal(tmp_path, line, data, t_ns):
-    path = tmp_path / "dump.txt"
-    path.write_text(f"{line}\r\n" * 4)
-    log = read_log(path)
+def test_bytes_in_hexadecimal(log_of, line, data, t_ns):
+    log = log_of(f"{line}\r\n" * 4, "dump.txt")
     assert log.wire == "serial" and log.form == "hex"
     assert [(packet.hex(), at) for packet, at in log.packets()] == [(data, t_ns)] * 4
 
 
 @pytest.mark.parametrize("text", ["12 34 56\n12 33 57\n" * 9, "1,2\n3,4\n", "", "\n\n", "hello\n"])
-def test_text_is_bytes_as_they_are(tmp_path, text):
-    path = tmp_path / "board.txt"
-    path.write_text(text)
-    log = read_log(path)
+def test_text_is_bytes_as_they_are(log_of, text):
+    log = log_of(text, "board.txt")
     assert log.form == "raw" and b"".join(p for p, _ in log.packets()) == text.encode()
 
 
-def test_times_never_go_back(tmp_path):
-    path = tmp_path / "back.log"
-    path.write_text("(2.0) can0 123#AA\n(1.0) can0 123#BB\n(3.0) can0 124#\n")
-    log = read_log(path)
+def test_times_never_go_back(log_of):
+    log = log_of("(2.0) can0 123#AA\n(1.0) can0 123#BB\n(3.0) can0 124#\n")
     assert [t for _, t in log.packets()] == [2_000_000_000, 2_000_000_000, 3_000_000_000]
-    assert log.notes == [
-        "1 times go back (frame 2 is the first); these packets have the time before"
-    ]
+    told = "1 times go back (frame 2 is the first); these packets have the time before"
+    assert log.notes == [told]
 
 
 @pytest.mark.parametrize("wrong", ["03:00:00", "15:00:00", "23:00:00"])
-def test_a_lone_wrong_time_of_day_is_no_midnight(tmp_path, wrong):
-    path = tmp_path / "day.txt"
+def test_a_lone_wrong_time_of_day_is_no_midnight(log_of, wrong):
     days = ("20:59:59", wrong, "21:00:00", "23:59:59", "00:00:01")
-    path.write_text("".join(f"{day}.000 -> 1,2\n" for day in days))
-    log = read_log(path)
+    log = log_of("".join(f"{day}.000 -> 1,2\n" for day in days), "day.txt")
     times = [75_599, 75_599, 75_600, 86_399, 86_401]
     assert [t // 10**9 for _, t in log.packets()] == times and "1 times go back" in log.notes[0]
 

@@ -63,9 +63,7 @@ def test_frames_are_written_as_the_manual_does() -> None:
 
 
 @given(frames_strategy, st.booleans(), st.lists(st.integers(0, 2000), max_size=5))
-def test_what_is_encoded_is_decoded_however_it_is_cut(
-    frames: list[CanFrame], stamped: bool, cuts: list[int]
-) -> None:
+def test_what_is_encoded_is_decoded_however_it_is_cut(frames, stamped, cuts):
     wire = encode(frames, 12_345 if stamped else None)
     decoder = SlcanDecoder()
     found = []

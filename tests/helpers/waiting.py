@@ -33,6 +33,16 @@ def until(
             meanwhile()
 
 
+def read_chunks(source: Any, samples: int) -> list[Any]:
+    """Read from a source until so many samples have come, and return their chunks."""
+    chunks: list[Any] = []
+    until(
+        lambda: sum(map(len, chunks)) >= samples,
+        meanwhile=lambda: chunks.extend(filter(None, [source.read(0.05)])),
+    )
+    return chunks
+
+
 def _words(condition: Callable[[], Any]) -> str:
     try:
         return textwrap.dedent(inspect.getsource(condition)).strip()

@@ -124,9 +124,8 @@ def touch(lerobot, monkeypatch, read_arguments):
     def make(*arguments):
         sensor = Plugged()
         monkeypatch.setattr(lerobot.tactile, "open_source", lambda url: sensor)
-        robot = lerobot.Tactile(
-            read_arguments("--robot.type=tactile", "--robot.sensors={finger: 'any:'}", *arguments)
-        )
+        sensors = ("--robot.type=tactile", "--robot.sensors={finger: 'any:'}")
+        robot = lerobot.Tactile(read_arguments(*sensors, *arguments))
         made.append(robot)
         sensor.give(1.0)
         robot.connect()
@@ -243,21 +242,16 @@ def test_by_choice_what_a_silent_sensor_measures_is_nan_until_it_comes_back(touc
     until(lambda: np.isnan(seen(robot, FX[0])))
     assert robot.is_connected
     assert seen(robot, "finger.valid") == 0.0 and seen(robot, "finger.age_ms") > 500
-    back = {FX[0]: 3.0, "finger.valid": 1.0}
-    until(
-        lambda: back.items() <= robot.get_observation().items(), meanwhile=lambda: sensor.give(3.0)
-    )
+    back = {(FX[0], 3.0), ("finger.valid", 1.0)}
+    until(lambda: back <= robot.get_observation().items(), meanwhile=lambda: sensor.give(3.0))
 
 
 def test_an_element_that_goes_away_is_nan_and_the_others_go_on(touch):
     robot, sensor = touch("--robot.on_stale=nan", "--robot.max_age_s=0.5")
 
     def gone():
-        found = robot.get_observation()
-        there = found[FX[0]] == found[FX[2]] == 4.0 and found["finger.valid"] == pytest.approx(
-            2 / 3
-        )
-        return there and np.isnan(found[FX[1]])
+        first, away, last, valid = map(robot.get_observation().get, (*FX, "finger.valid"))
+        return first == last == 4.0 and valid == pytest.approx(2 / 3) and np.isnan(away)
 
     until(gone, meanwhile=lambda: sensor.give(4.0, (True, False, True)))
 
@@ -288,8 +282,8 @@ def test_of_a_sensor_that_dies_the_recording_is_whole(touch, tmp_path):
 
 @pytest.mark.parametrize("stale", ["error", "nan"])
 def test_a_recording_that_fails_is_said_and_hides_no_touch(touch, tmp_path, caplog, stale):
-    robot, sensor = touch(f"--robot.record={tmp_path}", f"--robot.on_stale={stale}",
-                          "--robot.max_age_s=60")  # fmt: skip
+    words = (f"--robot.record={tmp_path}", f"--robot.on_stale={stale}")
+    robot, sensor = touch(*words, "--robot.max_age_s=60")
 
     def full(chunk):
         raise RecordingError("no space left")
@@ -342,10 +336,8 @@ def test_what_goes_on_with_nan_is_logged_once_each_way(touch, caplog):
 
 def test_a_device_that_is_pulled_out_is_no_touch(lerobot, read_arguments):
     with FakeSerial(np.ones((1, *SPEC.shape)), spec=SPEC) as device:
-        url = device.url
-        robot = lerobot.Tactile(
-            read_arguments("--robot.type=tactile", f"--robot.sensors={{finger: '{url}'}}")
-        )
+        sensor = f"--robot.sensors={{finger: '{device.url}'}}"
+        robot = lerobot.Tactile(read_arguments("--robot.type=tactile", sensor))
         robot.connect()
         try:
             device.unplug()

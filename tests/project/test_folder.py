@@ -150,11 +150,9 @@ def test_what_cannot_begin_is_one_line(refused, tmp_path: Path) -> None:
     assert "no category 'mugg'" in refused("new", tmp_path / "a", "--classes", "mugg,gear")
     assert "two or more" in refused("new", tmp_path / "a", "--classes", "mug")
     assert "no simulated array" in refused("new", tmp_path / "a", "--array", "hamster")
-    said = refused("new", tmp_path / "a", "--array", "hx711_whiskers")
-    assert "did you mean hx711_whisker?" in said
-    assert "is a .toml file" in refused(
-        "new", tmp_path / "a", "--array", MAGNETS.parent / "robot.csv"
-    )
+    new = ("new", tmp_path / "a", "--array")
+    assert "did you mean hx711_whisker?" in refused(*new, "hx711_whiskers")
+    assert "is a .toml file" in refused(*new, MAGNETS.parent / "robot.csv")
     assert not (tmp_path / "a").exists(), "nothing is half-written"
     assert "begin with `tactile-rt new" in refused("make", tmp_path / "a")
     assert "is no project, it has no array.toml" in refused("make", tmp_path / "full")

@@ -26,15 +26,14 @@ from tactile_rt.project.folder import KINDS, Project
 from tactile_rt.project.making import make
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_skipped
+from tests.helpers.processes import run_program, start_program
 from tests.helpers.source_tree import ROOT
 
 PAGE = ROOT / "docs" / "how-to" / "your-array.md"
-CLI = [
-    sys.executable,
-    "-c",
+PROGRAM = (
     "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main\n"
-    "if __name__ == '__main__': main()",
-]
+    "if __name__ == '__main__': main()"
+)
 
 
 def blocks(language: str) -> list[str]:
@@ -63,13 +62,9 @@ def folder(tmp_path_factory) -> Path:
     return here
 
 
-def called(here: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*CLI, *words], cwd=here, capture_output=True, text=True, timeout=600)
-
-
 def done(here: Path, words: list[str]) -> str:
     """What a command prints, once it has left with 0."""
-    run = called(here, words)
+    run = run_program(*words, program=PROGRAM, cwd=here, timeout=600)
     assert run.returncode == 0, run.stderr
     return run.stdout
 
@@ -125,12 +120,11 @@ def test_the_wire_decides_as_the_simulation(folder: Path) -> None:
 
 
 def test_the_robot_decides_what_the_device_touches(folder: Path) -> None:
-    emulate, run = ([*CLI, *commands()[name]] for name in ("emulate", "run"))
+    options = {"program": PROGRAM, "cwd": folder, "stderr": None}
     with (
-        subprocess.Popen(emulate, cwd=folder, stdout=subprocess.DEVNULL) as device,
-        subprocess.Popen(run, cwd=folder, stdout=subprocess.PIPE, text=True) as robot,
+        start_program(*commands()["emulate"], stdout=subprocess.DEVNULL, **options) as device,
+        start_program(*commands()["run"], **options) as robot,
     ):
-        assert robot.stdout is not None
         try:
             labels = (json.loads(line).get("label") for line in robot.stdout)
             assert next(label for label in labels if label) in KINDS
@@ -154,7 +148,7 @@ def test_an_array_that_changes_after_that_is_told(folder: Path) -> None:
         with pytest.raises(ConfigError, match="has been changed since"):
             make(project, 10)
         words = ["1" if word == "4" else word for word in commands()["hil"]]
-        told = called(folder, words).stderr
+        told = run_program(*words, program=PROGRAM, cwd=folder, timeout=600).stderr
         assert "array.toml or sweeps.toml of" in told and "the model is the one made before" in told
     finally:
         project.array.write_text(text)

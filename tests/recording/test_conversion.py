@@ -44,9 +44,6 @@ def path(tmp_path):
     return write(tmp_path / "run.mcap", odd_chunks())
 
 
-# as others read it
-
-
 def read_back(path):
     """Samples and messages of an .npz or .h5, in the types that are documented."""
     if path.suffix == ".npz":
@@ -93,25 +90,19 @@ def test_text_gives_back_every_valid_number(path, tmp_path):
     whole = concatenate(odd_chunks())
     with (tmp_path / "x.csv").open(encoding="utf-8", newline="") as file:
         head, *rows = csv.reader(file)
-    assert head == [
-        "seq", "t_ns", "A0.fy [N]", "A0.mz [N m]", "A1.fy [N]", "A1.mz [N m]", "A2.fy [N]",
-        "A2.mz [N m]",
-    ]  # fmt: skip
-    assert [(int(row[0]), int(row[1])) for row in rows] == [
-        *zip(whole.seq, whole.t_ns, strict=True)
-    ]
+    loads = [f"A{k}.{load}" for k in range(3) for load in ("fy [N]", "mz [N m]")]
+    assert head == ["seq", "t_ns", *loads]
+    assert np.array([row[:2] for row in rows], np.int64).T.tolist() == [[*whole.seq], [*whole.t_ns]]
     cells = np.array([row[2:] for row in rows]).reshape(whole.values.shape)
     assert np.array_equal((cells != "").all(axis=2), whole.valid)
     found = cells[whole.valid].astype(np.float32)
     assert np.array_equal(found, whole.values[whole.valid], equal_nan=True)
 
 
-def test_the_example_reads_hdf5(path, tmp_path, monkeypatch):
-    convert(path, tmp_path / "run.h5")
-    monkeypatch.chdir(tmp_path)
-    (text,) = re.findall(
-        r"```python\n(import h5py.*?)```", (DOCS / "reference" / "recording.md").read_text(), re.S
-    )
+def test_the_example_reads_hdf5(path, cwd):
+    convert(path, cwd / "run.h5")
+    page = (DOCS / "reference" / "recording.md").read_text()
+    (text,) = re.findall(r"```python\n(import h5py.*?)```", page, re.S)
     assert len([line for line in text.splitlines() if line]) == 6
     found = {}
     exec(text, found)
@@ -124,9 +115,6 @@ def test_the_example_reads_hdf5(path, tmp_path, monkeypatch):
     assert found["decisions"][2]["p"] == 0.2
 
 
-# damage and mistakes
-
-
 @pytest.mark.parametrize("form", FORMS)
 def test_a_recording_without_samples_is_refused(form, tmp_path):
     path = write(tmp_path / "run.mcap", [])
@@ -137,9 +125,8 @@ def test_a_recording_without_samples_is_refused(form, tmp_path):
 
 def test_without_the_extra_it_says_what_to_install(path, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(
-        ConfigError, match=f"HDF5 needs h5py, .*: {re.escape(install_extra('hdf5'))}"
-    ):
+    said = f"HDF5 needs h5py, .*: {re.escape(install_extra('hdf5'))}"
+    with pytest.raises(ConfigError, match=said):
         convert(path, tmp_path / "x.h5")
     assert convert(path, tmp_path / "x.npz")
 

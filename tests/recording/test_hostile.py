@@ -24,8 +24,7 @@ def test_a_hostile_recording_is_refused(name, tmp_path):
     "command",
     [("convert", "hostile.mcap", "out.npz"), ("label", "hostile.mcap", "set", "--by-name")],
 )
-def test_every_command_that_reads_recordings_refuses_it(command, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "hostile.mcap").write_bytes(MCAPS["zstd of 1 GiB"]())
+def test_every_command_that_reads_recordings_refuses_it(command, cwd):
+    (cwd / "hostile.mcap").write_bytes(MCAPS["zstd of 1 GiB"]())
     measured(*command).assert_refused("hostile.mcap")
-    assert [p.name for p in tmp_path.iterdir()] == ["hostile.mcap"]
+    assert [p.name for p in cwd.iterdir()] == ["hostile.mcap"]

@@ -11,15 +11,9 @@ import pytest
 from tactile_rt.classifier.model_file import METADATA_KEY, shipped_model
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
-from tactile_rt.recording import Recording
+from tactile_rt.recording import Recording, labelling
 from tactile_rt.recording.labelled_set import write_set
-from tactile_rt.recording.labelling import (
-    find_labelled,
-    intervals_beside,
-    intervals_by_name,
-    intervals_of_all,
-    like,
-)
+from tactile_rt.recording.labelling import find_labelled, intervals_beside, intervals_of_all, like
 from tactile_rt.recording.labels import LabelledInterval
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_object, read_sweeps
@@ -111,7 +105,8 @@ def test_a_set_is_there_whole_or_not_at_all(night, tmp_path):
 def test_three_recordings_of_a_label_are_its_objects(tmp_path):
     files = [record_touches(tmp_path / f"mug-{k}.mcap", ["mug"] * 2, seed=k) for k in range(3)]
     files.append(record_touches(tmp_path / "cup.mcap", ["cup"] * 4, seed=9))
-    manifest = write_set(tmp_path / "set", found := find_labelled(files, intervals_by_name(files)))
+    found = find_labelled(files, labelling.intervals_by_name(files))
+    manifest = write_set(tmp_path / "set", found)
     kinds = [name.split("@")[0] for name in manifest.names()]
     assert (kinds.count("mug"), kinds.count("cup")) == (3, 4)
     for split in ("train", "validation", "test"):

@@ -64,8 +64,7 @@ def table(folder, episode=0):
 
 
 def column(folder, name, episode=0):
-    found = np.array(table(folder, episode).column(f"observation.{name}").to_pylist())
-    return found
+    return np.array(table(folder, episode).column(f"observation.{name}").to_pylist())
 
 
 @pytest.fixture
@@ -131,14 +130,11 @@ def test_what_lerobot_reads_first_is_there_and_agrees(recording, tmp_path):
     assert [e["dataset_to_index"] for e in episodes] == [rows[0], sum(rows)]
     assert [e["tasks"] for e in episodes] == [["small"], ["stroke it"]]
     for k, e in enumerate(episodes):
-        path = info["data_path"].format(
-            chunk_index=e["data/chunk_index"], file_index=e["data/file_index"]
-        )
-        found = pq.read_table(folder / path)
+        at = {name: e[f"data/{name}"] for name in ("chunk_index", "file_index")}
+        found = pq.read_table(folder / info["data_path"].format(**at))
         assert set(found.column("episode_index").to_pylist()) == {k}
-        assert found.column("index").to_pylist() == list(
-            range(e["dataset_from_index"], e["dataset_to_index"])
-        )
+        rows_of = range(e["dataset_from_index"], e["dataset_to_index"])
+        assert found.column("index").to_pylist() == list(rows_of)
         assert set(found.column("task_index").to_pylist()) == {k}
     for name, feature in info["features"].items():
         shape = feature["shape"] if feature["shape"] != [1] else []
@@ -215,9 +211,6 @@ def test_what_cannot_be_a_dataset_is_named(recording, tmp_path):
         write_dataset([write(tmp_path / "e.mcap", [])], tmp_path / "set")
 
 
-# films
-
-
 def film(path, frames, fps=30):
     """Frame k is as bright as 2 k."""
     av = pytest.importorskip("av")
@@ -257,9 +250,8 @@ def test_each_row_shows_the_newest_frame_that_there_was(fps, at, expected, recor
     assert info["features"][key]["shape"] == [32, 48, 3] and "video_key" in info["video_path"]
     stats = json.loads((tmp_path / "set/meta/stats.json").read_text())[key]
     assert np.array(stats["mean"]).shape == (3, 1, 1) and 0 < stats["mean"][0][0][0] < 1
-    (episode,) = pq.read_table(
-        tmp_path / "set/meta/episodes/chunk-000/file-000.parquet"
-    ).to_pylist()
+    episodes = pq.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet")
+    (episode,) = episodes.to_pylist()
     assert episode[f"videos/{key}/to_timestamp"] == rows / 30
 
 

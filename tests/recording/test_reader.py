@@ -5,6 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
@@ -32,25 +33,19 @@ def test_a_description_comes_back(path):
     assert abs(about.utc_offset_ns - before) < 1e9
 
 
-def foreign(path):
-    from mcap.writer import Writer
-
+def foreign(path, **metadata):
     with path.open("wb") as file:
         other = Writer(file)
         other.start()
+        for name, fields in metadata.items():
+            other.add_metadata(name, fields)
         channel = other.register_channel("x", "json", 0)
         other.add_message(channel, 1, b"{}", 1)
         other.finish()
 
 
 def older(path):
-    from mcap.writer import Writer
-
-    with path.open("wb") as file:
-        other = Writer(file)
-        other.start()
-        other.add_metadata("tactile_rt", {"version": "2"})
-        other.finish()
+    foreign(path, tactile_rt={"version": "2"})
 
 
 @pytest.mark.parametrize(

@@ -275,11 +275,10 @@ def test_a_loop_of_nothing_ends(path):
         assert list(source) == []
 
 
-def test_the_recording_that_ships_has_a_name_and_a_file_of_that_name_a_path(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "demo", cut(noise(7), SPEC.rate_hz))
+def test_the_recording_that_ships_has_a_name_and_a_file_of_that_name_a_path(cwd):
+    write(cwd / "demo", cut(noise(7), SPEC.rate_hz))
     for url, samples in (("demo", sum(map(len, Recording(DEMO)))), ("./demo", 7)):
         with open_source(f"replay:{url}?speed=0") as source:
             assert sum(map(len, source)) == samples
     with pytest.raises(ConfigError, match="no file"):
-        open_source(f"replay:{tmp_path}/none/demo")
+        open_source(f"replay:{cwd}/none/demo")

@@ -13,13 +13,7 @@ from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.conversion import write_bag
 from tactile_rt.recording.replay import DEMO
 from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
-from tests.helpers.recordings import (
-    SPEC,
-    all_parts,
-    noise,
-    record_device,
-    write_as_daemon,
-)
+from tests.helpers.recordings import SPEC, all_parts, noise, record_device, write_as_daemon
 
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap_ros2")

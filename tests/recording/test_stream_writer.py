@@ -2,8 +2,6 @@
 
 import errno
 import os
-import subprocess
-import sys
 import threading
 import time
 
@@ -14,13 +12,8 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut
-from tests.helpers.recordings import (
-    SPEC,
-    all_parts,
-    noise,
-    parts,
-    record_device,
-)
+from tests.helpers.processes import start_program
+from tests.helpers.recordings import SPEC, all_parts, noise, parts, record_device
 from tests.helpers.waiting import PATIENCE_S, until
 
 
@@ -110,9 +103,8 @@ def test_what_a_slow_disk_has_no_room_for_is_counted_and_told(path, disk, no_thr
     assert sum(map(len, back)) == stats.samples
     assert stats.samples + stats.dropped_samples == 3000
     assert parts(back[-1]) == parts(chunks[-1])  # the oldest went
-    assert (
-        list(Recording(path).health())[-1]["recorder"]["dropped_samples"] == stats.dropped_samples
-    )
+    told = list(Recording(path).health())[-1]["recorder"]
+    assert told["dropped_samples"] == stats.dropped_samples
     kept = {parts(c) for c in chunks}
     assert all(parts(c) in kept for c in back)
 
@@ -221,9 +213,7 @@ with open_source("synthetic:4x6") as source, StreamWriter(sys.argv[1], source) a
 
 @pytest.mark.parametrize("seconds", np.random.default_rng(5).uniform(0, 1.6, 4).round(3))
 def test_of_a_killed_recorder_all_but_the_last_second_is_recovered(seconds, path):
-    with subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, str(path)], stdout=subprocess.PIPE, text=True
-    ) as process:
+    with start_program(path, program=PROGRAM, stderr=None) as process:
         process.stdout.readline()
         time.sleep(seconds)
         process.kill()

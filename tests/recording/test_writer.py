@@ -1,8 +1,6 @@
 """A file of a recording: its name, and what a kill leaves of it at every step."""
 
 import os
-import subprocess
-import sys
 
 import pytest
 
@@ -11,6 +9,7 @@ from tactile_rt.recording import writer as module
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.writer import RecordingWriter
 from tactile_rt.testing import ArraySource
+from tests.helpers.processes import run_program
 from tests.helpers.recordings import SPEC
 
 # Begins a file, killed at each line of the writer in turn.
@@ -69,9 +68,7 @@ for step in itertools.count(1):
 
 @pytest.mark.parametrize(("how", "before"), [("new", "nothing"), ("force", "the old one")])
 def test_killed_at_any_step_it_leaves_no_file_that_cannot_be_recovered(how, before, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path), how], capture_output=True, text=True
-    )
+    done = run_program(tmp_path, how, program=PROGRAM, timeout=None)
     assert done.returncode == 0, done.stderr
     found = [line.split(",")[1:] for line in done.stdout.splitlines()]
     assert found[-1] == ["0", "Ada"]

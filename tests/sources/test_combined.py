@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import concatenate
 from tactile_rt.sources.combined import CombinedSource, MemberArray, combine_specs
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, cut, small_spec
 
+HEAD = 'name = "a"\nrate_hz = 1\n'
+ONE = HEAD + '[[source]]\nname = "x"\nurl = "{}"'
 LEFT, RIGHT = small_spec(3), small_spec(2, rate_hz=500.0)
 PARTS = [
     MemberArray("left", ""),
@@ -26,9 +29,8 @@ def wave(spec, seconds, lag_s=0.0):
 def combined(lag_ns=0, right_seconds=2.0):
     right = cut(wave(RIGHT, right_seconds, lag_ns / 1e9), 500.0, start_ns=10_000_000_000 + lag_ns)
     left = cut(wave(LEFT, 2.0), 1000.0, start_ns=10_000_000_000)
-    return CombinedSource(
-        [ArraySource(LEFT, left), ArraySource(RIGHT, right)], PARTS, "head", 250.0
-    )
+    members = [ArraySource(LEFT, left), ArraySource(RIGHT, right)]
+    return CombinedSource(members, PARTS, "head", 250.0)
 
 
 def test_the_spec_holds_both_arrays_in_one_frame():
@@ -44,9 +46,8 @@ def test_the_spec_holds_both_arrays_in_one_frame():
 def test_samples_of_one_moment_come_together(lag_ns):
     with combined(lag_ns) as source:
         chunks = list(source)
-    t = np.concatenate([c.t_ns for c in chunks])
-    values = np.concatenate([c.values for c in chunks])
-    valid = np.concatenate([c.valid for c in chunks])
+    whole = concatenate(chunks)
+    t, values, valid = whole.t_ns, whole.values, whole.valid
     assert (np.diff(t) == 4_000_000).all() and (t % 4_000_000 == 0).all()
     both = valid.all(axis=1)
     assert both.sum() > 400
@@ -58,11 +59,9 @@ def test_samples_of_one_moment_come_together(lag_ns):
 
 def test_an_array_that_ends_is_left_out():
     with combined(right_seconds=1.0) as source:
-        chunks = list(source)
-    valid = np.concatenate([c.valid for c in chunks])
-    assert valid[-200:, :3].all() and not valid[-200:, 3:].any()
-    values = np.concatenate([c.values for c in chunks])
-    assert (values[-200:, 3:] == 0).all()
+        whole = concatenate(list(source))
+    assert whole.valid[-200:, :3].all() and not whole.valid[-200:, 3:].any()
+    assert (whole.values[-200:, 3:] == 0).all()
 
 
 def test_arrays_that_measure_different_things_are_refused():
@@ -89,26 +88,19 @@ def test_a_file_combines_urls(tmp_path):
     ("text", "said"),
     [
         ("", "needs a key 'name'"),
-        ('name = "a"\nrate_hz = 1\nsource = []', "no \\[\\[source\\]\\]"),
+        (HEAD + "source = []", "no \\[\\[source\\]\\]"),
         (
-            'name = "a"\nrate_hz = 1\nsource = [{name="x", url="y", pose=1}]',
+            HEAD + 'source = [{name="x", url="y", pose=1}]',
             r":3: source\[0\] has no key 'pose'; there are name, url, pos",
         ),
         ("name = ", ":1: not TOML: Invalid value"),
         ('name = "a"\nrate_hz = 0', ":2: rate_hz: expected a number > 0"),
-        (
-            'name = "a"\nrate_hz = 1\n[[source]]\nname = "x"\nurl = "synthetic:5"',
-            r":5: source\[0\]\.url: synthetic:5 is not a size",
-        ),
-        (
-            'name = "a"\nrate_hz = 1\n[[source]]\nname = "x"\nurl = "combined:head.toml"',
-            r":5: source\[0\]\.url: head\.toml combines itself",
-        ),
+        (ONE.format("synthetic:5"), r":5: source\[0\]\.url: synthetic:5 is not a size"),
+        (ONE.format("combined:head.toml"), r":5: source\[0\]\.url: head\.toml combines itself"),
     ],
 )
-def test_a_wrong_file_is_named(tmp_path, monkeypatch, text, said):
-    monkeypatch.chdir(tmp_path)
-    path = tmp_path / "head.toml"
+def test_a_wrong_file_is_named(cwd, text, said):
+    path = cwd / "head.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=said) as caught:
         open_source(f"combined:{path}")

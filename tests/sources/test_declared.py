@@ -8,7 +8,7 @@ import pytest
 
 from tactile_rt.calibration import Calibration, save_calibration
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
-from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
+from tactile_rt.core.stream import ArraySpec, concatenate
 from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.codecs.native_common import MessageType
 from tactile_rt.drivers.device_source import device_of
@@ -17,7 +17,7 @@ from tactile_rt.recording.checking import compare_decoding
 from tactile_rt.sources.opening import check_model, check_source, open_source
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import record_device
-from tests.helpers.waiting import PATIENCE_S, until
+from tests.helpers.waiting import PATIENCE_S, read_chunks
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -40,26 +40,12 @@ def write(path: Path, array: ArraySpec) -> Path:
     return path
 
 
-def read(source, n: int = N) -> Chunk:
-    chunks: list[Chunk] = []
-
-    def more() -> None:
-        chunk = source.read(0.05)
-        if chunk is not None:
-            chunks.append(chunk)
-
-    until(lambda: sum(map(len, chunks)) >= n, meanwhile=more)
-    return concatenate(chunks)
-
-
 def signal(elements: int, channels: int, size: float) -> np.ndarray:
     return np.random.default_rng(5).normal(size=(N, elements, channels)) * size
 
 
 DEVICES = {
-    "bota": (
-        FakeSerial, {"temperature": "true"}, array_of(1, "fx mz", "N,N m"), [0, 5], 1.0, 1e-6,
-    ),
+    "bota": (FakeSerial, {"temperature": "true"}, array_of(1, "fx mz", "N,N m"), [0, 5], 1.0, 1e-6),
     "anyskin": (FakeSerial, {}, array_of(5, "bx by bz", "T,T,T"), [0, 1, 2], 1e-4, 1e-9),
     "hx711_whisker": (
         FakeSerial, {"whiskers": "8", "reset": "false"}, array_of(8, "bridge1 bridge0", "V,V"),
@@ -90,7 +76,7 @@ def test_a_device_is_the_array_that_it_is_said_to_be(codec: str, tmp_path: Path)
         with open_source(url) as source:
             assert source.spec == known == replace(array, rate_hz=own.rate_hz)
             assert device_of(source).spec == own
-            got = read(source, N - 5)
+            got = concatenate(read_chunks(source, N - 5))
             assert source.stats.corrupt == source.stats.missing == 0
     expected = values[: len(got), :, picked]
     np.testing.assert_allclose(got.values, expected, rtol=1e-6, atol=resolution)
@@ -100,9 +86,8 @@ def test_a_device_is_the_array_that_it_is_said_to_be(codec: str, tmp_path: Path)
 def test_it_is_recorded_as_that_array_and_decoded_again_as_that(tmp_path: Path) -> None:
     array, path = array_of(1, "fz fx", "N,N"), tmp_path / "run.mcap"
     file = write(tmp_path / "robot.json", array)
-    chunks, _ = record_device(
-        FakeSerial(signal(1, 6, 1.0), "bota"), path, N, suffix=f"&array={file}"
-    )
+    fake = FakeSerial(signal(1, 6, 1.0), "bota")
+    chunks, _ = record_device(fake, path, N, suffix=f"&array={file}")
     file.unlink()  # the recording tells by itself
     expected = concatenate(chunks)
     assert Recording(path).spec == replace(array, rate_hz=100.0)
@@ -137,9 +122,8 @@ def test_a_native_device_that_says_nothing_is_told(tmp_path: Path, monkeypatch) 
     with FakeSerial(values, spec=small_spec()) as fake:
         with pytest.raises(SourceError, match="no answer to its description"):
             open_source(fake.url)
-    chunks, _ = record_device(
-        FakeSerial(values, spec=small_spec()), path, N, suffix=f"&array={file}"
-    )
+    fake = FakeSerial(values, spec=small_spec())
+    chunks, _ = record_device(fake, path, N, suffix=f"&array={file}")
     assert np.array_equal(concatenate(chunks).values, values.astype(np.float32))
     file.unlink()
     about = Recording(path).description
@@ -165,7 +149,7 @@ def test_counts_are_calibrated_first_then_declared(tmp_path: Path) -> None:
         url = f"{fake.url}&start_s={PATIENCE_S:g}&calibration={toml}&array={file}"
         assert check_source(url) == replace(array, rate_hz=taxels.rate_hz)
         with open_source(url) as source:
-            got = read(source, N - 5)
+            got = concatenate(read_chunks(source, N - 5))
     expected = (counts * gain)[: len(got), :, [2, 0]]
     np.testing.assert_allclose(got.values, expected, rtol=1e-6)
     with pytest.raises(SpecMismatch, match=r"has fz \(N\), fx \(N\), uSPa44 gives x \(1\)"):
@@ -215,9 +199,6 @@ def test_several_arrays_are_one_that_has_a_name(tmp_path: Path) -> None:
         check_source(f"combined:{head}")
 
 
-# Models
-
-
 def test_a_model_s_file_says_what_array_it_is(tmp_path: Path) -> None:
     """Trained on a description, streamed by a codec: the shortest way from one to the other."""
     pytest.importorskip("onnx")
@@ -244,7 +225,7 @@ def test_it_is_one_source_with_all_that_the_device_has(tmp_path: Path) -> None:
     file = write(tmp_path / "robot.json", array_of(1, "fx", "N"))
     with FakeSerial(signal(1, 6, 1.0), "bota") as fake:
         with open_source(f"{fake.url}&start_s={PATIENCE_S:g}&array={file}") as source:
-            assert read(source, 10).values.shape[1:] == (1, 1)
+            assert concatenate(read_chunks(source, 10)).values.shape[1:] == (1, 1)
             assert source.stats.delivered >= 10 and source.health.connections == 1
     chunks = cut(np.zeros((3, 1, 6)), 1.0)
     assert device_of(ArraySource(check_source("serial:x?codec=bota"), chunks)) is None

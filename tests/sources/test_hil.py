@@ -53,9 +53,7 @@ def test_a_codec_with_names_of_its_own_carries_any_array_that_fits(model: Path) 
     assert report.direct == report.wire == report.same_label == 8
 
 
-def test_a_device_that_sends_no_time_is_compared_as_if_samples_were_a_period_apart(
-    model: Path,
-) -> None:
+def test_a_device_that_sends_no_time_is_compared_as_if_samples_were_a_period_apart(model):
     columns = ",".join(f"W{e}.{c}" for e in range(3) for c in ("fy:N", "mz:N m"))
     report = Loop(touches(), model, codec="ascii_line", options={"columns": columns}).run()
     assert report.failure == "" and report.identical_samples == 3000
@@ -74,9 +72,7 @@ def test_what_a_format_rounds_is_not_bit_equal_and_need_not_be(model: Path) -> N
 
 
 @pytest.mark.parametrize("by", [None, 1e-3])
-def test_a_driver_that_alters_one_value_is_found_out(
-    model: Path, monkeypatch: pytest.MonkeyPatch, by: float | None
-) -> None:
+def test_a_driver_that_alters_one_value_is_found_out(model, monkeypatch, by):
     """In one sample of a touch: by one unit in the last place, or so that decisions differ."""
     honest, seen = NativeSerial.feed, []
 
@@ -133,9 +129,6 @@ def test_a_model_of_another_array_is_refused(model: Path) -> None:
     other = ArraySource(small_spec(4), [])
     with pytest.raises(SpecMismatch):
         Loop(other, model)
-
-
-# ---- the verdict
 
 
 def decision(onset: int, step: int, label: str = "a", final: bool = False) -> Classification:

@@ -15,20 +15,18 @@ URLS = [url for url in dict.fromkeys(URL.findall(PAGE)) if not re.search("ARRAY|
 
 
 def test_every_scheme_has_an_example() -> None:
-    assert re.findall(r"^\| `(\w+)` \|[^|]+\| `\1:", PAGE, re.M) == list(
-        dict.fromkeys(url.partition(":")[0] for url in URLS)
-    )
-    assert {url.partition(":")[0] for url in URLS} == set(SCHEMES)
+    named = [*dict.fromkeys(url.partition(":")[0] for url in URLS)]
+    assert re.findall(r"^\| `(\w+)` \|[^|]+\| `\1:", PAGE, re.M) == named
+    assert set(named) == set(SCHEMES)
 
 
 @pytest.mark.parametrize("url", URLS)
-def test_the_examples_are_sources(url: str, tmp_path, monkeypatch) -> None:
+def test_the_examples_are_sources(url: str, cwd) -> None:
     if url.startswith(("sim:", "whisking:")):
         pytest.importorskip("mujoco")
         pytest.importorskip("trimesh")
-    monkeypatch.chdir(tmp_path)
     shutil.copy(DEMO, "touches.mcap")
-    (tmp_path / "head.toml").write_text(
+    (cwd / "head.toml").write_text(
         'name = "head"\nrate_hz = 1000\n[[source]]\nname = "left"\nurl = "synthetic:"\n'
     )
     check_source(url)

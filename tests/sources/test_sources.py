@@ -42,9 +42,6 @@ def glove(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metadata, "entry_points", lambda **params: points.select(**params))
 
 
-# Third parties
-
-
 @pytest.mark.usefixtures("glove")
 def test_another_package_s_source_is_opened_with_its_own_options() -> None:
     source = open_source("glove:/dev/ttyUSB0?gain=2.5&channels=6&raw=true")
@@ -94,9 +91,6 @@ def test_a_wrong_option_is_named_with_what_would_be_right(url: str, said: str) -
 def test_third_parties_are_among_the_known_schemes() -> None:
     assert refusal(open_source, "glvoe:left") == "'glvoe:left' is no source; did you mean glove:?"
     assert "glove:" in refusal(open_source, "xyz:left")
-
-
-# Ours
 
 
 @pytest.mark.parametrize("url", ["", "mouse", "xyz:mouse", "/dev/ttyUSB0", "?seed=1"])

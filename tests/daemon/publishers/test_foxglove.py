@@ -47,12 +47,9 @@ class Client:
 
     def __init__(self, publisher, topics=None):
         self._stack = contextlib.ExitStack()
-        url = publisher.details()["url"]
-        self.line = self._stack.enter_context(
-            connect(
-                url, subprotocols=[PROTOCOL], max_size=None, compression=None, close_timeout=0.2
-            )
-        )
+        options = {"max_size": None, "compression": None, "close_timeout": 0.2}
+        line = connect(publisher.details()["url"], subprotocols=[PROTOCOL], **options)
+        self.line = self._stack.enter_context(line)
         assert self.line.subprotocol == PROTOCOL
         self._publisher, self.channels, self.topics = publisher, {}, topics
         self._got = []
@@ -67,9 +64,7 @@ class Client:
                 if self.topics is None or topic in self.topics
             }
             known = [c["topic"] for c in self.channels.values()]
-            return all(
-                known.count(topic) == 1 and channel.has_sinks() for topic, channel in taken.items()
-            )
+            return all(known.count(t) == 1 and taken[t].has_sinks() for t in taken)
 
         until(is_reader, meanwhile=lambda: self._take(0.01))
 
@@ -114,16 +109,14 @@ class Client:
 
     def scenes(self, found):
         """SceneUpdates, decoded with the schema that came with the channel."""
-        schema = self.channel("/tactile/whiskers/scene")
+        schema = self.channel(SCENE)
         assert schema["schemaName"] == "foxglove.SceneUpdate"
         files = descriptor_pb2.FileDescriptorSet.FromString(base64.b64decode(schema["schema"]))
         pool = descriptor_pool.DescriptorPool()
         for file in files.file:
             pool.Add(file)
         kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.SceneUpdate"))
-        return [
-            (t, kind.FromString(b)) for topic, t, b in found if topic == "/tactile/whiskers/scene"
-        ]
+        return [(t, kind.FromString(b)) for topic, t, b in found if topic == SCENE]
 
 
 @pytest.fixture
@@ -140,11 +133,9 @@ def served():
 
 def test_all_topics_are_there_for_whoever_comes(served):
     _, client, _ = served
-    assert {c["topic"] for c in client.channels.values()} == {
-        "/tactile/log", "/tactile/state", "/tactile/whiskers/array", "/tactile/whiskers/scene",
-        "/tactile/whiskers/values",
-    }  # fmt: skip
-    values = client.channel("/tactile/whiskers/values")
+    own = {"/tactile/log", "/tactile/state", "/tactile/whiskers/array"}
+    assert {c["topic"] for c in client.channels.values()} == {*own, SCENE, VALUES}
+    values = client.channel(VALUES)
     assert (values["encoding"], values["schemaEncoding"]) == ("json", "jsonschema")
     fields = json.loads(values["schema"])["properties"]
     assert fields["fx"]["properties"] == {"B1": {"type": "number"}, "C2": {"type": "number"}}

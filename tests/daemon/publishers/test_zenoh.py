@@ -11,15 +11,7 @@ from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.testing import small_spec
-from tests.helpers.published import (
-    View,
-    busy_snapshot,
-    contact,
-    decision,
-    event,
-    opened,
-    running,
-)
+from tests.helpers.published import View, busy_snapshot, contact, decision, event, opened, running
 from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codecs.anyskin import AnySkin, AnySkinOptions
-from tests.helpers.codec_contract import (
-    T0,
-    CodecCase,
-    CodecContract,
-    chunk_of,
-)
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of
 
 MILLI = 1e-3  # T
 
@@ -57,16 +52,12 @@ def test_golden_frames() -> None:
     codec = anyskin(magnetometers=1)
     samples = codec.feed(GOLDEN, T0)
     assert samples is not None and codec.lock_confidence == 1.0
-    assert samples.values[:, 0] == pytest.approx(
-        np.array(
-            [
-                [100e-6, -50e-6, 1e-3, 298.15],
-                [0.5e-6, -50e-6, 1e-3, 298.15],
-                [100e-6, -50e-6, -1e-3, 298.65],
-            ]
-        ),
-        rel=1e-6,
-    )
+    expected = [
+        [100e-6, -50e-6, 1e-3, 298.15],
+        [0.5e-6, -50e-6, 1e-3, 298.15],
+        [100e-6, -50e-6, -1e-3, 298.65],
+    ]
+    assert samples.values[:, 0] == pytest.approx(np.array(expected), rel=1e-6)
     again = anyskin(magnetometers=1).encode(chunk_of(codec, samples.values))
     assert [len(p) for p in again] == [18] * 3 and all(p.endswith(b"\r\n") for p in again)
     sent = [struct.unpack("<4f", p[:16]) for p in again]

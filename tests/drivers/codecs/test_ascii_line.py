@@ -11,6 +11,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
+<<<<<<< HEAD
 from tactile_rt.drivers.codecs.ascii_text import Names
 from tests.helpers.codec_contract import (
     T0,
@@ -20,6 +21,9 @@ from tests.helpers.codec_contract import (
     decode,
     stacked,
 )
+=======
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
+>>>>>>> x/tb
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "codecs" / "ascii_line.toml"
 PLAIN = "A0.fx,A0.fy,B1.fx,B1.fy"
@@ -85,7 +89,6 @@ PRINTED = (
 def test_what_boards_print() -> None:
     codec = ascii_line()
     samples = codec.feed(PRINTED, T0)
-    assert samples is not None
     assert codec.spec is not None and codec.spec.grid == ((0, 0), (1, 1))
     good = [
         [1, -2.5, 0.3, 4], [5, 6, 7, 8], [np.nan, np.inf, np.nan, 12], [13, 14, 15, 16],
@@ -105,14 +108,12 @@ def test_what_boards_print() -> None:
 def test_the_documented_example_means_what_it_says() -> None:
     codec = AsciiLine(AsciiLineOptions(mapping=str(EXAMPLE)))
     spec = codec.spec
-    assert spec is not None
     assert spec.name == "two-whiskers" and spec.elements == ("A0", "A1")
     assert spec.channels == ("fx", "fy", "temperature") and spec.units == ("N", "N", "K")
     assert spec.positions[1] == (0.0, 0.002, 0.0) and spec.rate_hz == 100.0
     line = "12345678 4021  12.5 -3.0 24.6  0.5 7.25 24.5  1"
     assert f"#   {line}\n" in EXAMPLE.read_text()
     samples = codec.feed(f"\n{line}\n".encode(), T0)
-    assert samples is not None
     assert samples.values[0] == pytest.approx(
         np.array([[6.25e-3, -1.5e-3, 297.75], [0.25e-3, 3.625e-3, 297.65]]), rel=1e-6
     )
@@ -206,16 +207,13 @@ def test_invalid_elements_stay_invalid_on_the_wire() -> None:
     st.lists(st.sampled_from([b",", b" ", b"\t", b"; ", b" , "]), min_size=3, max_size=3),
     st.sampled_from([b"\n", b"\r\n", b"\r", b"\n\n"]),
 )  # fmt: skip
-def test_any_numbers_with_any_separators(
-    rows: list[list[float]], gaps: list[bytes], end: bytes
-) -> None:
+def test_any_numbers_with_any_separators(rows, gaps, end):
     lines = []
     for row in rows:
         words = [repr(x).encode() for x in row]
         lines.append(words[0] + b"".join(g + w for g, w in zip(gaps, words[1:], strict=True)))
     codec = ascii_line()
     samples = codec.feed(end + end.join(lines) + end, T0)
-    assert samples is not None
     assert np.array_equal(samples.values.reshape(-1, 4), np.array(rows, np.float32))
     assert codec.stats.corrupt == codec.stats.skipped == 0
 

@@ -116,9 +116,8 @@ def test_constant_frames_that_pass_at_one_place_are_told() -> None:
         samples = decode(codec, (one * 40)[7:])
         if len(places(one)) == 1:
             alone += 1
-            assert (
-                stacked(samples, "values") == stacked(decode(ati(), ANSWER + one), "values")
-            ).all()
+            alike = stacked(decode(ati(), ANSWER + one), "values")
+            assert (stacked(samples, "values") == alike).all()
             assert codec.lock_confidence == 1
         else:
             assert samples == []

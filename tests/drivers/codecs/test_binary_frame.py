@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream import concatenate
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.binary_frame import BinaryFrame, BinaryFrameOptions
 from tactile_rt.drivers.codecs.framing import crc16_modbus
@@ -14,15 +15,8 @@ from tactile_rt.drivers.codecs.optoforce import OptoForceOptions, OptoForceSeria
 from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, cut
-from tests.helpers.codec_contract import (
-    T0,
-    CodecCase,
-    CodecContract,
-    chunk_of,
-    join,
-    mutations,
-)
-from tests.helpers.waiting import PATIENCE_S, until
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, join, mutations
+from tests.helpers.waiting import PATIENCE_S, read_chunks
 
 EXAMPLE = Path(__file__).parents[3] / "docs/codecs/binary_frame.toml"
 OPTOFORCE = """
@@ -60,11 +54,8 @@ def example():
 
 def signal(n=40):
     draw = np.random.default_rng(0)
-    counts = np.stack(
-        [draw.integers(-30000, 30000, (n, 4)) * 0.25e-3, draw.integers(0, 255, (n, 4)) * 500.0],
-        axis=2,
-    )
-    return counts.astype(float)
+    forces = draw.integers(-30000, 30000, (n, 4)) * 0.25e-3
+    return np.stack([forces, draw.integers(0, 255, (n, 4)) * 500.0], axis=2)
 
 
 class TestExample(CodecContract):
@@ -175,13 +166,9 @@ def test_what_is_out_of_range_or_only_looked_at_makes_its_element_invalid(tmp_pa
     )
     codec = described(text, tmp_path)
     assert codec.spec.channels == ("x",)
-    for x, state, good in (
-        (5, 0, True),
-        (-6, 0, False),
-        (0, 101, False),
-        (0, 2, False),
-        (1, 3, True),
-    ):
+    bad = [(-6, 0), (0, 101), (0, 2)]
+    for x, state in ((5, 0), *bad, (1, 3)):
+        good = (x, state) not in bad
         samples = codec.feed(bytes((0x55, x & 255, state, 0, 100)), T0)
         assert samples.valid.tolist() == [[good, True]] and samples.values[0, 0, 0] == x
 
@@ -269,12 +256,7 @@ def test_a_described_sensor_streams_over_a_line():
         url = f"{device.url}&start_s={PATIENCE_S:g}"
         assert "codec=binary_frame" in url and "mapping=" in url
         with open_source(url) as opened:
-            found = []
-            until(
-                lambda: sum(map(len, found)) == 200,
-                meanwhile=lambda: found.extend(filter(None, [opened.read(0.05)])),
-            )
+            found = read_chunks(opened, 200)
             assert opened.stats.missing == opened.stats.corrupt == 0
             assert opened.health.connections == 1
-    got = np.concatenate([chunk.values for chunk in found])
-    assert got == pytest.approx(values, rel=1e-6, abs=1e-2)
+    assert concatenate(found).values == pytest.approx(values, rel=1e-6, abs=1e-2)

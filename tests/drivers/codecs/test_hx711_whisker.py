@@ -7,14 +7,7 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.hx711_whisker import Hx711Whisker, Hx711WhiskerOptions
-from tests.helpers.codec_contract import (
-    T0,
-    CodecCase,
-    CodecContract,
-    chunk_of,
-    decode,
-    stacked,
-)
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
 def hx711(**options: float) -> Hx711Whisker:
@@ -82,7 +75,6 @@ def test_a_saturated_converter_is_not_valid() -> None:
     wire = b"".join(struct.pack("<2f", *row) + GOLDEN[8:] for row in rows)
     wire += bytes.fromhex("010080ff00000000") + GOLDEN[8:]  # a signalling NaN, made by damage
     samples = hx711(whiskers=1).feed(wire, T0)
-    assert samples is not None
     assert samples.valid[:, 0].tolist() == [False, False, True, False, False, False]
 
 

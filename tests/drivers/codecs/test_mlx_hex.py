@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codecs.mlx_hex import MlxHex, MlxHexOptions
-from tests.helpers.codec_contract import (
-    T0,
-    CodecCase,
-    CodecContract,
-    chunk_of,
-    decode,
-    stacked,
-)
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
 def mlx_hex(**options: float) -> MlxHex:
@@ -43,7 +36,6 @@ GOLDEN = b"01\n05\n83\n820064ff9c7fff - 862\n8200640000FFFF - 8\r\nea00000000000
 def test_golden_lines() -> None:
     codec = mlx_hex()
     samples = codec.feed(GOLDEN, T0)
-    assert samples is not None
     assert samples.values[:, 0] == pytest.approx(
         np.array([[15e-6, -15e-6, 32767 * 0.242e-6], [15e-6, 0, -0.242e-6], [0, 0, 0]]), rel=1e-6
     )
@@ -61,11 +53,8 @@ def test_golden_lines() -> None:
         ({"hallconf": 0}, "000100010001", [0.157, 0.157, 0.253]),
     ],
 )
-def test_counts_mean_what_the_chip_is_set_to(
-    options: dict[str, int], digits: str, tesla: list[float]
-) -> None:
+def test_counts_mean_what_the_chip_is_set_to(options, digits, tesla):
     samples = mlx_hex(**options).feed(f"82{digits} - 850\n".encode(), T0)
-    assert samples is not None
     assert samples.values[0, 0] == pytest.approx(1e-6 * np.array(tesla), rel=1e-6)
 
 
@@ -104,7 +93,6 @@ def test_damaged_lines_are_counted_as_the_samples_they_were(hurt: object, lost: 
     codec = mlx_hex()
     lines = codec.encode(chunk_of(codec, signal(10)))
     samples = codec.feed(b"".join(hurt(lines)), T0)
-    assert samples is not None
     assert codec.stats.corrupt == lost == samples.damaged.sum()
 
 

@@ -39,11 +39,8 @@ def signal(n: int = 30, spec: ArraySpec = SPEC) -> np.ndarray:
 
 def whiskers(elements: int) -> ArraySpec:
     """Six channels each."""
-    return dataclasses.replace(
-        small_spec(elements),
-        channels=("fx", "fy", "fz", "mx", "my", "mz"),
-        units=("N",) * 3 + ("N m",) * 3,
-    )
+    channels, units = ("fx", "fy", "fz", "mx", "my", "mz"), ("N",) * 3 + ("N m",) * 3
+    return dataclasses.replace(small_spec(elements), channels=channels, units=units)
 
 
 class TestClassicInt16(CodecContract):
@@ -73,7 +70,6 @@ GOLDEN = [
 def test_a_golden_sample() -> None:
     codec = native(small_spec(2))
     samples = codec.feed(GOLDEN, T0)
-    assert samples is not None
     assert samples.values.tolist() == [[[1.5, -2.0], [0.25, 0.0]]]
     assert samples.count is not None and samples.count.tolist() == [0x1234]
     assert samples.ticks is not None and samples.ticks.tolist() == [1_234_567]
@@ -92,7 +88,6 @@ def test_a_golden_int16_sample_in_one_long_frame() -> None:
     check = crc16_xmodem(head.data + payload).to_bytes(2, "little")
     part = CanFrame(0x103, b"\x07\x00" + payload + check + bytes(3), fd=True)
     samples = native(small_spec(2)).feed([head, part], T0)
-    assert samples is not None and samples.status is not None
     assert samples.status.tolist() == [5]
     counts = np.array([[16384, -16384], [1, 32767]])
     expected = counts * [0.1 / 32767, 1e-3 / 32767]
@@ -193,7 +188,6 @@ def test_an_inverted_bit_is_never_taken_for_a_value() -> None:
             middle = [*packets[1][:at], CanFrame(hurt.id, bytes(data)), *packets[1][at + 1 :]]
             samples = decode(host, [*packets[0], *middle, *packets[2]])
             count, valid = stacked(samples, "count"), stacked(samples, "valid")
-            assert count is not None and valid is not None
             assert count.tolist() in ([0, 1, 2], [0, 2]) and valid[[0, -1]].all()
             off = np.abs(stacked(samples, "values") - values[count])[valid]
             assert (off <= np.array([0.1, 1e-3]) / 32767).all()
@@ -268,7 +262,6 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match="format must be one of"):
         NativeCanOptions(format="int8")
     spec = whiskers(130)
-    with pytest.raises(
-        ConfigError, match=r"130 elements of 6 channels do not fit in the 256 frames .*: use fd"
-    ):
+    said = r"130 elements of 6 channels do not fit in the 256 frames .*: use fd"
+    with pytest.raises(ConfigError, match=said):
         native(spec).encode(chunk_of(native(spec), np.zeros((1, *spec.shape))))

@@ -229,19 +229,20 @@ class Case:
         return Chunk(np.array([self.seq], np.int64), t_ns, self.values[None], self.valid[None])
 
 
+def array_of(elements: int, channels: int) -> ArraySpec:
+    names = tuple(f"c{i}" for i in range(channels))
+    return dataclasses.replace(small_spec(elements), channels=names, units=("N",) * channels)
+
+
 def cases(n: int, most: tuple[int, int]) -> Iterator[Case]:
     draw = np.random.default_rng(5)
     sizes = [(1, 1), (8, 6), (9, 1), (35, 6), most]
     for k in range(n):
         elements, channels = sizes[k] if k < len(sizes) else draw.integers(1, 20, 2).tolist()
-        spec = dataclasses.replace(
-            small_spec(elements),
-            channels=tuple(f"c{i}" for i in range(channels)),
-            units=("N",) * channels,
-        )
         counts = draw.integers(-32767, 32768, (elements, channels))
         seq, time_us = draw.integers(0, 2**32, 2).tolist()
-        yield Case(spec, seq, time_us, draw.random(elements) < 0.8, counts)
+        valid = draw.random(elements) < 0.8
+        yield Case(array_of(elements, channels), seq, time_us, valid, counts)
 
 
 def compare(samples: Samples | None, case: Case, wide: bool, status: int, bits: int) -> None:
@@ -272,9 +273,8 @@ def test_serial_samples_are_those_of_the_codec(program: Path, form: str) -> None
 def test_can_samples_are_those_of_the_codec(program: Path, form: str, fd: bool) -> None:
     wide = form == "float32"
     tried = list(cases(40, (40, 9) if wide else (60, 12)))
-    data, _ = run(
-        program, f"s{'d' if fd else 'c'}{form[0]}", b"".join(c.record(wide) for c in tried)
-    )
+    mode = f"s{'d' if fd else 'c'}{form[0]}"
+    data, _ = run(program, mode, b"".join(c.record(wide) for c in tried))
     sent = frames_of(data, fd)
     for case in tried:
         codec = NativeCan(NativeCanOptions(base=BASE, fd=fd, format=form))
@@ -299,18 +299,15 @@ def test_the_status_arrives(program: Path) -> None:
 
 
 def test_a_sample_too_long_for_a_wire_is_not_sent(program: Path) -> None:
-    spec = dataclasses.replace(small_spec(100), channels=tuple("abcdefgh"), units=("N",) * 8)
-    case = Case(spec, 0, 0, np.ones(100, bool), np.zeros((100, 8), int))
+    case = Case(array_of(100, 8), 0, 0, np.ones(100, bool), np.zeros((100, 8), int))
     assert run(program, "sci", case.record(False))[0] == b""  # 269 classic frames
     assert run(program, "sdi", case.record(False))[0] != b""
 
 
 def test_checksums_and_counts(program: Path) -> None:
-    draw = np.random.default_rng(6)
-    scale = np.float32(0.1 / 32767)
-    values = np.concatenate(
-        [draw.normal(0, 0.05, 2000), [0, 0.1, -0.1, 1e30, -1e30, np.nan, np.inf, -np.inf]]
-    ).astype(np.float32)
+    some, scale = np.random.default_rng(6).normal(0, 0.05, 2000), np.float32(0.1 / 32767)
+    odd = [0, 0.1, -0.1, 1e30, -1e30, np.nan, np.inf, -np.inf]
+    values = np.concatenate([some, odd]).astype(np.float32)
     pairs = np.stack([values, np.full_like(values, scale)], axis=1)
     lines = run(program, "c", pairs.astype("<f4").tobytes())[0].decode().split("\n")
     assert lines[0] == "31c3 cbf43926 cbf43926"  # the catalogue's
@@ -338,13 +335,8 @@ def hosts(wire: bytes, cuts: list[int], json: bytes) -> bytes:
 def test_commands_are_obeyed_and_answered_as_by_the_codec(program: Path) -> None:
     host, emulated = NativeSerial(NativeOptions()), device()
     packets = [s.send for s in host.commands(Command.START)]
-    packets += [host.whisk(8.0, 0.5, -0.25).send, host.whisk(float("nan"), 0, 0).send]
-    packets += [
-        frame(9),
-        frame(MessageType.WHISK, b"four"),
-        frame(MessageType.ACK, b"\3\0"),
-        frame(0),
-    ]
+    packets += [host.whisk(8.0, 0.5, -0.25).send, host.whisk(float("nan"), 0, 0).send, frame(9)]
+    packets += [frame(MessageType.WHISK, b"four"), frame(MessageType.ACK, b"\3\0"), frame(0)]
     wire = b"T noise TR" + b"R".join(packets)
     json = DeviceDescription.of(SPEC).to_json()
     draw = random.Random(1)
@@ -357,9 +349,8 @@ def test_commands_are_obeyed_and_answered_as_by_the_codec(program: Path) -> None
     found = NativeSerial(NativeOptions())
     found.feed(answer, T0)
     assert found.spec == SPEC
-    _, state = run(
-        program, "h", hosts(frame(MessageType.START) + frame(MessageType.STOP), [], json)
-    )
+    both = frame(MessageType.START) + frame(MessageType.STOP)
+    _, state = run(program, "h", hosts(both, [], json))
     assert state.startswith("0 ")
     # a device without a description says so
     answer, _ = run(program, "h", hosts(frame(MessageType.DESCRIBE), [], b""))
@@ -385,12 +376,9 @@ def test_can_commands_are_obeyed_and_answered_as_by_the_codec(program: Path, fd:
     host, emulated = NativeCan(options), NativeCan(options)
     emulated.spec = SPEC
     sent = [f for s in host.commands(Command.START) for f in s.send]
-    sent += [
-        *host.whisk(8.0, 0.5, -0.25).send,
-        CanFrame(BASE, b"\x09", fd=fd),
-        CanFrame(BASE, b"\5\1"),
-    ]
-    sent += [CanFrame(BASE, b""), CanFrame(BASE + 1, b"\3"), CanFrame(BASE + 2, bytes(8))]
+    sent += [*host.whisk(8.0, 0.5, -0.25).send, CanFrame(BASE, b"\x09", fd=fd)]
+    sent += [CanFrame(BASE, b"\5\1"), CanFrame(BASE, b"")]
+    sent += [CanFrame(BASE + 1, b"\3"), CanFrame(BASE + 2, bytes(8))]
     json = DeviceDescription.of(SPEC).to_json()
     data = len(json).to_bytes(2, "little") + json + records(sent)
     answer, state = run(program, "bd" if fd else "bc", data)
@@ -447,9 +435,7 @@ def fenced(language: str = "") -> list[str]:
 def test_the_documents_frames_and_description_are_the_codecs() -> None:
     (json,) = fenced("json")
     described = DeviceDescription.from_json(json.encode())
-    assert described is not None and described.scale == pytest.approx(
-        (0.1 / 32767, 1e-3 / 32767), 1e-4
-    )
+    assert described.scale == pytest.approx((0.1 / 32767, 1e-3 / 32767), 1e-4)
     codec = NativeSerial(NativeOptions())
     codec.spec = described.spec
     *serial, can = fenced()
@@ -473,14 +459,8 @@ def test_the_documents_rates_are_those_of_the_frames() -> None:
     for match in re.finditer(r"^\| (\d+) .*x (\d).* \| float32 (.*)\n\| \| int16 (.*)", text, re.M):
         elements, channels = int(match[1]), int(match[2])
         for form, row in zip(("float32", "int16"), match.groups()[2:], strict=True):
-            spec = dataclasses.replace(
-                small_spec(elements),
-                channels=tuple("abcdefg"[:channels]),
-                units=("N",) * channels,
-            )
-            case = Case(
-                spec, 0, 0, np.ones(elements, bool), np.zeros((elements, channels), np.int16)
-            )
+            spec = array_of(elements, channels)
+            case = Case(spec, 0, 0, np.ones(elements, bool), np.zeros(spec.shape, np.int16))
             line = NativeSerial(NativeOptions(format=form))
             buses = [NativeCan(NativeCanOptions(fd=fd, format=form)) for fd in (False, True)]
             for codec in (line, *buses):
@@ -488,14 +468,10 @@ def test_the_documents_rates_are_those_of_the_frames() -> None:
             size = len(line.encode(case.chunk())[0])
             frames, long = (len(bus.encode(case.chunk())[0]) for bus in buses)
             told = re.findall(r"[\d.]+ (?:k?Hz|B|frames)", row)
-            expected = [
-                f"{size} B",
-                *(f"{baud / 10 / size:.0f} Hz" for baud in (460_800, 2e6, 3e6)),
-            ]
-            assert told[:4] == expected
-            assert told[-3:] == [
-                f"{frames} frames", f"{9000 / frames:.0f} Hz", f"{long} frames"
-            ]  # fmt: skip
+            rates = [f"{baud / 10 / size:.0f} Hz" for baud in (460_800, 2e6, 3e6)]
+            assert told[:4] == [f"{size} B", *rates]
+            frame_hz = f"{9000 / frames:.0f} Hz"
+            assert told[-3:] == [f"{frames} frames", frame_hz, f"{long} frames"]
 
 
 def test_the_example_runs(tmp_path: Path) -> None:

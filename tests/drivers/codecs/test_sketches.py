@@ -95,7 +95,6 @@ def test_a_sketch_is_described_in_a_line(name: str) -> None:
     columns, printed, expected = (SKETCHES | FOUND)[name]
     codec = board(columns)
     samples = codec.feed(b"\r\n" + printed.encode(), T0)
-    assert samples is not None
     assert samples.values == pytest.approx(np.array(expected), rel=1e-6, nan_ok=True)
     assert samples.valid.tolist() == np.isfinite(expected).all(axis=2).tolist()
     assert codec.stats.corrupt == 0

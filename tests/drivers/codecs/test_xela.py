@@ -39,7 +39,6 @@ def test_lost_taxels_are_invalid_and_the_next_sample_is_whole() -> None:
         wire = [*packets[0], *packets[1][:lost], *packets[1][lost + 1 :], *packets[2]]
         samples = decode(host, wire, range(1, len(wire)))
         valid, got = stacked(samples, "valid"), stacked(samples, "values")
-        assert valid is not None and got is not None
         assert valid.sum(axis=1).tolist() == [16, 15, 16] and not valid[1, lost]
         assert np.array_equal(got[valid], values.astype(np.float32)[valid])
         assert host.stats.incomplete == 1

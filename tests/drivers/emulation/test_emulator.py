@@ -3,7 +3,6 @@
 import errno
 import os
 import select
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.core.errors import ConfigError, SourceError
-from tactile_rt.core.stream import Chunk, EndOfStream, Source
+from tactile_rt.core.stream import Chunk, EndOfStream, Source, concatenate
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
@@ -25,7 +24,7 @@ from tactile_rt.drivers.emulation.transmitter import fit
 from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
-from tests.helpers.waiting import PATIENCE_S, until
+from tests.helpers.waiting import PATIENCE_S, read_chunks, until
 
 SPEC = small_spec(4)
 
@@ -275,9 +274,6 @@ def test_a_name_that_is_taken_is_not_taken_away(tmp_path: Path) -> None:
             native(1, endpoint=SerialEndpoint(tmp_path / "port")).start()
 
 
-# CAN
-
-
 def native_can(n: int, endpoint: Any, **options: Any) -> Emulator:
     source = ArraySource(SPEC, cut(signal(n) * 1e-3, SPEC.rate_hz))
     codec = NativeCan(NativeCanOptions(format="float32"))
@@ -356,9 +352,6 @@ def test_faults_of_a_bus() -> None:
         native(1, faults=FaultSchedule(faults))
 
 
-# other protocols
-
-
 class Asked(SerialCodec):
     """Sends a sample, as text, for each question mark."""
 
@@ -426,9 +419,6 @@ def test_a_commanded_array_moves() -> None:
         host.close()
 
 
-# what it measures
-
-
 def test_an_array_is_fitted_to_the_device_s() -> None:
     source, device = small_spec(3), small_spec(5)
     chunk = cut(signal(2)[:, :3], 1000.0)[0]
@@ -489,10 +479,6 @@ def test_closing_needs_nobody() -> None:
     with pytest.raises(EndOfStream):
         while True:
             device.source.read()
-    assert threading.active_count() >= 1
-
-
-# what users get
 
 
 def test_fakes_are_opened_by_their_url(fake_serial: Any, fake_can: Any) -> None:  # noqa: F811
@@ -506,12 +492,7 @@ def test_fakes_are_opened_by_their_url(fake_serial: Any, fake_can: Any) -> None:
     for device in (serial_device, slcan_device, bus_device):
         with open_source(device.url) as source:
             assert source.spec == SPEC
-            got: list[Chunk] = []
-            end = time.monotonic() + PATIENCE_S
-            while sum(map(len, got)) < 300 and time.monotonic() < end:
-                chunk = source.read(0.5)
-                got += [] if chunk is None else [chunk]
-        assert np.array_equal(np.concatenate([c.values for c in got]), values)
+            assert np.array_equal(concatenate(read_chunks(source, 300)).values, values)
     assert bus_device.port == "virtual:mine" and slcan_device.port.startswith("slcan:/dev/pts/")
     with pytest.raises(ConfigError, match="a signal is"):
         FakeSerial(np.zeros(3))

@@ -7,13 +7,7 @@ import pytest
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.emulation.faults import (
-    Fate,
-    Fault,
-    FaultSchedule,
-    damaged,
-    read_faults,
-)
+from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule, damaged, read_faults
 
 RATE = 1000
 
@@ -36,10 +30,8 @@ def test_a_schedule_is_read(tmp_path: Path) -> None:
         '[[fault]]\nkind = "unplug"\nat_s = 5.0\nduration_s = 0.5\n'
     )
     schedule = read_faults(file)
-    assert schedule.faults == (
-        Fault("bit_flip", rate=2.0, amount=3),
-        Fault("unplug", at_s=5.0, duration_s=0.5),
-    )
+    flip, unplug = Fault("bit_flip", rate=2.0, amount=3), Fault("unplug", at_s=5.0, duration_s=0.5)
+    assert schedule.faults == (flip, unplug)
     again = hits(FaultSchedule(schedule.faults, 7), 30)
     assert hits(schedule, 30) == again
     assert hits(FaultSchedule(schedule.faults, 8), 30) != again
@@ -65,9 +57,7 @@ def test_a_schedule_is_read(tmp_path: Path) -> None:
         ("rate = 1", "fault[0]: needs a key 'kind'"),
     ],
 )
-def test_a_mistake_is_one_line_that_names_file_and_key(
-    tmp_path: Path, text: str, message: str
-) -> None:
+def test_a_mistake_is_one_line_that_names_file_and_key(tmp_path, text, message):
     file = tmp_path / "faults.toml"
     file.write_text(f"[[fault]]\n{text}\n")
     with pytest.raises(ConfigError) as caught:
@@ -141,10 +131,8 @@ def test_what_damage_does_to_a_packet() -> None:
         assert fate == Fate.CORRUPTED and len(hurt) == 40
         flipped = sum((a ^ b).bit_count() for a, b in zip(packet, hurt, strict=True))
         assert flipped == min(bits, 320)
-    assert damaged(packet, Fault("truncate", rate=1, amount=4), draw) == (
-        packet[:36],
-        Fate.TRUNCATED,
-    )
+    cut = damaged(packet, Fault("truncate", rate=1, amount=4), draw)
+    assert cut == (packet[:36], Fate.TRUNCATED)
     assert damaged(packet, Fault("truncate", rate=1, amount=99), draw)[0] == packet[:1]
     frames = [CanFrame(i) for i in range(9)]
     left, fate = damaged(frames, Fault("bit_flip", rate=1, amount=2), draw)

@@ -14,6 +14,7 @@ from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import schema_text
 from tactile_rt.testing import cut, small_spec
+from tests.helpers.recordings import odd_chunks, write
 
 rosbags = pytest.importorskip("rosbags")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
@@ -144,10 +145,14 @@ def test_topics_are_told_with_what_they_are(tmp_path):
     assert topics["/ft/wrench"].columns.startswith("wrench.force.x=tool0_ft.fx:N,")
 
 
+def file_of(path):
+    """The file that holds the messages of a bag."""
+    return path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_half_a_bag_is_imported_with_a_note_or_refused_with_what_mends_it(tmp_path, form):
-    path = bag(tmp_path, form)
-    path = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    path = file_of(bag(tmp_path, form))
     half = tmp_path / f"half{path.suffix}"
     half.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     if form == "mcap":
@@ -161,8 +166,7 @@ def test_half_a_bag_is_imported_with_a_note_or_refused_with_what_mends_it(tmp_pa
 
 @pytest.mark.parametrize("form", FORMS)
 def test_damage_raises_nothing_but_our_errors(tmp_path, form):
-    path = bag(tmp_path, form)
-    path = path if path.is_file() else next(p for p in path.iterdir() if p.suffix != ".yaml")
+    path = file_of(bag(tmp_path, form))
     whole, draw = path.read_bytes(), random.Random(3)
     hurt = tmp_path / f"hurt{path.suffix}"
     for k in range(12):
@@ -192,8 +196,6 @@ def test_what_cannot_be_is_one_line(tmp_path, options, why):
 
 
 def test_a_recording_is_no_bag_to_import(tmp_path):
-    from tests.helpers.recordings import odd_chunks, write
-
     path = write(tmp_path / "run.mcap", odd_chunks())
     with pytest.raises(ConfigError, match="is a recording already"):
         import_bag(path, tmp_path / "o.mcap")

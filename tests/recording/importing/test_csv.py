@@ -20,6 +20,17 @@ def imported(path, columns, rate_hz=0.0, **form):
     return made, concatenate(list(Recording(output))), Recording(output).description
 
 
+@pytest.fixture
+def table(tmp_path):
+    """Import a table that is written so, in one piece or line by line."""
+
+    def written(text, *columns, **form):
+        (tmp_path / "t.csv").write_text("".join(text))
+        return imported(tmp_path / "t.csv", *columns, **form)
+
+    return written
+
+
 def rows(form: str) -> str:
     return "".join(form.format(k=k, s=5 + 0.01 * k, a=k - 7, b=0.25 * k) for k in range(N))
 
@@ -44,10 +55,9 @@ WRITTEN = {
 
 
 @pytest.mark.parametrize("name", WRITTEN)
-def test_a_table_is_read_as_it_is_written(tmp_path, name):
+def test_a_table_is_read_as_it_is_written(table, name):
     header, form, columns = WRITTEN[name]
-    (tmp_path / "t.csv").write_text(header + rows(form))
-    made, chunk, about = imported(tmp_path / "t.csv", columns)
+    made, chunk, about = table(header + rows(form), columns)
     assert (made.samples, made.intact, made.corrupt, made.missing) == (N, N, 0, 0)
     expected = [[1e-3 * (k - 7), 0.25e-3 * k] for k in range(N)]
     assert chunk.values[:, 0] == pytest.approx(np.array(expected))
@@ -55,38 +65,33 @@ def test_a_table_is_read_as_it_is_written(tmp_path, name):
     assert about.spec.rate_hz == 100 and about.spec.units == ("N", "N")
 
 
-def test_a_column_that_is_seldom_there_is_a_column(tmp_path):
+def test_a_column_that_is_seldom_there_is_a_column(table):
     lines = (f"{k / 100},nan,{20 + k if k % 10 == 0 else ''}\n" for k in range(N))
-    (tmp_path / "t.csv").write_text("t,fx,temp\n" + "".join(lines))
     columns = "t=time:s,fx=A0.value:1,temp=T0.value:1"
-    made, chunk, _ = imported(tmp_path / "t.csv", columns)
+    made, chunk, _ = table(["t,fx,temp\n", *lines], columns)
     assert (made.samples, made.corrupt) == (N, 0)
     assert chunk.valid[:, 1].tolist() == [k % 10 == 0 for k in range(N)]
 
 
 @pytest.mark.parametrize("late", [1, 30, 300])
-def test_a_column_that_comes_late_takes_no_row_with_it(tmp_path, late):
+def test_a_column_that_comes_late_takes_no_row_with_it(table, late):
     lines = (f"{k / 100},{k},{k if k >= late else ''}\n" for k in range(310))
-    (tmp_path / "t.csv").write_text("t,a,b\n" + "".join(lines))
-    made, chunk, _ = imported(tmp_path / "t.csv", "t=time:s,a=A0.fx,b=B0.fx")
+    made, chunk, _ = table(["t,a,b\n", *lines], "t=time:s,a=A0.fx,b=B0.fx")
     assert (made.samples, made.corrupt) == (310, 0)
     assert chunk.valid[:, 1].tolist() == [k >= late for k in range(310)]
 
 
 @pytest.mark.parametrize("head", ["t,x,y\n", ""])
-def test_a_word_in_the_first_rows_is_counted_as_in_all_others(tmp_path, head):
+def test_a_word_in_the_first_rows_is_counted_as_in_all_others(table, head):
     lines = (f"{k / 100},{'OVERLOAD' if k % 10 < 2 else k},{k}\n" for k in range(N))
-    (tmp_path / "t.csv").write_text(head + "".join(lines))
     columns = "t=time:s,x=S.fx,y=S.fy" if head else "time:s,S.fx,S.fy"
-    made, _, _ = imported(tmp_path / "t.csv", columns)
+    made, _, _ = table([head, *lines], columns)
     assert (made.samples, made.corrupt) == (N - 10, 10)
 
 
-def test_a_time_of_seconds_and_the_rest(tmp_path):
-    (tmp_path / "t.csv").write_text(
-        "".join(f"{1_700_000_000 + k // 2},{k % 2 * 500_000_001},ft,{k}\n" for k in range(9))
-    )
-    _, chunk, about = imported(tmp_path / "t.csv", "time:s,time:ns,-,S.fx")
+def test_a_time_of_seconds_and_the_rest(table):
+    lines = (f"{1_700_000_000 + k // 2},{k % 2 * 500_000_001},ft,{k}\n" for k in range(9))
+    _, chunk, about = table(lines, "time:s,time:ns,-,S.fx")
     assert about.utc_offset_ns == 1_700_000_000 * 10**9 and about.spec.rate_hz == 2
     assert chunk.t_ns[:4].tolist() == [0, 500_000_001, 10**9, 1_500_000_001]
 
@@ -99,18 +104,17 @@ def test_names_from_windows(tmp_path):
 @pytest.mark.parametrize(
     "first, line", [("", '"{k},5","{k},25"\n'), ("Serial 12345\n", "{k}  {k},25\n")]
 )
-def test_a_decimal_comma_is_told_from_a_delimiter(tmp_path, first, line):
-    (tmp_path / "t.csv").write_text(first + "".join(line.format(k=k) for k in range(9)))
-    assert imported(tmp_path / "t.csv", "time:s,S.fx")[1].values[3, 0, 0] == 3.25
+def test_a_decimal_comma_is_told_from_a_delimiter(table, first, line):
+    _, chunk, _ = table([first, *(line.format(k=k) for k in range(9))], "time:s,S.fx")
+    assert chunk.values[3, 0, 0] == 3.25
 
 
 @pytest.mark.parametrize("delimiter", [",", ", ", ";", "; ", "\t", "|"])
 @pytest.mark.parametrize("quote", ["", '"'])
-def test_cells_that_are_empty_move_none(tmp_path, delimiter, quote):
+def test_cells_that_are_empty_move_none(table, delimiter, quote):
     rows = [[k, "" if k % 4 == 3 else 10 + k, "" if k % 5 == 3 else 20 + k] for k in range(N)]
-    lines = [delimiter.join(f"{quote}{cell}{quote}" for cell in row) for row in rows]
-    (tmp_path / "t.csv").write_text("Serial 12345\nDevice: Foo 3\n" + "\n".join(lines) + "\n")
-    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,A0.fx,B0.fx")
+    lines = [delimiter.join(f"{quote}{cell}{quote}" for cell in row) + "\n" for row in rows]
+    made, chunk, _ = table(["Serial 12345\nDevice: Foo 3\n", *lines], "time:s,A0.fx,B0.fx")
     assert (made.samples, made.corrupt) == (N, 0)
     for j in (0, 1):
         read = chunk.values[chunk.valid[:, j], j, 0].tolist()
@@ -122,19 +126,16 @@ def test_names_between_commas_above_spaces(tmp_path):
     assert csv_form(tmp_path / "t.txt").names == ("t", "x", "y")
 
 
-def test_commas_alone_are_no_decimal_commas(tmp_path):
-    (tmp_path / "t.csv").write_text(
-        "".join(f"{k},{'!x' if k == 9 else f'2,{-k}'}\n" for k in range(N))
-    )
-    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx")
+def test_commas_alone_are_no_decimal_commas(table):
+    lines = (f"{k},{'!x' if k == 9 else f'2,{-k}'}\n" for k in range(N))
+    made, chunk, _ = table(lines, "time:s,S.fx")
     assert (made.samples, made.corrupt) == (N - 1, 1)
     assert set(chunk.values[:, 0, 0].tolist()) == {2}
 
 
-def test_a_comma_of_thousands_is_no_decimal_comma(tmp_path):
-    (tmp_path / "t.csv").write_text("t,x\n" + "".join(f'0.{k},"{k},250"\n' for k in range(1, 9)))
+def test_a_comma_of_thousands_is_no_decimal_comma(table):
     with pytest.raises(RecordingError, match="'1,250' is no number"):
-        imported(tmp_path / "t.csv", "t=time:s,x=S.fx")
+        table(["t,x\n", *(f'0.{k},"{k},250"\n' for k in range(1, 9))], "t=time:s,x=S.fx")
 
 
 @pytest.mark.parametrize(
@@ -156,58 +157,54 @@ def test_gzip_and_utf16(tmp_path, packed):
         ("14.11.2023 22:13:20.5", "time:iso", 1_700_000_000_500_000_000),
     ],
 )
-def test_times_are_exact_and_those_since_1970_are_utc(tmp_path, cell, column, t_ns):
+def test_times_are_exact_and_those_since_1970_are_utc(table, cell, column, t_ns):
     later = {"time:s": "1700000001", "time:ns": "1700000001000000000", "time:ms": "1700000001000"}
     second = later.get(column, "2023-11-14 22:13:21")
-    (tmp_path / "t.csv").write_text(f"{cell},1\n{second},2\n" + f"{second[:-1]}9,3\n")
-    _, chunk, about = imported(tmp_path / "t.csv", f"{column},S.fx")
+    _, chunk, about = table(f"{cell},1\n{second},2\n" + f"{second[:-1]}9,3\n", f"{column},S.fx")
     assert int(chunk.t_ns[0]) + about.utc_offset_ns == t_ns
 
 
-def test_what_is_missing_is_not_valid_and_what_is_no_row_is_corrupt(tmp_path):
-    lines = ["t,x,y", "0.0,1,2", "0.1,,3", "0.2,nan,null", "0.3,abc,1", "0.4,1", "0.5,4,5", "0.6,7"]
-    (tmp_path / "t.csv").write_text("\n".join([*lines[:6], *(f"0.{k},1,1" for k in range(5, 10))]))
-    made, chunk, _ = imported(tmp_path / "t.csv", "t=time:s,x=A0.fx,y=B0.fx")
-    assert (made.samples, made.corrupt) == (8, 2 - (len(lines) < 7))
+def test_what_is_missing_is_not_valid_and_what_is_no_row_is_corrupt(table):
+    text = "t,x,y\n0.0,1,2\n0.1,,3\n0.2,nan,null\n0.3,abc,1\n0.4,1\n"
+    text += "0.5,1,1\n0.6,1,1\n0.7,1,1\n0.8,1,1\n0.9,1,1"
+    made, chunk, _ = table(text, "t=time:s,x=A0.fx,y=B0.fx")
+    assert (made.samples, made.corrupt) == (8, 2)
     assert chunk.valid[:3].tolist() == [[True, True], [False, True], [False, False]]
     assert any("'abc' is no number" in note for note in made.notes)
 
 
-def test_a_count_tells_what_is_missing(tmp_path):
+def test_a_count_tells_what_is_missing(table):
     counts = [250, 251, 252, 255, 0, 1, 1, 2]
-    (tmp_path / "t.csv").write_text("".join(f"{c} {k} 5\n" for k, c in enumerate(counts)))
-    made, chunk, _ = imported(tmp_path / "t.csv", "count:8,time:s,S.fx")
+    lines = (f"{c} {k} 5\n" for k, c in enumerate(counts))
+    made, chunk, _ = table(lines, "count:8,time:s,S.fx")
     assert (made.samples, made.missing) == (7, 2)
     assert chunk.seq.tolist() == [0, 1, 2, 5, 6, 7, 8]
 
 
-def test_rows_of_one_time_are_spread_and_times_that_go_back_go_on(tmp_path):
+def test_rows_of_one_time_are_spread_and_times_that_go_back_go_on(table):
     coarse = [0.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.2]
-    (tmp_path / "t.csv").write_text("".join(f"{t},1,2\n" for t in coarse))
-    made, chunk, about = imported(tmp_path / "t.csv", "time:s,S.fx,S.fy")
+    made, chunk, about = table((f"{t},1,2\n" for t in coarse), "time:s,S.fx,S.fy")
     assert np.diff(chunk.t_ns).min() > 15e6 and any("spread" in note for note in made.notes)
     assert about.spec.rate_hz == 40
     assert np.diff(chunk.t_ns).tolist() == [25_000_000] * 11
-    (tmp_path / "t.csv").write_text("".join(f"{t / 10},1,2\n" for t in [*range(9), *range(9)]))
-    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx,S.fy")
+    back = [*range(9), *range(9)]
+    made, chunk, _ = table((f"{t / 10},1,2\n" for t in back), "time:s,S.fx,S.fy")
     assert np.diff(chunk.t_ns).tolist() == [100_000_000] * 17
     assert any("times go back 1 times" in note for note in made.notes)
 
 
-def test_rows_of_several_lines_after_some_to_skip(tmp_path):
-    lines = ["-10000", *(x for k in range(9) for x in (f"{k} 1 2", f"{k + 1} 3", "7"))]
-    (tmp_path / "t.txt").write_text("\n".join(lines) + "\n")
-    made, chunk, _ = imported(tmp_path / "t.txt", "-{1..3},T{0..2}.p:1", 20, skip=1, lines=3)
+def test_rows_of_several_lines_after_some_to_skip(table):
+    text = ["-10000\n", *(f"{k} 1 2\n{k + 1} 3\n7\n" for k in range(9))]
+    made, chunk, _ = table(text, "-{1..3},T{0..2}.p:1", 20, skip=1, lines=3)
     assert made.samples == 9 and chunk.values[4].ravel().tolist() == [5, 3, 7]
     assert np.diff(chunk.t_ns).tolist() == [50_000_000] * 8
 
 
-def test_columns_of_a_file_are_with_their_places(tmp_path):
+def test_columns_of_a_file_are_with_their_places(tmp_path, table):
     (tmp_path / "c.toml").write_text(
         'name = "pad"\ncolumns = ["t=time:s", "x=A0.fx:mN"]\n[elements.A0]\nposition = [1, 2, 3]\n'
     )
-    (tmp_path / "t.csv").write_text("t,x\n" + rows("{s:.2f},{a}\n"))
-    _, _, about = imported(tmp_path / "t.csv", str(tmp_path / "c.toml"))
+    _, _, about = table("t,x\n" + rows("{s:.2f},{a}\n"), str(tmp_path / "c.toml"))
     assert about.spec.name == "pad" and about.spec.positions == ((1, 2, 3),)
 
 
@@ -226,10 +223,9 @@ def test_columns_of_a_file_are_with_their_places(tmp_path):
         ("", "time:s,S.fx", "is no table of numbers"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_told_and_nothing_is_written(tmp_path, text, columns, why):
-    (tmp_path / "t.csv").write_text(text)
+def test_what_cannot_be_is_told_and_nothing_is_written(tmp_path, table, text, columns, why):
     with pytest.raises((ConfigError, RecordingError), match=why):
-        imported(tmp_path / "t.csv", columns)
+        table(text, columns)
     assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
 
 

@@ -20,12 +20,13 @@ HEADS = {  # lines above the rows, of three columns
     "": [], "names": ["t,Fx,Fy"], "units": ["t,Fx,Fy", "s,N,N"], "remark": ["# t,Fx,Fy"],
     "preamble": ["Sensor: ATI mini40", "Rate,100", "", "t,Fx,Fy"],
 }  # fmt: skip
+FEW = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=8
+)
 COUNTS = {k: st.integers(0, 3) for k in ("cut", "more", "words", "twice", "blank", "remark")}
 
 
-@settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=8
-)
+@FEW
 @given(
     st.sampled_from(sorted(HEADS)), st.fixed_dictionaries(COUNTS), st.randoms(),
     st.sampled_from([",", ";", "\t", "|"]), st.sampled_from(["\n", "\r\n", "\r"]),
@@ -57,9 +58,7 @@ def test_the_lines_of_a_table_add_up(
     assert made.seconds == pytest.approx(0.39, abs=0.011)
 
 
-@settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=8
-)
+@FEW
 @given(
     st.integers(0, 3), st.integers(0, 3), st.integers(0, 3), st.booleans(), st.randoms(),
     st.sampled_from(["\n", "\r\n", "\r"]), st.sampled_from(["", "12:00:{:06.3f} -> "]),
@@ -153,6 +152,5 @@ def test_dates_are_read_as_people_write_them(tmp_path, cell, column, seconds):
     table = read_table(tmp_path / "t.csv", csv_form(tmp_path / "t.csv"))
     import_table(table, tmp_path / "o.mcap", f"t=time:{column},Fx=S.fx")
     day = 1_693_872_000 if "/5/" in cell or cell[0] == "5" else 1_694_822_400
-    assert Recording(tmp_path / "o.mcap").description.utc_offset_ns == day * 10**9 + round(
-        1e9 * seconds
-    )
+    begin_ns = day * 10**9 + round(1e9 * seconds)
+    assert Recording(tmp_path / "o.mcap").description.utc_offset_ns == begin_ns

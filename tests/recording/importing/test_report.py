@@ -33,10 +33,9 @@ def test_bytes_are_read_or_passed_over(tmp_path, noise, tail):
     data = b"".join(noise.get(k, b"") + p for k, p in enumerate(packets)) + packets[0][:tail]
     (tmp_path / "raw.bin").write_bytes(data)
     made = import_wire(read_log(tmp_path / "raw.bin"), tmp_path / "o.mcap", {"codec": "bota"})
-    report = made
-    assert (report.unit, report.total) == ("bytes", len(data))
-    assert report.read == FRAME * made.intact == FRAME * len(packets)
-    assert report.read + report.passed_over == report.total
+    assert (made.unit, made.total) == ("bytes", len(data))
+    assert made.read == FRAME * made.intact == FRAME * len(packets)
+    assert made.read + made.passed_over == made.total
     assert made.notes == ([f"it ends with {tail} bytes of no whole sample"] if tail else [])
 
 
@@ -60,10 +59,10 @@ def test_messages_of_any_size_are_samples_of_the_largest(tmp_path_factory, sizes
     folder = tmp_path_factory.mktemp("bag")
     bag = arrays(folder / "bag", sizes)
     made = import_bag(bag, folder / "o.mcap")
-    report, fewer = made, [k for k, n in enumerate(sizes, 1) if n < max(sizes)]
-    assert (report.unit, report.total, report.read) == ("messages", len(sizes), len(sizes))
-    assert report.invalid == len(fewer) and len(report.ranges) == max(sizes)
-    assert report.ranges[f"T{max(sizes) - 1}.value"] == (max(sizes) - 1,) * 2
+    fewer = [k for k, n in enumerate(sizes, 1) if n < max(sizes)]
+    assert (made.unit, made.total, made.read) == ("messages", len(sizes), len(sizes))
+    assert made.invalid == len(fewer) and len(made.ranges) == max(sizes)
+    assert made.ranges[f"T{max(sizes) - 1}.value"] == (max(sizes) - 1,) * 2
     told = "messages that lack some of the numbers, which are invalid"
     assert made.notes == ([f"{told}: {len(fewer)} (message {fewer[0]})"] if fewer else [])
     assert bag_topics(bag)[0].columns.startswith("data")
@@ -106,10 +105,9 @@ def test_what_a_counter_misses_and_a_frame_lacks_is_told_with_its_place(tmp_path
     lines[20] = lines[20][:-2]
     (tmp_path / "can.log").write_text("\n".join(lines) + "\n\nnoise\n")
     made = import_wire(read_log(tmp_path / "can.log"), tmp_path / "o.mcap", {"codec": "aft200"})
-    report = made
-    assert (report.unit, report.total, report.passed_over) == ("lines", len(lines) + 1, 1)
+    assert (made.unit, made.total, made.passed_over) == ("lines", len(lines) + 1, 1)
     assert f"passed over, no line of a candump log: 1 (line {len(lines) + 2})" in made.notes
     assert "corrupt frames: 1 (frame 21)" in made.notes
-    assert report_lines(report)[1].startswith("81 lines: 80 read, 1 passed over, 0 out of order")
-    assert report.said_hz == 1000 and made.rate_hz == report.found_hz
-    assert report.found_hz == pytest.approx(50, rel=0.03)
+    assert report_lines(made)[1].startswith("81 lines: 80 read, 1 passed over, 0 out of order")
+    assert made.said_hz == 1000 and made.rate_hz == made.found_hz
+    assert made.found_hz == pytest.approx(50, rel=0.03)
