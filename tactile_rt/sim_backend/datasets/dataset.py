@@ -212,7 +212,7 @@ class _Work:
 
 @lru_cache(maxsize=1)
 def _objects_once(choice: bytes) -> ShapeObjects | MeshObjects:
-    """Objects of a choice, once in a process: Ray hands each task a work of its own."""
+    """Choose objects, once in a process, as Ray hands each task its own work."""
     return choose_objects(msgspec.json.decode(choice, type=ObjectChoice))
 
 

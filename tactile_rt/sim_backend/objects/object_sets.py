@@ -158,7 +158,7 @@ def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
 
 
 def read_table(folder: Path) -> dict[str, ObjectRow]:
-    """Read what a folder's table says of its objects by their names; nothing if it has none."""
+    """Read the rows of a folder's table by their objects' names; none without a table."""
     path = folder / FOLDER_TABLE
     if not path.exists():
         return {}

@@ -11,19 +11,8 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
-<<<<<<< HEAD
 from tactile_rt.drivers.codecs.ascii_text import Names
-from tests.helpers.codec_contract import (
-    T0,
-    CodecCase,
-    CodecContract,
-    chunk_of,
-    decode,
-    stacked,
-)
-=======
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
->>>>>>> x/tb
 
 EXAMPLE = Path(__file__).parents[3] / "docs" / "codecs" / "ascii_line.toml"
 PLAIN = "A0.fx,A0.fy,B1.fx,B1.fy"
