@@ -129,8 +129,8 @@ def merge_categories(
                 raise ConfigError(f"classes: {category!r} is both {class_of[category]} and {one}")
     if not class_of:
         return manifest
-    known = [name for name in manifest.names() if manifest.label(name) >= 0]
-    before = {name: manifest.category(name) for name in known}
+    labelled = [name for name in manifest.names() if manifest.label(name) >= 0]
+    before = {name: manifest.category(name) for name in labelled}
     return replace(
         manifest,
         categories=tuple(dict.fromkeys(class_of.get(c, c) for c in manifest.categories)),
