@@ -1,6 +1,7 @@
 """A project's folder: your whiskers, what touches them, your robot.
 
 array.toml       your whiskers and what reads them
+array.json       the same as a robot knows them, which no device or model may differ from
 sweeps.toml      what touches them, and how
 robot.toml       the device and the model of `tactile-rt run robot.toml`
 test_robot.py    your robot's own code, driven by the device that does not exist yet
@@ -45,12 +46,6 @@ RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
 NO_NAME = re.compile(r"[^\w.+-]+")  # what a URL or a file in TOML would take for something else
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
-# What robot.toml says of a device: a robot's codec does not know the places of its whiskers.
-DECLARED = 'array = "model.onnx"         # whose whiskers they are: the codec does not know'
-UNDECLARED = """\
-# A device that speaks another codec (`tactile-rt codecs`) is said to be your array:
-# url = "serial:///dev/ttyUSB0?codec=bota"
-# array = "model.onnx\""""
 SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
 # mm/s, of objects of 40 mm. Larger ones are faster: so in a window as much of the array is touched.
 SPEEDS = (28, 40)
@@ -93,6 +88,11 @@ class Project:
         self.folder = folder
         self.array, self.model = folder / "array.toml", folder / "model.onnx"
         self.build, self.report = folder / "build", folder / "report"
+
+    def write_spec(self) -> None:
+        """Write array.json, the array as a source and a model have it."""
+        spec = device_spec(load_animals(str(self.array)))
+        _write(self.folder / "array.json", spec.to_json())
 
     def recipe(self) -> SweepRecipe:
         """What is to be swept past the array; its numbers of objects and sweeps are the most."""
@@ -207,7 +207,6 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         "whiskers": str(len(spec.elements)),
         "link": f"/tmp/{name}",
         "device": ROBOTS.get(array, "codec=native"),
-        "declared": DECLARED if array in ROBOTS else UNDECLARED,
     }
     folder.mkdir(parents=True, exist_ok=True)
     texts = {name: (templates / f"{name}.txt").read_text("utf-8") for name in FILES}
@@ -215,11 +214,13 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         for name, text in texts.items():
             _write(folder / name, Template(text).substitute(words))
         _write(folder / "array.toml", described)
+        project = Project(folder)
+        project.write_spec()
     except OSError:  # the disk is full: the folder may be named again
-        for name in texts:
+        for name in (*texts, "array.toml"):
             (folder / name).unlink(missing_ok=True)
         raise
-    return Project(folder)
+    return project
 
 
 def _described(array: str, folder: Path) -> str:

@@ -86,6 +86,7 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
     sweeps = _sweep(project, budget, begun + SWEPT_BY * 60 * minutes, end, tell)
     best = _train(project, budget, sweeps, begun + TRAINED_BY * 60 * minutes, end, tell)
     tell(MakeProgress("exporting", 0, 1, end - time.monotonic()))
+    project.write_spec()
     release(best, project.model, project.folder.resolve().name)
     tell(MakeProgress("evaluating", 0, 1, end - time.monotonic()))
     project.report.mkdir(exist_ok=True)

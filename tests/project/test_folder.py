@@ -2,6 +2,7 @@
 
 import errno
 import re
+import shutil
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -15,6 +16,7 @@ pytest.importorskip("matplotlib")
 
 import trimesh
 
+from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.project import folder as folder_module
@@ -64,15 +66,19 @@ def test_a_robot_s_project_is_its_array_behind_its_codec(name: str, tmp_path: Pa
     assert project.array.read_text("utf-8") == robot_text(name), "a copy, to be changed"
     source = load_config(project.folder / "robot.toml").config.source[0]
     assert source.url == f"serial:///tmp/mine?{ROBOTS[name]}"
-    assert source.array == str(project.model)
+    assert source.array == str(project.folder / "array.json")
+    assert check_source(source.url, array=source.array) == device_spec((load_array(name),))
     line = project.line()
     assert (line.wire, line.port) == ("serial", "/tmp/mine")
     assert urlencode({"codec": line.codec, **line.options}) == ROBOTS[name]
     assert project.spoken() == (line.codec, line.options)
     assert project.spoken("native", {"format": "int16"})[1]["format"] == "int16"
-    array = tmp_path / "array.json"
-    array.write_text(device_spec((load_array(str(project.array)),)).to_json())
-    assert check_source(source.url, array=str(array)) == device_spec((load_array(name),))
+
+
+def test_a_model_of_another_array_is_refused(project: Project, refused) -> None:
+    shutil.copy(shipped_model(), project.model)
+    said = refused("config", "check", project.folder / "robot.toml")
+    assert "source whiskers" in said and "mouse44.onnx" not in said
 
 
 def test_the_device_meets_what_the_sweeps_say(tmp_path: Path) -> None:
