@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 POLL_S = 0.1
 REST_S = 2.0  # at rest, to measure the noise by
 HINT_S = 20.0  # without a touch, before it is said how strong the readings are; then twice as long
+SILENT_S = 3.0  # without a sample, in a lesson: it is said at once
+RESTS = 3  # tries to be at rest
+PAGE_S = 1.5  # a page asks twice a second
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 RESTING = f"touch nothing for {REST_S:g} s"
 HELP = "type and press Enter: a class or its number, n the next, u takes a touch back, q learns"
@@ -78,18 +81,21 @@ def teach(
         raise ConfigError(f"--json {json} is a file of the lesson, or its model: name another")
     lesson = _begun_before(folder, base)
     opened = open_url(source)
-    with opened, alone_in(folder), Orders(at) as orders, leaving(seconds):
-        lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
-        orders.teacher = Teacher(lesson, wanted, touches)
-        _teach(orders.teacher, opened, source, orders)
-    teacher = orders.teacher
-    if lesson is None or teacher is None or not lesson.taught_enough:
-        raise ConfigError(
-            f"{folder}: touches kept: {len(lesson.touches) if lesson else 0}, too few to learn "
-            "from: two of a class are needed; run the same command to go on"
-        )
-    began = time.process_time()
-    card = lesson.learn()
+    with opened, alone_in(folder), Orders(at) as orders:
+        with leaving(seconds):
+            lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
+            orders.teacher = Teacher(lesson, wanted, touches)
+            _teach(orders.teacher, opened, source, orders)
+        teacher = orders.teacher
+        if lesson is None or teacher is None or not lesson.taught_enough:
+            few = f"touches kept: {len(lesson.touches) if lesson else 0}, too few to learn from"
+            orders.end(few)
+            raise ConfigError(
+                f"{folder}: {few}: two of a class are needed; run the same command to go on"
+            )
+        began = time.process_time()
+        card = lesson.learn()
+        orders.end(f"{folder / MODEL} knows {', '.join(lesson.taught_enough)}")
     for line in (*teacher.summary(), *_losses(opened)):
         typer.echo(line)
     learnt = lesson.taught_enough
@@ -143,6 +149,12 @@ class Orders:
         if self._page is not None:
             self._page.close()
 
+    def end(self, said: str) -> None:
+        """Let the page show how the lesson ended, for as long as it takes to ask for it."""
+        if self.teacher is not None:
+            self.teacher.ended = said
+            time.sleep(PAGE_S if self._page else 0)
+
     def listen(self) -> None:
         """Take lines of stdin from now on."""
         threading.Thread(target=self._take_lines, daemon=True).start()
@@ -183,6 +195,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
         typer.echo(teacher.prompt())
         label = teacher.label  # of the touch under way, or of the next
         quiet_since, patience_s = time.monotonic(), HINT_S
+        heard, silent = time.monotonic(), False
         while not teacher.done:
             if time.monotonic() - quiet_since > patience_s:
                 _say(teacher.note(listener.hint()))
@@ -194,7 +207,13 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
             while not teacher.done and (order := orders.next()):
                 _say(teacher.obey(order))
             if chunk is None:
+                if time.monotonic() - heard > SILENT_S and not silent:
+                    silent = True
+                    _say(teacher.note(f"no sample for {SILENT_S:g} s: is the device plugged in?"))
                 continue
+            if silent:
+                _say(teacher.note("samples come again"))
+            heard, silent = time.monotonic(), False
             writer.push(chunk)
             if not listener.touching:
                 label = teacher.label
@@ -250,11 +269,24 @@ def _address(given: str) -> tuple[str, int]:
 
 def _begun(folder: Path, source: "Source") -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
-    from tactile_rt.core.stream import EndOfStream
     from tactile_rt.teaching.lesson import Lesson
-    from tactile_rt.teaching.listener import measured_floor
+    from tactile_rt.teaching.listener import find_motion, measured_floor
 
-    typer.echo(RESTING)
+    for _ in range(RESTS):
+        typer.echo(RESTING)
+        chunks = _take_rest(source)
+        if not (moved := find_motion(chunks, source.spec)):
+            return Lesson.begun(folder, source.spec, measured_floor(chunks))
+        typer.echo(f"that was no rest: {moved} moved")
+    raise SourceError(
+        f"no rest in {RESTS} tries: {moved} moves; hold the array still, or look at it with "
+        "`tactile-rt hz`"
+    )
+
+
+def _take_rest(source: "Source") -> "list[Chunk]":
+    from tactile_rt.core.stream import EndOfStream
+
     chunks: list[Chunk] = []
     samples, needed = 0, REST_S * source.spec.rate_hz
     heard = time.monotonic()
@@ -269,7 +301,7 @@ def _begun(folder: Path, source: "Source") -> "Lesson":
             heard = time.monotonic()
         elif time.monotonic() - heard > DEAF_S:
             raise SourceError(f"no sample came for {DEAF_S:g} s: is the device on, and its codec?")
-    return Lesson.begun(folder, source.spec, measured_floor(chunks))
+    return chunks
 
 
 def _greeting(lesson: "Lesson", source: "Source") -> str:

@@ -16,6 +16,7 @@ A lesson is a folder, so that it can be gone on with, looked at and corrected:
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,7 @@ __all__ = [
 ORDERS = ("next", "undo", "done")  # to a teacher; any other word is the label from now on
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
+SAME, ENOUGH = 0.65, 5  # share of the touches of two classes told apart; touches of each
 ODD = 3.0  # times as far from its class as its others are, a touch is odd
 
 Floats = NDArray[np.float64]
@@ -267,11 +269,13 @@ class LessonProgress:
         odd: Touches that are unlike the others of their class: their number, counted from 1, and
             the class that they are most like.
         confused: Pairs of classes that are taken for one another, the most often first.
+        same: Pairs of classes that feel the same: touches of the two are told apart by chance.
     """
 
     classes: tuple[tuple[str, int, int], ...]
     odd: tuple[tuple[int, str], ...]
     confused: tuple[tuple[str, str], ...]
+    same: tuple[tuple[str, str], ...] = ()
 
     @property
     def right(self) -> tuple[int, int]:
@@ -297,7 +301,14 @@ def _progress(used: Sequence[int], names: Sequence[str], found: LeaveOneOut) -> 
         (name, names.count(name), int(found.right[own == np.searchsorted(classes, name)].sum()))
         for name in dict.fromkeys(names)
     )
-    return LessonProgress(told, tuple(odd), tuple(pairs))
+    alike = []
+    for a, b in combinations(range(len(classes)), 2):
+        both = (own == a) | (own == b)
+        counts = (own == a).sum(), (own == b).sum()
+        nearer = (distances[both, a] < distances[both, b]) == (own[both] == a)
+        if min(counts) >= ENOUGH and nearer.mean() < SAME:
+            alike.append((str(classes[a]), str(classes[b])))
+    return LessonProgress(told, tuple(odd), tuple(pairs), tuple(alike))
 
 
 def _check_free(folder: Path) -> None:

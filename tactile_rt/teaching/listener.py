@@ -10,11 +10,13 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["Listener", "measured_floor"]
+__all__ = ["Listener", "find_motion", "measured_floor"]
 
 HASTY_NS = 200_000_000  # after the end of a contact, within which another is not a touch of its own
 FELT = 6.0  # times the noise, for two samples running, is felt
 LONG_AGO_NS = 2**62
+# Parts of a rest, and by how many times the noise within them their means differ at most.
+REST_PARTS, MOVED = 8, 10.0
 QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
 
 
@@ -79,6 +81,7 @@ class Listener:
                 self.hasty, self._counts = self.hasty + hasty, not hasty
             self._steps.append(decision)
             if decision.final and self._counts:
+                self._heard, self._strongest = 0, 0.0  # it is no touch that was missed
                 yield decision.onset_ns, decision.t_ns, self._felt(self._steps)
 
     def _released_before(self, onset_ns: int) -> int:
@@ -114,6 +117,27 @@ class Listener:
     def seconds(self, t_ns: int) -> float:
         """Stream time in seconds since the first sample."""
         return (t_ns - (self._first_ns or 0)) / NS_PER_S
+
+
+def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
+    """Find a reading that was not at rest: its element and channel, or nothing.
+
+    Means of eighths of the time differ by no more than ten times the noise at rest, or by two of
+    the levels that a reading has.
+    """
+    values = np.concatenate([c.values for c in chunks]).astype(float) if chunks else np.empty(0)
+    if len(values) < 4 * REST_PARTS:
+        return ""
+    parts = np.array_split(values, REST_PARTS)
+    apart = np.ptp([part.mean(axis=0) for part in parts], axis=0)
+    noise = np.median([part.std(axis=0) for part in parts], axis=0)
+    for element in range(values.shape[1]):
+        for channel in range(values.shape[2]):
+            levels = np.unique(values[:, element, channel])
+            step = float(np.diff(levels).min()) if len(levels) > 1 else 0.0
+            if apart[element, channel] > max(MOVED * noise[element, channel], 2 * step):
+                return f"{spec.elements[element]} {spec.channels[channel]}"
+    return ""
 
 
 def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:

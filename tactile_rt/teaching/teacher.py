@@ -26,6 +26,7 @@ class Teacher:
         wanted: The names of the classes to be taught, in their order; more come as they are named.
         label: The name of what is touched now; empty: nobody has said.
         done: Whether who teaches has had enough, or all that was wanted is there.
+        ended: How the lesson ended; empty: it goes on.
     """
 
     lesson: Lesson
@@ -33,6 +34,7 @@ class Teacher:
     each: int
     label: str = ""
     done: bool = False
+    ended: str = ""
     said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether there is a list to be worked through, and then an end
@@ -105,6 +107,8 @@ class Teacher:
 
     def prompt(self) -> str:
         """What to do now."""
+        if self.ended:
+            return self.ended
         if self.done:
             return "all touches are there"
         if not self.label:
@@ -124,6 +128,7 @@ class Teacher:
             "label": self.label,
             "each": self.each,
             "done": self.done,
+            "ended": bool(self.ended),
             "prompt": self.prompt(),
             "classes": [
                 {
@@ -147,7 +152,10 @@ class Teacher:
             f"{name}: {good} of {count} touches right, leave-one-out"
             for name, count, good in self.progress.classes
         ]
-        lines += [f"{a} is taken for {b}" for a, b in self.progress.confused[:3]]
+        lines += [f"{a} and {b} feel the same: make them one" for a, b in self.progress.same]
+        same = {frozenset(pair) for pair in self.progress.same}
+        others = [pair for pair in self.progress.confused if frozenset(pair) not in same]
+        lines += [f"{a} is taken for {b}" for a, b in others[:3]]
         learnt = self.lesson.taught_enough
         if learnt and not lines:
             lines = [f"{learnt[0]} is the only class: teach another, to see if they are told apart"]

@@ -16,7 +16,7 @@ from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.teaching.head import fit_classes, leave_one_out
 from tactile_rt.teaching.lesson import MODEL, ORDERS, Lesson
-from tactile_rt.teaching.listener import measured_floor
+from tactile_rt.teaching.listener import find_motion, measured_floor
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -28,9 +28,9 @@ TAUGHT = [kind for kind in KINDS for _ in range(EACH)]
 FLOOR = (0.3 * NOISE).astype(np.float32)
 
 
-def teach(lesson: Lesson, labels: list[str], seed: int) -> None:
-    """TaughtTouch, as the command does."""
-    chunks = cut(felt(labels, seed), RATE_HZ)
+def teach(lesson: Lesson, labels: list[str], seed: int, kinds: list[str] | None = None) -> None:
+    """Teach touches, of these kinds if not of what they are called, as the command does."""
+    chunks = cut(felt(kinds or labels, seed), RATE_HZ)
     path = lesson.next_recording()
     source = ArraySource(wrench_spec(), chunks)
     listener, told = lesson.listener(source.spec), iter(labels)
@@ -217,6 +217,27 @@ def test_it_says_why_nothing_was_felt(taught):
     for chunk in cut(held, RATE_HZ, start_ns=3_000_000_000):
         list(listener.push(chunk))
     assert "touched all the while: let go" in listener.hint()
+
+
+@pytest.mark.parametrize("levels", [0.0, 0.5])
+def test_a_rest_in_which_something_moved_is_named(levels):
+    spec, rng = wrench_spec(), np.random.default_rng(0)
+    values = rng.normal(0, 0.1, (200, len(spec.elements), len(spec.channels)))
+
+    def rest() -> str:
+        rounded = np.round(values / levels) * levels if levels else values
+        return find_motion(list(cut(rounded.astype(np.float32), RATE_HZ)), spec)
+
+    assert rest() == ""
+    values[60:110, 0, 2] += 3.0
+    assert rest() == f"{spec.elements[0]} {spec.channels[2]}"
+
+
+def test_two_classes_that_are_the_same_are_named(tmp_path):
+    lesson = Lesson.begun(tmp_path / "lesson", wrench_spec(), FLOOR)
+    teach(lesson, ["press", "slide"] * 8, seed=3, kinds=["press"] * 16)
+    assert Teacher(lesson, [], 8).progress.same == (("press", "slide"),)
+    assert "press and slide feel the same: make them one" in Teacher(lesson, [], 8).summary()
 
 
 def test_what_cannot_be_is_one_line(taught, tmp_path):

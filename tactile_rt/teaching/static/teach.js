@@ -3,6 +3,7 @@ const $ = (id) => document.getElementById(id);
 const buttons = new Map(); // of the classes, by name
 let listed = ""; // names of the classes on the page
 let shown = ""; // the newest state
+let ended = false; // and the page says how
 let asking = false; // an answer is on its way
 
 async function order(text) {
@@ -38,6 +39,7 @@ function show(state) {
   $("prompt").textContent = state.prompt;
   if (!state.classes) return; // at rest, before the first touch
   $("note").textContent = state.said;
+  ended = state.ended;
   const made = state.classes.map((entry) => button(state.each, entry, entry.name === state.label));
   const names = state.classes.map((entry) => entry.name).join("\n");
   if (names !== listed) $("classes").replaceChildren(...made);
@@ -64,8 +66,8 @@ async function look() {
     if (text !== shown) show(JSON.parse(text));
     shown = text;
   } catch {
+    if (!ended) $("prompt").textContent = "The teaching program has ended.";
     shown = "";
-    $("prompt").textContent = "The teaching program has ended.";
   } finally {
     asking = false;
   }
