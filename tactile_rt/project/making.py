@@ -29,7 +29,7 @@ from tactile_rt.project.folder import Project
 from tactile_rt.project.report import write_report
 from tactile_rt.sets.objects import read_skipped, write_skipped
 from tactile_rt.sim_backend.datasets.dataset import describe_set, finished_objects, make_sweeps
-from tactile_rt.sim_backend.datasets.inventory import write_sums
+from tactile_rt.sim_backend.datasets.inventory import tally, write_sums
 
 __all__ = ["MakeProgress", "make"]
 
@@ -120,6 +120,10 @@ def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tel
             folder, read_skipped(folder) | dict.fromkeys(left, "there was no time for it")
         )
         write_sums(folder)
+    counted = tally(folder, manifest.names(), len(recipe.sweeps))
+    if counted.shortcomings:
+        said = f"{counted.sweeps} sweeps: {counted.shortcomings}"
+        tell(MakeProgress(said, of, of, end - time.monotonic()))
     return folder
 
 

@@ -64,7 +64,7 @@ class Sensor:
         described: SensorSpec | None = None,
         drawn: bool = True,
     ) -> None:
-        self._model, self._spec = model, spec
+        self._model, self._spec, self._drawn = model, spec, drawn
         seeds = np.random.SeedSequence(seed).spawn(len(EFFECTS))
         self._rng = {e: np.random.default_rng(s) for e, s in zip(EFFECTS, seeds, strict=True)}
 
@@ -173,7 +173,8 @@ class Sensor:
         on = self._resolution > 0
         values[..., on] = np.rint(values[..., on] / self._resolution[on]) * self._resolution[on]
         beyond = np.abs(values) > self._range
-        if not self.saturated and beyond.any():
+        # of a set's sweeps, who makes them counts
+        if self._drawn and not self.saturated and beyond.any():
             element, channel = np.argwhere(beyond)[0, 1:]
             log.warning(
                 "%s of %s is beyond the %g %s that the sensor can read",

@@ -245,12 +245,14 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     Returns:
         (sample, element, channel) values, SI, and the parameters of `sweep.Sweep` with `draw`, the
         sweep's number among those of its combination, `touches`, 0 when it misses the array,
-        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then, and
-        `wedged`, how many whiskers had no room, see `SweepSimulation`. With contacts if the recipe
-        asks for them: they are the truth, whatever the sensors make of it.
+        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then,
+        `saturated`, the share of the readings that the sensor clips, and `wedged`, how many
+        whiskers had no room, see `SweepSimulation`. With contacts if the recipe asks for them: they
+        are the truth, whatever the sensors make of it.
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
     ideal = load_animals(recipe.array)
+    elements = sum(len(animal.whiskers) for animal in ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
     most = 1 if recipe.sweeps.keeps_misses else DRAWS
@@ -264,21 +266,22 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         made = _simulated(recipe, simulation) if simulation.touches else None
         if made is not None:
             break
+    loads, felt = made or (np.zeros((0, elements, len(LOADS))),) * 2
+    values, saturated = _sensed(recipe, target, index, loads)
     parameters = {
         **asdict(sweep),
         "draw": recipe.sweeps.draw_index(index),
         "touches": float(simulation.touches),
         "unstable": float(simulation.touches and made is None),
+        "saturated": saturated,
         "wedged": float(len(simulation.wedged)),
     }
-    elements = sum(len(animal.whiskers) for animal in ideal)
-    loads, felt = made or (np.zeros((0, elements, len(LOADS))),) * 2
     # Through the loads' own resampler, so that a contact is of the same time as what it causes.
     contacts = None
     if recipe.contacts:
         felt = felt[..., : len(CONTACT_CHANNELS)]
         contacts = contact_distances(_resampled(recipe, _chunk(recipe, felt), FASTEST_HZ))
-    return SweepRecord(_sensed(recipe, target, index, loads), parameters, contacts)
+    return SweepRecord(values, parameters, contacts)
 
 
 def _simulated(
@@ -305,8 +308,9 @@ def _simulated(
 
 def _sensed(
     recipe: SweepRecipe, target: TactileObject, index: int, loads: NDArray[np.float64]
-) -> Floats:
-    """(sample, element, channel) what the array's sensor, and the recipe's, make of the loads.
+) -> tuple[Floats, float]:
+    """(sample, element, channel) what the array's sensor, and the recipe's, make of the loads; and
+    the share of the readings that it clips.
 
     Noise, offset and drift that the array's description tells of are left to training, which draws
     them afresh each time that it takes a sweep.
@@ -319,10 +323,13 @@ def _sensed(
     else:
         chunk = Transducer(described, spec.elements).push(_chunk(recipe, loads))
     assert chunk is not None  # of a lead and a sweep there is always a sample
+    clipped = 0.0
     if described is not None or recipe.sensor != SensorModel():
         key = recipe.key(target.name, index, SENSOR)
-        chunk = Sensor(recipe.sensor, spec, key, described, drawn=False).push(chunk) or chunk
-    return _resampled(recipe, chunk, spec.rate_hz)
+        sensor = Sensor(recipe.sensor, spec, key, described, drawn=False)
+        chunk = sensor.push(chunk) or chunk
+        clipped = sensor.saturated / chunk.values.size
+    return _resampled(recipe, chunk, spec.rate_hz), clipped
 
 
 def _lengths(recipe: SweepRecipe) -> tuple[int, int]:

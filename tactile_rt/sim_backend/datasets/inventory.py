@@ -30,13 +30,15 @@ class Tally:
     misses: int = 0
     unstable: int = 0
     wedged: int = 0
+    saturated: int = 0
     skipped: int = 0
 
     @property
     def shortcomings(self) -> str:
         """What is to be told beside the number of sweeps; nothing if all is well."""
         told = {
-            f"{self.misses} miss the array": self.misses,
+            f"{self.misses} miss the array (larger `size_mm`, less `distance_mm`)": self.misses,
+            f"{self.saturated} exceed the sensor's `range`": self.saturated,
             f"{self.unstable} could not be simulated": self.unstable,
             f"{self.wedged} leave no room for a whisker": self.wedged,
             f"{self.skipped} objects could not be made ({SKIPPED})": self.skipped,
@@ -47,7 +49,7 @@ class Tally:
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
     """Count what there is of these objects."""
     there = [name for name in names if has_object(folder, name)]
-    misses = unstable = wedged = 0
+    misses = unstable = wedged = saturated = 0
     for name in there:
         path = object_path(folder, name)
         check_no_pointer(path)
@@ -57,12 +59,14 @@ def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
                 misses += int((~arrays["touches"]).sum()) if "touches" in known else 0
                 unstable += int(arrays["unstable"].sum()) if "unstable" in known else 0
                 wedged += int((arrays["wedged"] > 0).sum()) if "wedged" in known else 0
+                saturated += int((arrays["saturated"] > 0).sum()) if "saturated" in known else 0
         except Exception as error:  # numpy and zipfile raise a dozen unrelated types
             reason = str(error) or type(error).__name__
             raise RecordingError(
                 f"{path} is damaged ({reason}): delete it and sweep again"
             ) from None
-    return Tally(len(there) * sweeps, misses, unstable, wedged, len(read_skipped(folder)))
+    skipped = len(read_skipped(folder))
+    return Tally(len(there) * sweeps, misses, unstable, wedged, saturated, skipped)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -23,6 +23,7 @@ def folder(tmp_path: Path) -> Path:
         ("b", (True,) * 2, (0, 0)),
     ):
         flags = {"touches": np.array(touches), "unstable": np.array(unstable, np.bool_)}
+        flags["saturated"] = np.array([0.2, 0.0])
         write_object(tmp_path, name, values, flags)
     write_skipped(tmp_path, {"c": "no triangles"})
     return tmp_path
@@ -30,9 +31,10 @@ def folder(tmp_path: Path) -> Path:
 
 def test_misses_failures_and_skipped_objects_are_counted(folder: Path) -> None:
     counts = tally(folder, ["a", "b", "c"], 2)
-    assert counts == Tally(sweeps=4, misses=1, unstable=1, skipped=1)
+    assert counts == Tally(sweeps=4, misses=1, unstable=1, saturated=2, skipped=1)
     assert counts.shortcomings == (
-        "1 miss the array, 1 could not be simulated, 1 objects could not be made (skipped.json)"
+        "1 miss the array (larger `size_mm`, less `distance_mm`), 2 exceed the sensor's `range`, "
+        "1 could not be simulated, 1 objects could not be made (skipped.json)"
     )
     assert tally(folder, ["b"], 2).misses == 0
     assert Tally(sweeps=4).shortcomings == ""
