@@ -288,7 +288,8 @@ def _progress(used: Sequence[int], names: Sequence[str], found: LeaveOneOut) -> 
     own = np.searchsorted(classes, names)
     distances = found.distances[:, -1]
     nearest = distances.argmin(axis=1)
-    mine = distances[np.arange(len(own)), own]
+    squares = distances[np.arange(len(own)), own]  # of a network's classes below 0 well inside
+    mine = np.sqrt(np.maximum(squares, 0))
     odd = []
     for k in range(len(own)):
         others = mine[(own == own[k]) & (np.arange(len(own)) != k)]

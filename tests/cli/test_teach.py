@@ -225,6 +225,13 @@ def test_the_page_shows_and_obeys():
         page.close()
 
 
+def test_a_device_that_falls_silent_is_told(tmp_path):
+    with device(["press"], 1) as line:
+        words = ("teach", url(line), tmp_path / "a", "--classes", "press", "--seconds", "7")
+        done = run_program(*words)
+    assert "no sample for 3 s: is the device plugged in?" in done.stdout
+
+
 def test_letters_and_numbers_are_orders(tmp_path):
     """A number chooses, n goes to the next, u takes back, q learns."""
     with device(["press"] * 2, 1, pace="realtime") as line:

@@ -276,6 +276,13 @@ def test_a_touch_under_a_wrong_name_is_found(taught):
     assert not found.right[1] and found.right[2:].mean() >= 0.9
 
 
+def test_a_touch_is_odd_under_a_wrong_name_and_not_by_chance(taught):
+    assert taught.leave_one_out().odd == ()
+    own, *others = taught.touches
+    wrong = replace(taught, touches=[replace(own, label="slide"), *others])
+    assert wrong.leave_one_out().odd[0] == (1, own.label)
+
+
 def test_who_teaches_is_led_and_obeyed(tmp_path):
     lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
     teacher = Teacher(lesson, ["press", "slide"], 2)
@@ -313,6 +320,14 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert quiet.prompt() == "what is touched next? name it, or choose its number"
     assert "nothing was learnt" in quiet.take("", np.zeros((22, size), "f"), "x", (0, 1))
     assert quiet.obey("undo") == "there is no touch to take back"
+
+
+def test_how_it_ended_is_what_a_page_shows(taught):
+    teacher = Teacher(taught, [], 2)
+    assert not teacher.state()["ended"]
+    teacher.ended = "model.onnx knows press, slide"
+    state = teacher.state()
+    assert (state["ended"], state["prompt"]) == (True, "model.onnx knows press, slide")
 
 
 def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
