@@ -150,7 +150,7 @@ class Orders:
             self._page.close()
 
     def end(self, said: str) -> None:
-        """Let the page show how the lesson ended, for as long as it takes to ask for it."""
+        """Let the page show how the lesson ended, until it has asked for it."""
         if self.teacher is not None:
             self.teacher.ended = said
             time.sleep(PAGE_S if self._page else 0)

@@ -309,8 +309,7 @@ def _simulated(
 def _sensed(
     recipe: SweepRecipe, target: TactileObject, index: int, loads: NDArray[np.float64]
 ) -> tuple[Floats, float]:
-    """(sample, element, channel) what the array's sensor, and the recipe's, make of the loads; and
-    the share of the readings that it clips.
+    """Return readings (sample, element, channel), and the share of them that the sensor clips.
 
     Noise, offset and drift that the array's description tells of are left to training, which draws
     them afresh each time that it takes a sweep.
