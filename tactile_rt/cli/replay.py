@@ -210,6 +210,7 @@ class _Replay:
 def _in_order(files: list[Path]) -> "list[Recording]":
     """The files of one source by time."""
     from tactile_rt.recording import Recording
+    from tactile_rt.recording.layout import DECISIONS, EVENTS, SAMPLES
 
     folders = [path for path in files if path.is_dir()]
     if folders:
@@ -228,9 +229,10 @@ def _in_order(files: list[Path]) -> "list[Recording]":
             raise ConfigError(
                 f"{recording.path} is of another array than {files[0]}: {differing[0]}"
             )
-        first = next(recording.chunks(), None)
+        # One may have no samples: what was decided about those of the file before it came late.
+        first = next(recording.raw(SAMPLES, DECISIONS, EVENTS), None)
         offset = recording.description.utc_offset_ns
-        begins.append(0 if first is None else int(first.t_ns[0]) + offset)
+        begins.append(0 if first is None else first.t_ns + offset)
     return [found[k] for k in sorted(range(len(found)), key=begins.__getitem__)]
 
 

@@ -173,6 +173,20 @@ def test_rotated_files_are_one_stream(call, done, tmp_path):
     assert call("replay", *paths, "--codec", "recorded")[0] == 2
 
 
+def test_a_file_of_late_decisions_comes_after_that_of_their_samples(done, live, tmp_path):
+    decisions = list(Recording(live[0]).raw("decisions"))
+
+    def early(raw):
+        return raw if raw.topic != "decisions" or raw == decisions[0] else None
+
+    files = [
+        again(live[0], tmp_path / "late.mcap", lambda raw: raw if raw in decisions[1:] else None),
+        again(live[0], tmp_path / "early.mcap", early),
+    ]
+    out, _ = done("replay", *files, "--check", "--name", "left")
+    assert " decisions of left are as recorded" in out
+
+
 def test_a_piece_of_a_stream_is_named_as_that(call, live, tmp_path):
     whole = Recording(live[0])
     touched_ns = next(d["t_ns"] for d in whole.decisions() if d["step"] == 3)
