@@ -1,7 +1,6 @@
-"""What could be known of a thing: from its whole surface, and from a noise-free picture of a side.
+"""Bounds of what touch can tell: from a whole surface, and from a noise-free picture of a side.
 
-Bounds of what touch can tell; both need the meshes. An object is 40 mm large and upright, as it is
-swept.
+Both need the meshes. An object is 40 mm large and upright, as it is swept.
 """
 
 from collections.abc import Mapping, Sequence
