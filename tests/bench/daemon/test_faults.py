@@ -6,7 +6,7 @@ pytest.importorskip("zmq")
 pytest.importorskip("onnx")
 faults = pytest.importorskip("bench.daemon.faults")
 
-MOST_SHARE = 0.6  # of a core, for the daemon while nothing is wrong: beyond, a reload costs decisions
+MOST_SHARE = 0.6  # of a core, undisturbed: beyond, a reload alone costs decisions
 
 
 @pytest.mark.slow
