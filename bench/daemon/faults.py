@@ -26,7 +26,6 @@ import numpy as np
 from rich.console import Console
 
 from bench.daemon.fault_kinds import KINDS, FaultKind, FaultScene, Named, may_mount
-from bench.daemon.process import Usage
 from tactile_rt.models.evaluation.records import Record, show, write
 
 TIMES = 40
@@ -177,20 +176,6 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     return Repetition(
         max(0.0, seen - effect), max(0.0, gone - ended), tuple(wrong), watcher.disagreed - disagreed
     ), busy  # fmt: skip
-
-
-def measure_share(seconds: float = 5.0) -> float:
-    """Measure the share of a core that the daemon takes while nothing is wrong.
-
-    Where it is most of one, a reload alone lets a model fall behind, which is then told, truly.
-    """
-    with FaultScene() as scene, _Watcher(scene.ports["metrics"]):
-        time.sleep(1.0)
-        usage = Usage(scene.daemon.process.pid)
-        usage.look()
-        time.sleep(seconds)
-        usage.look()
-        return usage.share
 
 
 def _waited(scene: FaultScene) -> dict[str, int]:

@@ -110,12 +110,18 @@ def test_overrides_come_last():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[train]\nlerning_rate = 1.0", "has no key 'lerning_rate'; did you mean learning_rate?"),
+        (
+            "[train]\nlerning_rate = 1.0",
+            "train has no key 'lerning_rate'; did you mean learning_rate?",
+        ),
         ("[tarin]\nbatch = 3", "the file has no key 'tarin'; did you mean train?"),
         ("[train]\nbatch = 'many'", ":2: train.batch: expected a whole number, got 'many'"),
         ("[search]\noptimizer = ['sgd', 'sdg']", "optimizer is 'sdg', not one of"),
         ("[train]\nencoder = 'foo'", ":1: encoder is 'foo', not one of"),
-        ("[train]\n\n[search]\nlearning_rate = [0.1, -1.0]", ":3: train: learning_rate must be po"),
+        (
+            "[train]\n\n[search]\nlearning_rate = [0.1, -1.0]",
+            ":3: train: learning_rate must be positive",
+        ),
         ("[train]\ndata = 'set'", "train has no key 'data'"),
         ("[search]\nbatch = 3", "search.batch: expected a list, got 3"),
         ("train = ]", ":1: not TOML"),

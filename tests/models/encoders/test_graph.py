@@ -115,7 +115,11 @@ def test_width_scales_every_node_but_not_the_frame():
         ("rows = 5", "rows = 0", "frame: 0 x 7 sites"),
         ("rows = 5", "rows = 1", "first: .* no site|reads no map|no site is left"),
         ("channels = 64", "channels = 0", "up: channels is 0"),
-        ("channels = 64", "chanels = 64", r"nodes\.up has no key 'chanels'; did you mean channel"),
+        (
+            "channels = 64",
+            "chanels = 64",
+            r"nodes\.up has no key 'chanels'; did you mean channels\?",
+        ),
         ("[nodes.first]", "[nodes.frame]", "'frame' must be a name of its own"),
         ("[nodes.first]", '[nodes."a-b"]', "'a-b' must be a name"),
         ('["up", { source = "down"', '["first", { source = "first"', "reads the same node twice"),
