@@ -141,10 +141,14 @@ def make_sweeps(
 
 
 def _spread(manifest: SweepManifest, missing: set[str]) -> list[str]:
-    """What is to be made, in an order in which all splits grow alike: one may stop any time."""
+    """Order objects so that all splits and categories grow alike: one may stop any time."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for side, names in manifest.split.items():
+        for name in names:
+            alike.setdefault((side, manifest.category(name)), []).append(name)
     place = {
-        name: (at + 1) / len(names)
-        for names in manifest.split.values()
+        name: ((at + 1) / len(names), side)
+        for (side, _), names in alike.items()
         for at, name in enumerate(names)
     }
     return sorted(missing, key=lambda name: (place[name], name))

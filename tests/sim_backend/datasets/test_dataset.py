@@ -8,6 +8,7 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -282,6 +283,19 @@ def test_an_interrupted_run_keeps_what_it_has_and_ends_the_same(
     assert names[: len(kept)] == sorted(kept), "what was there is reported first, and not made anew"
     assert sorted(names) == NAMES
     assert files(tmp_path) == files(finished)
+
+
+def test_categories_grow_alike_so_that_one_may_stop_any_time() -> None:
+    objects = msgspec.structs.replace(
+        RECIPE.objects, categories=("bottle", "chair", "mug"), per_category=9, validation=1, test=2
+    )
+    manifest = dataset.describe_set(replace(RECIPE, objects=objects))
+    order = dataset._spread(manifest, set(manifest.names()))
+    assert sorted(order) == sorted(manifest.names())
+    for share in (2, 3):
+        begun = order[: len(order) // share]
+        number = [sum(manifest.category(n) == c for n in begun) for c in manifest.categories]
+        assert max(number) - min(number) <= 1
 
 
 def test_an_object_that_another_run_finished_meanwhile_is_left_alone(finished: Path) -> None:
