@@ -99,7 +99,8 @@ def read_nwb(
         try:
             reading = read_session(path, window, read, clock, wanted)
         except ConfigError as error:
-            spoilt.append(f"session {path.stem} left out: {error}")
+            why = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
+            spoilt.append(f"session {path.stem} left out: {why}")
         else:
             if wanted.task in (None, reading.task) and reading.session.rates.shape[1]:
                 readings.append(reading)

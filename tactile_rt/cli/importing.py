@@ -16,6 +16,7 @@ from tactile_rt.cli.options import Force, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import check_no_pointer
 
 if TYPE_CHECKING:
     from tactile_rt.recording.importing.report import Import
@@ -73,6 +74,7 @@ def import_file(
         raise ConfigError(f"no file {log}")
     if log.is_file() and not log.stat().st_size:
         raise ConfigError(f"{log} is empty")
+    check_no_pointer(log)
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
     check_is_mcap(output)
     check_output(json)

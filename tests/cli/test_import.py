@@ -156,6 +156,8 @@ def test_a_git_lfs_pointer_is_refused_by_that_name(refused, tmp_path, name):
     target = path.parent if "/" in name else path
     for line in (("import", target, tmp_path / "o.mcap", "--columns", "a=S.x"), ("sniff", target)):
         assert said in refused(*line)
+    if name == "a.mcap":  # also where it would be written over
+        assert said in refused("import", path, path)
     if "/" not in name:
         for command in (("replay", path), ("recover", path), ("convert", path, tmp_path / "x.csv")):
             assert said in refused(*command)
