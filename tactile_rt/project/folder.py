@@ -24,6 +24,7 @@ from tactile_rt.core.files import write_whole
 from tactile_rt.core.settings import no_such, read_text, split_url
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import codec_class
+from tactile_rt.project.placing import place_objects
 from tactile_rt.sets.sensor_faults import LARGEST
 from tactile_rt.sim_backend.arrays.files import (
     ARRAY_FILES,
@@ -36,7 +37,7 @@ from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, added_categories
-from tactile_rt.sim_backend.sweep import Sweep, usual_distance, usual_size
+from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.transducer import device_spec, sensor_drift, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
 
@@ -46,7 +47,6 @@ RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
 NO_NAME = re.compile(r"[^\w.+-]+")  # what a URL or a file in TOML would take for something else
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
-SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
 # mm/s, of objects of 40 mm. Larger ones are faster: so in a window as much of the array is touched.
 SPEEDS = (28, 40)
 
@@ -188,18 +188,19 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         raise ConfigError("--classes takes two or more categories, each once")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder} is not empty: name a new folder")
-    distance = usual_distance(animals)
-    near, far = (f"{share * distance:.3g}" for share in SPREAD)
-    size = usual_size(animals)
-    slow, fast = (f"{speed * size / Sweep.size_mm:.3g}" for speed in SPEEDS)
+    placing = place_objects(animals, kinds)
+    slow, fast = (f"{speed * placing.size_mm / Sweep.size_mm:.3g}" for speed in SPEEDS)
     name = NO_NAME.sub("-", folder.resolve().name)
     words = {
         "name": name,
         "kind": kinds[0],
         "kinds": ", ".join(f'"{kind}"' for kind in kinds),
-        "near": near,
-        "far": far,
-        "usual": f"{size:g}",
+        "near": f"{placing.distance_mm[0]:.3g}",
+        "far": f"{placing.distance_mm[1]:.3g}",
+        "low": f"{placing.height_mm[0]:g}",
+        "high": f"{placing.height_mm[1]:g}",
+        "usual": f"{placing.size_mm:g}",
+        "touching": f"{100 * placing.touching:.0f}",
         "slow": slow,
         "fast": fast,
         "offset": f"{min(sensor_drift(animals, SweepRecipe.period_ms), LARGEST):.2g}",

@@ -18,6 +18,9 @@ from tactile_rt.models.evaluation.pictures import draw_confusion
 from tactile_rt.models.evaluation.records import Record
 from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.project.folder import Project
+from tactile_rt.sets.manifest import SPLITS, SweepManifest, has_object
+from tactile_rt.sim_backend.datasets.inventory import tally
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 
 __all__ = ["confused", "write_report"]
 
@@ -55,6 +58,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
         ),
         step=f"{step_ms:.3g}",
         sample=f"{len(set(objects.tolist()))} objects, {len(labels)} sweeps",
+        swept=_describe_sweeps(sweeps),
         kinds=escape(", ".join(card.classes)),
         headlines=_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
         robust=_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
@@ -82,6 +86,26 @@ def confused(
         if i != j
     ]
     return sorted(pairs, key=lambda pair: -pair[2])
+
+
+def _describe_sweeps(folder: Path) -> str:
+    """Say what the sweeps are for, and what share of them touches and saturates."""
+    manifest = SweepManifest.read(folder)
+    there = {s: [n for n in manifest.split[s] if has_object(folder, n)] for s in SPLITS}
+    every = tally(
+        folder, manifest.names(SPLITS), draws := len(recipe_of_set(manifest.recipe).sweeps)
+    )
+    parts = ", ".join(
+        f"{what} {draws * len(there[split])} of {len(there[split])}"
+        for split, what in zip(
+            SPLITS, ("it learnt from", "was chosen by", "tested on"), strict=True
+        )
+    )
+    touching, beyond = 1 - every.misses / every.sweeps, every.saturated / every.sweeps
+    return (
+        f"Sweeps of objects: {parts}. {100 * touching:.0f} % of all touch a whisker; in "
+        f"{100 * beyond:.0f} % a reading is beyond the sensor's range."
+    )
 
 
 def _rows(records: Sequence[tuple[Record, str]]) -> str:

@@ -286,12 +286,12 @@ def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
 
 
 def usual_size(animals: Sequence[WhiskerArray]) -> float:
-    """A mouse's 40 mm, or as far as the base points of an array are apart where that is more, mm.
+    """A mouse's 40 mm, or as far as the tips of an array are apart where that is more, mm.
 
-    So an object is no smaller than what it passes.
+    So an object is no smaller than where whiskers reach.
     """
-    apart = [float(np.ptp([w.base for w in a.whiskers], axis=0).max()) for a in animals]
-    return max(Sweep.size_mm, *apart)
+    tips = [line[-1, 1:] for a in animals for line in centrelines(a.whiskers, a.mount)]
+    return max(Sweep.size_mm, round(float(np.ptp(tips, axis=0).max())))
 
 
 @cache

@@ -97,6 +97,7 @@ def test_the_report_tells_what_it_measured(folder: Path) -> None:
         "What it cannot tell apart",
         "after the baseline",
         "12 objects, 24 sweeps",
+        "100 % of all touch a whisker",
     ):
         assert said in page
     assert page.count("data:image/png;base64,") == 2
