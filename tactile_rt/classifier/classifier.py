@@ -13,6 +13,7 @@ A silence too long for the resampler to bridge ends an episode early, and so doe
 skipped, see `tactile_rt.classifier.skips`.
 """
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -52,7 +53,11 @@ EVERY = 4
 BEHIND_STEPS, BEHIND_S = 3, 0.15
 # Far beyond any load, and far below where squares of float32 overflow.
 ABSURD = 1e9
+# Times the largest load that a model believes: beyond it, a unit or a gain is not what it should be.
+IMPLAUSIBLE = 3.0
+IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
 TOUCHES = 256
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -124,6 +129,8 @@ class ClassifierStats:
         bad_samples: The number of samples of one element that were no number, infinite or absurd
             though marked valid; they were taken for invalid.
         bad_steps: The number of steps whose logits were not finite; they gave no decision.
+        implausible: The number of episodes with a load of more than three times the largest that
+            the model believes, as of a sensor in another unit.
     """
 
     steps: int = 0
@@ -132,6 +139,7 @@ class ClassifierStats:
     skips: int = 0
     bad_samples: int = 0
     bad_steps: int = 0
+    implausible: int = 0
 
 
 class Classifier:
@@ -165,6 +173,7 @@ class Classifier:
             there is one. The next `push` overwrites it.
         touches: The newest 256 changes of contact, as stream time (ns) and whether it began;
             whoever reads them takes them out.
+        implausible: True if the newest episode has implausible loads, see `ClassifierStats`.
         stats: The counters of steps, late steps and bad samples.
         providers: Names of the execution providers in use, as onnxruntime has them.
 
@@ -232,6 +241,8 @@ class Classifier:
         self._skipping = False
         self._next_seq = 0
         self._rated = rated_noise(self.card)
+        self._plausible = IMPLAUSIBLE * np.array(self.card.clip, dtype=np.float32)
+        self.implausible = False
         self._set_rule: PredictionSetRule | None = None  # of the episode
         self._columns = kind_columns(self.card.kinds)
         self._name_rules: dict[str, PredictionSetRule | None] = {}  # likewise, by class
@@ -307,6 +318,11 @@ class Classifier:
             self._onset_ns = None  # released: the next contact is a new episode
         if self._onset_ns is None or (self._decided and not self._sliding):
             return None
+        if not self.implausible and (np.abs(self.deviation) > self._plausible).any():
+            self.implausible = True
+            self.stats.implausible += 1
+            if self.stats.implausible == 1:  # later ones are counted
+                log.warning("%s: %s", self.card.name, IMPLAUSIBLE_LOADS)
         now = np.where(untouched[:, None], self._offset, sample)
         self._stepper.samples[:, self._filled] = now[self._order]
         self._filled += 1
@@ -325,7 +341,7 @@ class Classifier:
     def _begin(self, t_ns: int) -> None:
         self._onset_ns = t_ns
         self._filled = self._step = 0
-        self._decided = False
+        self._decided = self.implausible = False
         self._exit.begin()
         self._offset = self.detector.offset
         self._sigma = self.detector.sigma

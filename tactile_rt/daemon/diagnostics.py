@@ -19,6 +19,7 @@ from collections.abc import Sequence
 
 from msgspec import structs
 
+from tactile_rt.classifier.classifier import IMPLAUSIBLE_LOADS
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import (
     ConsumerState,
@@ -156,6 +157,8 @@ def _of_model(
     if model.lost.second:
         why = "it was too slow for its samples"
         return [Diagnostic(part.name, "missing decisions", why, still)]
+    if model.implausible:
+        return [Diagnostic(part.name, "implausible loads", IMPLAUSIBLE_LOADS, still)]
     if model.refused:
         why = f"the new one is refused: {model.refused}"
         return [Diagnostic(part.name, "old model", why, "the one before decides")]

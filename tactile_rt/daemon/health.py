@@ -133,6 +133,7 @@ class ModelState:
     skips: Losses = field(default_factory=Losses)
     lost: Losses = field(default_factory=Losses)  # samples that were dropped from its mailbox
     refused: str = ""  # why the model that was to take the place of this one does not
+    implausible: bool = False  # the newest touch has loads far beyond those that it learnt from
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class ModelPart(Part):
     @property
     def model_state(self) -> ModelState:
         """For the snapshot."""
-        newest, queue = self._newest, self.box.state
+        newest, queue, classifier = self._newest, self.box.state, self._classifier
         return ModelState(
             self.state, self.config.source, str(self.file), self._sha256, self._labels,
             queue, self._decisions, self._final, self._touching,
@@ -86,7 +86,7 @@ class ModelPart(Part):
             self._latency.state, self._step.state, self._late, self._bad_samples,
             1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
-            self.refused,
+            self.refused, classifier is not None and classifier.implausible,
         )  # fmt: skip
 
     def stop(self) -> None:

@@ -158,6 +158,17 @@ def test_a_bad_sample_is_an_invalid_one_and_counted(model: Path, bad: float) -> 
     assert logits_of(got[-1].probabilities) == fed_logits(values, 501, STEPS, 1e-4)
 
 
+def test_loads_in_another_unit_are_told_once_and_counted(model: Path, caplog) -> None:
+    touches = signal([(500, 900, 0.1), (2000, 2400, 0.1)], 3000)
+    sound, spoilt = Classifier(model, SAME_RATE), Classifier(model, SAME_RATE)
+    decisions = push_all(sound, stream(touches))
+    assert sound.stats.implausible == 0 and not caplog.text
+    found = push_all(spoilt, stream(1000 * touches))
+    assert spoilt.stats.implausible == len([d for d in decisions if d.final]) == 2
+    assert spoilt.implausible and len(found) == len(decisions)
+    assert caplog.text.count("another unit, gain or sensor?") == 1
+
+
 def test_bad_samples_that_were_marked_are_no_news(model: Path) -> None:
     chunks = stream(signal([], 50))
     for chunk in chunks:

@@ -100,6 +100,7 @@ def test_what_is_no_fault_of_a_source_is_not_told(changes):
         ({"behind_s": 0.76}, "late decisions: model.a: it is more than 0.75 s behind"),
         ({"skips": Losses(1, 1)}, "missing decisions: model.a: it cannot keep up"),
         ({"lost": Losses(9, 9)}, "missing decisions: model.a: it was too slow"),
+        ({"implausible": True}, "implausible loads: model.a: loads are far beyond those"),
         ({"part": part("model.a", "waiting", "no file")}, "no decisions: model.a fails: no file"),
         (
             {"part": part("model.a", "starting", "no file", 1)},
