@@ -54,7 +54,7 @@ BEHIND_STEPS, BEHIND_S = 3, 0.15
 # Far beyond any load, and far below where squares of float32 overflow.
 ABSURD = 1e9
 # Times the largest load that a model believes: beyond it, a unit or a gain is not what it should be.
-IMPLAUSIBLE = 3.0
+IMPLAUSIBLE = 10.0
 IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
 TOUCHES = 256
 log = logging.getLogger(__name__)
@@ -129,7 +129,7 @@ class ClassifierStats:
         bad_samples: The number of samples of one element that were no number, infinite or absurd
             though marked valid; they were taken for invalid.
         bad_steps: The number of steps whose logits were not finite; they gave no decision.
-        implausible: The number of episodes with a load of more than three times the largest that
+        implausible: The number of episodes with a load of more than ten times the largest that
             the model believes, as of a sensor in another unit.
     """
 
