@@ -13,8 +13,9 @@ The plan. `Stamper` makes chunks of what a codec found: `Sequencer` numbers the 
 best clock that there is dates them:
 - the device's own time, on the host's clock (`DeviceClock`);
 - if it sends a counter only, that, as a clock whose tick is the nominal period;
-- if it sends neither, the arrivals: those of one packet are spread over the time before
-  (`host_stamps`);
+- if it sends neither, its steady rate: samples are counted as they come, and that is its clock
+  (`SteadyClock`); where the rate is not steady, the arrivals, those of one packet spread over the
+  time before (`host_stamps`);
 - on demand (``clock=device``), the device's own time as it is (`DeviceTime`).
 
 How `DeviceClock` finds offset and drift. A sample cannot arrive before it was taken, so of all
@@ -38,7 +39,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, SourceStats
 from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Codec, Samples
 
-__all__ = ["DeviceClock", "DeviceTime", "Stamper", "host_stamps"]
+__all__ = ["DeviceClock", "DeviceTime", "Stamper", "SteadyClock", "host_stamps"]
 
 COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the device's only clock
 FIRST_BUCKET_NS: Final = NS_PER_S // 4  # of each only the promptest arrival is kept
@@ -54,6 +55,11 @@ LATE_NS: Final = 30_000_000  # so late for ...
 LATE_FOR_NS: Final = 2 * NS_PER_S  # ... so long: it stepped back
 LEAST_STEP: Final = 0.5  # of the device's, between two samples when the estimate moves back
 LONG_NS: Final = 60_000_000_000  # a clock that wraps sooner cannot show that it went back
+STEADY_TOLERANCE, STRAYED = 1.5, 0.5  # drift that is tried, and that of a rate that is another
+SETTLED_NS: Final = 2 * NS_PER_S  # when the rate is known well enough
+LOST, LOST_NS, LOST_PACKETS = 0.7, NS_PER_S // 4, 8  # periods late, for so long, in so many packets
+SILENCE_NS, SILENT_PERIODS = NS_PER_S // 10, 5  # after which the count begins anew
+OFTEN, OFTEN_NS = 5, 10 * NS_PER_S  # samples lost within this: the count says little of the time
 
 
 class Stamper:
@@ -61,6 +67,7 @@ class Stamper:
 
     Args:
         codec: The codec of the device, which says what counter and clock there are.
+        steady: False for a log, whose own times date what has neither time nor count.
 
     Attributes:
         clock: The clock that dates the samples; None for a device that sends neither time nor
@@ -69,21 +76,24 @@ class Stamper:
         status: Status bits of the newest sample.
     """
 
-    def __init__(self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats) -> None:
+    def __init__(
+        self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats, steady: bool = True
+    ) -> None:
         self.spec, self._shape = spec, spec.shape
         self.newest_ns = self.status = 0
         self._period_ns = round(NS_PER_S / spec.rate_hz)
         ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
         self.sequencer = Sequencer(codec.count_bits, stats, ticks, codec.tick_bits)
+        self._steady = SteadyClock(self._period_ns, steady)
         self.clock: DeviceClock | DeviceTime | None = None
         if codec.tick_ns is not None:
             self.clock = DeviceClock(codec.tick_ns, codec.tick_bits)
         elif codec.count_bits is not None:
             self.clock = DeviceClock(NS_PER_S / spec.rate_hz, codec.count_bits, COUNTED_TOLERANCE)
-        self._told = 0  # time given to the newest sample
 
     def resume(self) -> None:
         """The device was away."""
+        self._steady.resume()
         if self.clock is not None:
             self.clock.resume()
 
@@ -104,8 +114,7 @@ class Stamper:
         if self.clock is not None and counter is not None:
             t_ns = self.clock.to_host(counter, arrived)
         else:
-            t_ns = host_stamps(arrived, self._told, self._period_ns)
-        self._told = int(t_ns[-1])
+            t_ns = self._steady.to_host(arrived)
         self.newest_ns = int(arrived[-1])
         if samples.status is not None:
             self.status = int(samples.status[-1])
@@ -263,6 +272,71 @@ def _slope_below(points: Sequence[tuple[float, float]]) -> float:
         if x2 >= middle:
             return (d2 - d1) / (x2 - x1)
     return 0.0
+
+
+class SteadyClock:
+    """Dates the samples of a device that tells neither time nor count, by its steady rate.
+
+    That a sample is lost without a trace shows in all later ones, which come a period late. In the
+    first two seconds, also after a silence, and where the rate is far from the nominal, samples are
+    dated by their arrival.
+
+    Args:
+        period_ns: Nominal time between samples, ns.
+        steady: False dates all samples by their arrival.
+
+    Attributes:
+        lost: Number of samples that are missing, by the time at which others came.
+    """
+
+    def __init__(self, period_ns: int, steady: bool = True) -> None:
+        self.lost = 0
+        self._period_ns, self._told, self._strayed = period_ns, 0, not steady
+        self.resume()
+
+    def resume(self) -> None:
+        """The device was away."""
+        self._clock = DeviceClock(self._period_ns, 62, STEADY_TOLERANCE)
+        self._count, self._began = 0, -1
+        self._late: list[tuple[int, int]] = []  # arrival of the newest packets, and how late
+        self._losses: list[int] = []  # when samples were lost
+
+    def to_host(self, arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n,) host times of the samples of one packet, ns: strictly increasing."""
+        n, last = len(arrived_ns), int(arrived_ns[-1])
+        silent_ns = last - self._late[-1][0] if self._late else 0
+        if silent_ns > max(SILENCE_NS, SILENT_PERIODS * self._period_ns, 4 * n * self._period_ns):
+            self.resume()
+        if self._began < 0:
+            self._began = last
+        numbers = np.arange(self._count, self._count + n)
+        self._count += n
+        t_ns = self._clock.to_host(numbers, arrived_ns)
+        late_ns = last - int(t_ns[-1])
+        settled = last - self._began > SETTLED_NS
+        self._losses = [at for at in self._losses if last - at < OFTEN_NS]
+        self._strayed = self._strayed or (settled and abs(self._clock.drift) > STRAYED)
+        if self._strayed or not settled or len(self._losses) >= OFTEN:
+            t_ns = host_stamps(arrived_ns, self._told, self._period_ns)
+        elif t_ns[0] <= self._told:
+            t_ns = np.maximum(t_ns, self._told + 1 + np.arange(n))
+        self._told = int(t_ns[-1])
+        self._count_lost(last, late_ns, settled)
+        return t_ns
+
+    def _count_lost(self, arrived: int, late_ns: int, settled: bool) -> None:
+        """Skip the numbers of samples that must have been lost, so late are all later ones."""
+        self._late.append((arrived, late_ns))
+        while len(self._late) > LOST_PACKETS and arrived - self._late[1][0] >= LOST_NS:
+            del self._late[0]
+        enough = len(self._late) >= LOST_PACKETS and arrived - self._late[0][0] >= LOST_NS
+        period = self._period_ns * (1 + self._clock.drift)
+        least = min(late for _, late in self._late)
+        if settled and enough and least > LOST * period:
+            lost = round(least / period)
+            self.lost, self._count = self.lost + lost, self._count + lost
+            self._losses += [arrived] * min(lost, OFTEN)
+            self._late = self._late[-1:]
 
 
 class DeviceTime:

@@ -51,7 +51,7 @@ class Description:
     wire: str = ""
     codec: str = ""
     codec_options: Mapping[str, str] = field(default_factory=dict)
-    clock: str = "host"
+    clock: str = "host"  # "device": its own time; "log": an imported log's
     calibration: Calibration | None = None
     session: Mapping[str, str] = field(default_factory=dict)
     recovered: bool = False

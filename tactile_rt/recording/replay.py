@@ -270,7 +270,8 @@ class _Decoding:
 
     def chunks(self, stats: SourceStats) -> Timed:
         """The chunks and the arrival of the packets that completed them."""
-        stamper, codec = Stamper(self._codec, self.spec, stats), self._codec
+        codec = self._codec
+        stamper = Stamper(codec, self.spec, stats, steady=self._clock != "log")
         if self._clock == "device" and codec.tick_ns is not None:
             stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         connected = False

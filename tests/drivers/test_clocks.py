@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.clocks import DeviceClock, DeviceTime, host_stamps
+from tactile_rt.drivers.clocks import DeviceClock, DeviceTime, SteadyClock, host_stamps
 
 MS = 1_000_000
 
@@ -142,6 +142,66 @@ def test_samples_without_time_or_count_are_spread_before_their_arrival():
     assert squeezed.tolist() == [85 * MS, 90 * MS, 95 * MS, 100 * MS]
     late = host_stamps(arrived, 100 * MS, 10 * MS)  # something was dated after it already
     assert (np.diff(late) > 0).all() and late[0] > 100 * MS
+
+
+def packets_of(taken, seed, busy):
+    """Samples and arrivals as a host reads them that waits for a processor every so often."""
+    rng, at, now = np.random.default_rng(seed), 0, 0
+    while at < len(taken):
+        now = max(now, int(taken[at])) + int(rng.exponential(0.3 * MS))
+        if rng.random() < busy:
+            now += int(rng.exponential(60 * MS))
+        end = max(at + 1, int(np.searchsorted(taken, now, side="right")))
+        yield slice(at, end), np.full(end - at, now)
+        at = end
+
+
+def dated(taken, nominal_hz, busy=0.1, seed=1):
+    """Errors of the times, ms, by a steady rate, and by arrival."""
+    clock, told, before = SteadyClock(round(1e9 / nominal_hz)), [], [0]
+    arrived = []
+    for _, at in packets_of(taken, seed, busy):
+        told += clock.to_host(at).tolist()
+        before += host_stamps(at, before[-1], round(1e9 / nominal_hz)).tolist()
+        arrived += at.tolist()
+    assert (np.diff(told) > 0).all()
+    assert (np.array(told) <= np.array(arrived) + len(told)).all()
+    return (np.array(told) - taken) / MS, (np.array(before[1:]) - taken) / MS, clock
+
+
+@pytest.mark.parametrize("rate_hz", [70, 80, 97, 100, 130])
+def test_a_steady_rate_dates_samples_that_a_busy_host_reads_late(rate_hz):
+    taken = np.round(np.arange(3000) * 1e9 / rate_hz).astype(np.int64)
+    steady, by_arrival, clock = dated(taken, 100)
+    late = slice(10 * rate_hz, -50)
+    assert np.abs(steady[late]).max() < 1 and clock.lost == 0
+    assert np.percentile(np.abs(by_arrival[late]), 95) > 4
+
+
+@pytest.mark.parametrize("rate_hz", [30, 300])
+def test_where_the_rate_is_another_the_arrival_dates_samples(rate_hz):
+    taken = np.round(np.arange(3000) * 1e9 / rate_hz).astype(np.int64)
+    steady, by_arrival, _ = dated(taken, 100, busy=0.02)
+    late = slice(6 * rate_hz, -50)
+    assert np.abs(steady[late]).mean() < 1.2 * np.abs(by_arrival[late]).mean() + 0.1
+
+
+def test_a_sample_that_is_lost_shows_in_those_after_it():
+    taken = np.arange(6000) * 10 * MS
+    kept = np.delete(taken, [1500, 3000, 3001, 4500])
+    steady, _, clock = dated(kept, 100)
+    assert clock.lost == 4
+    assert np.abs(steady[:-50]).max() < 21 and np.median(np.abs(steady)) < 0.1
+    often = taken[np.random.default_rng(0).random(6000) > 0.03]
+    steady, by_arrival, _ = dated(often, 100)
+    assert np.abs(steady).mean() < 1.3 * np.abs(by_arrival).mean()
+
+
+def test_after_a_silence_nothing_is_dated_before_it():
+    taken = np.arange(4000) * 10 * MS
+    taken[2000:] += 1500 * MS
+    steady, _, _ = dated(taken, 100, busy=0)
+    assert np.abs(steady[2000:]).max() < 2
 
 
 def test_device_time_unwraps_and_never_goes_back() -> None:

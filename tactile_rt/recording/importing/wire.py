@@ -191,7 +191,7 @@ class _Decoded:
         self._packets = chain(waiting, ((p, t_ns, self._take(p, t_ns)) for p, t_ns in packets))
         self.timed = self._stamped = bool(waiting) and waiting[0][1] is not None
         self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
-        self._stamper = Stamper(codec, codec.spec, stats)
+        self._stamper = Stamper(codec, codec.spec, stats, steady=False)
         own_clock = False
         if not self._stamped and codec.tick_ns is not None:
             self.timed = own_clock = True
@@ -200,7 +200,7 @@ class _Decoded:
         self._passed = 0.0  # periods, where the log has no times
         self.about = replace(
             about, spec=codec.spec, utc_offset_ns=self._zero,
-            clock="device" if own_clock else "host",
+            clock="device" if own_clock else "log",
         )  # fmt: skip
 
     @property
