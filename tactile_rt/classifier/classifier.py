@@ -53,7 +53,7 @@ EVERY = 4
 BEHIND_STEPS, BEHIND_S = 3, 0.15
 # Far beyond any load, and far below where squares of float32 overflow.
 ABSURD = 1e9
-# Times the largest load that a model believes: beyond it, a unit or a gain is not what it should be.
+# Times the largest load that a model believes: beyond, a unit or a gain is not what it should be.
 IMPLAUSIBLE = 10.0
 IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
 TOUCHES = 256
