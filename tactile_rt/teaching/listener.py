@@ -17,6 +17,7 @@ FELT = 6.0  # times the noise, for two samples running, is felt
 LONG_AGO_NS = 2**62
 # Parts of a rest, and by how many times the noise within them their means differ at most.
 REST_PARTS, MOVED = 8, 10.0
+QUIETEST = 0.25  # share of the parts in which nothing touched, at least
 QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
 
 
@@ -130,7 +131,7 @@ def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
         return ""
     parts = np.array_split(values, REST_PARTS)
     apart = np.ptp([part.mean(axis=0) for part in parts], axis=0)
-    noise = np.median([part.std(axis=0) for part in parts], axis=0)
+    noise = np.quantile([part.std(axis=0) for part in parts], QUIETEST, axis=0)
     for element in range(values.shape[1]):
         for channel in range(values.shape[2]):
             levels = np.unique(values[:, element, channel])

@@ -15,6 +15,7 @@ from tactile_rt.teaching.lesson import ORDERS, Lesson, LessonProgress
 
 __all__ = ["ORDERS", "Teacher"]
 
+FEW = 5  # touches of a class, below which others are hardly told from it
 LONG = 9  # digits: more are no class's number
 
 
@@ -159,8 +160,16 @@ class Teacher:
         learnt = self.lesson.taught_enough
         if learnt and not lines:
             lines = [f"{learnt[0]} is the only class: teach another, to see if they are told apart"]
-        few = [name for name in self.lesson.labels if name not in self.lesson.taught_enough]
-        return [*lines, *(f"{name}: one touch is too few, and was not learnt" for name in few)]
+        for name in self.lesson.labels:
+            count, wanted = self.lesson.count(name), max(FEW, self.each)
+            if name not in learnt:
+                lines.append(f"{name}: one touch is too few, and was not learnt")
+            elif count < FEW and len(learnt) > 1:
+                lines.append(
+                    f"{name}: {count} touches make refusals of strange things weak: "
+                    f"give it {wanted - count} more"
+                )
+        return lines
 
     def _told_apart(self) -> str:
         right, of = self.progress.right

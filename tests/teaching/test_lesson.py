@@ -199,6 +199,9 @@ def test_one_touch_of_a_class_is_told_to_be_too_few(taught, tmp_path):
     lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
     teach(lesson, ["press", "press", "slide"], seed=8)
     assert Teacher(lesson, [], 2).summary()[-1] == "slide: one touch is too few, and was not learnt"
+    teach(lesson, ["slide"] * 5, seed=9)
+    said = "press: 2 touches make refusals of strange things weak: give it 8 more"
+    assert Teacher(lesson, [], 10).summary()[-1] == said
 
 
 def test_it_says_why_nothing_was_felt(taught):
@@ -230,6 +233,10 @@ def test_a_rest_in_which_something_moved_is_named(levels):
 
     assert rest() == ""
     values[60:110, 0, 2] += 3.0
+    assert rest() == f"{spec.elements[0]} {spec.channels[2]}"
+    values[60:110, 0, 2] -= 3.0
+    bump = 3.0 * np.sin(np.pi * np.arange(130) / 130)  # touched most of the time
+    values[20:150, 0, 2] += bump
     assert rest() == f"{spec.elements[0]} {spec.channels[2]}"
 
 
