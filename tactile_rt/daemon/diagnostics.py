@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from msgspec import structs
 
 from tactile_rt.classifier.classifier import IMPLAUSIBLE_LOADS
+from tactile_rt.core.errors import name_some
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import (
     ConsumerState,
@@ -129,6 +130,9 @@ def _of_source(
             found.append(Diagnostic(name, "late samples", why))
     if source.stuck_at_s:
         why = "the values do not change at all, as no sensor's do: the device hangs"
+        found.append(Diagnostic(name, "stuck-at fault", why))
+    elif source.stuck:
+        why = f"no value of {name_some(source.stuck)} changes: it hangs, or is out of range"
         found.append(Diagnostic(name, "stuck-at fault", why))
     if source.losses.second:
         found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))

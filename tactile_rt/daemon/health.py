@@ -106,6 +106,7 @@ class SourceState:
     bad_samples: int = 0  # of one element, no number or an absurd one, though not marked invalid
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some
+    stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
 
 
 @dataclass(frozen=True)

@@ -153,6 +153,7 @@ class SourcePart(Part):
         return dataclasses.replace(
             about, array=spec.name, frame=spec.frame, rate_hz=spec.rate_hz,
             elements=spec.elements, channels=spec.channels, units=spec.units,
+            stuck=tuple(spec.elements[k] for k in self._stuck_at.elements),
         )  # fmt: skip
 
     @property
@@ -163,10 +164,11 @@ class SourcePart(Part):
     def judge(self, sensor: SensorSpec | None) -> None:
         """Say what the sensor of a model on this source is, if there is one that tells."""
         spec, device = self._spec, self._device
-        after_s = self.config.stuck_at_s
+        after_s, each_s = self.config.stuck_at_s, math.inf
         if not after_s and spec is not None and device is not None and sensor is not None:
             after_s = derive_stuck_at_s(spec, sensor)
-        self._stuck_at.after_s = after_s or math.inf
+            each_s = derive_stuck_at_s(spec, sensor, each=True)
+        self._stuck_at.after_s, self._stuck_at.each_after_s = after_s or math.inf, each_s
 
     def stop(self) -> None:
         self._stopped_s = self._stopped_s or time.monotonic()

@@ -321,6 +321,25 @@ def test_how_long_nothing_changes_is_counted_sample_by_sample(values, useless, c
         assert judge.seconds == pytest.approx(same / 1000 if same > after else 0.0)
 
 
+def test_an_element_that_does_not_change_while_others_do_is_named():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(900, 3, 2))
+    values[200:700, 1] = values[200, 1]
+    judge, found = detector(0.3), []
+    judge.each_after_s = 0.1
+    for chunk in chunks(values):
+        chunk.valid[:, 2] = False  # who is known to be of no use is not named
+        judge.add(chunk)
+        found.append(judge.elements)
+        assert not judge.seconds
+    times = (np.arange(len(found)) * 7 + 6) / 1000.0
+    stuck = np.array([one == (1,) for one in found])
+    assert stuck[(times > 0.31) & (times < 0.69)].all() and not stuck[times < 0.3].any()
+    assert not any(one for one, at in zip(found, times, strict=True) if not 0.3 <= at < 0.708)
+    (said,) = told([replace(SOURCE, stuck=("B1", "B2", "C1", "C2", "C3"))])
+    assert said.startswith("stuck-at fault: source.a: no value of B1, B2, C1 and 2 more changes: ")
+
+
 def test_another_array_is_not_stuck():
     judge = detector(0.005)
     for at, elements in ((0, 3), (1, 4)):
@@ -355,6 +374,7 @@ def test_from_when_on_equal_samples_are_impossible_follows_from_the_noise():
     fine, coarse = sensor(1e-3, 1e-6), sensor(1e-6, 1e-2)
     assert derive_stuck_at_s(spec, fine) == 0.25
     assert derive_stuck_at_s(spec, coarse) == float("inf")
+    assert derive_stuck_at_s(spec, fine, each=True) == 2.0
     assert derive_stuck_at_s(spec, sensor(0.0, 1e-3)) == float("inf")
     assert derive_stuck_at_s(spec, sensor(1e-3, 0.0)) == 0.25
 
