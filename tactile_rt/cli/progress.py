@@ -18,7 +18,8 @@ from rich.progress import (
 __all__ = ["progress_bar"]
 
 A_DAY_S = 86_400.0
-LINE_S = 10.0  # between lines where there is no terminal
+# Between lines where there is no terminal: at first, and at most; a fourth of the time so far.
+LINE_S, LONGEST_S, SHARE = 10.0, 120.0, 0.25
 
 Update = Callable[..., None]
 
@@ -30,16 +31,19 @@ def progress_bar(
     total: float | None = None,
     completed: int = 0,
     counted: bool = False,
+    timed: bool = True,
 ) -> Iterator[Update]:
     """Show a bar with the time left, gone when the block is done or fails.
 
-    Where the console is no terminal a line every `LINE_S` seconds takes its place, so that who
-    reads a log file sees that it goes on; what is done before then says nothing.
+    Where the console is no terminal a line takes its place after `LINE_S` seconds, and then more
+    and more seldom, so that who reads a log file sees that it goes on; what is done before then
+    says nothing.
 
     Args:
         total: of the work; None where its end is not known.
         completed: was done before, and says nothing about the time left.
         counted: show how many of the total are done, not what share.
+        timed: show the time left; False where the description says it.
 
     Yields:
         What to call as the work goes on: rich's `Progress.update` without the task
@@ -49,7 +53,7 @@ def progress_bar(
         TextColumn("{task.description}"),
         BarColumn(),
         *((MofNCompleteColumn(),) if counted else ()),
-        TimeRemainingColumn(),
+        *((TimeRemainingColumn(),) if timed else ()),
     )
     # Of rich's usual 30 s: a step may last minutes, and a rate takes two of them.
     with Progress(
@@ -59,8 +63,9 @@ def progress_bar(
         task = progress.add_task(what, total=total, completed=completed)
         done = threading.Event()
         lines = threading.Thread(
-            target=_print_lines, args=(console, progress.tasks[0], counted, done), daemon=True
-        )
+            target=_print_lines, args=(console, progress.tasks[0], counted, timed, done),
+            daemon=True,
+        )  # fmt: skip
         if progress.disable:
             lines.start()
         try:
@@ -71,12 +76,17 @@ def progress_bar(
                 lines.join()
 
 
-def _print_lines(console: Console, task: Task, counted: bool, done: threading.Event) -> None:
-    while not done.wait(LINE_S):
-        console.print(describe_task(task, counted), highlight=False, markup=False, soft_wrap=True)
+def _print_lines(
+    console: Console, task: Task, counted: bool, timed: bool, done: threading.Event
+) -> None:
+    pause = LINE_S
+    while not done.wait(pause):
+        said = describe_task(task, counted, timed)
+        console.print(said, highlight=False, markup=False, soft_wrap=True)
+        pause = min(max(LINE_S, SHARE * (task.elapsed or 0.0)), LONGEST_S)
 
 
-def describe_task(task: Task, counted: bool) -> str:
+def describe_task(task: Task, counted: bool, timed: bool = True) -> str:
     """Return a line that says how far the work is and how long it takes."""
     said = f"{task.description}:"
     if task.total and counted:
@@ -84,7 +94,7 @@ def describe_task(task: Task, counted: bool) -> str:
     elif task.total:
         said += f" {task.percentage:.0f} %,"
     said += f" {_span(task.elapsed or 0.0)} so far"
-    left = task.time_remaining
+    left = task.time_remaining if timed else None
     return f"{said}, about {_span(left)} left" if left else said
 
 

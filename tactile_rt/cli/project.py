@@ -55,7 +55,7 @@ def make(
         from tactile_rt.project.folder import Project
         from tactile_rt.project.making import make as make_project
     project = Project(folder)
-    with progress_bar(console, "reading") as update:
+    with progress_bar(console, "reading", timed=False) as update:
         seen = ""
 
         def tell(stage: "MakeProgress") -> None:

@@ -56,6 +56,7 @@ def test_shares_are_per_cent_and_long_times_are_minutes_and_hours(bar):
         wait(150)
         update(completed=share)
     assert describe_task(task, False) == "objects: 2 %, 5 min so far, about 3.2 h left"
+    assert describe_task(task, False, timed=False) == "objects: 2 %, 5 min so far"
 
 
 def test_a_log_file_gets_a_line_whenever_one_is_due(monkeypatch):
