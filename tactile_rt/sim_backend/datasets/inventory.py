@@ -41,7 +41,7 @@ class Tally:
             f"{self.saturated} exceed the sensor's `range`": self.saturated,
             f"{self.unstable} could not be simulated": self.unstable,
             f"{self.wedged} leave no room for a whisker": self.wedged,
-            f"{self.skipped} objects could not be made ({SKIPPED})": self.skipped,
+            f"{self.skipped} objects are left out ({SKIPPED} says why)": self.skipped,
         }
         return ", ".join(text for text, count in told.items() if count)
 

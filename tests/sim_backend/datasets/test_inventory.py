@@ -34,7 +34,7 @@ def test_misses_failures_and_skipped_objects_are_counted(folder: Path) -> None:
     assert counts == Tally(sweeps=4, misses=1, unstable=1, saturated=2, skipped=1)
     assert counts.shortcomings == (
         "1 miss the array (larger `size_mm`, less `distance_mm`), 2 exceed the sensor's `range`, "
-        "1 could not be simulated, 1 objects could not be made (skipped.json)"
+        "1 could not be simulated, 1 objects are left out (skipped.json says why)"
     )
     assert tally(folder, ["b"], 2).misses == 0
     assert Tally(sweeps=4).shortcomings == ""
