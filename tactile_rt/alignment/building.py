@@ -89,6 +89,11 @@ def build(
         sessions, notes = checked_sessions(
             files, strict, lambda share: progress(READING * share), clock, selection
         )
+        folders = (path for path in inputs if path.is_dir())
+        others = {file for path in folders for file in path.rglob("*.nwb")} - {*files}
+        if others:
+            names = name_some(sorted(file.name for file in others))
+            notes.append(f"passed over, without `ecephys` in their names: {names}")
         if not strict:
             animals = by_animal(_complete(sessions, notes))
             rates = {animal.name: published_layout(animal) for animal in animals}

@@ -390,6 +390,14 @@ def folder(tmp_path_factory):
     return folder
 
 
+def test_files_that_a_folder_has_beside_those_with_spikes_are_told(folder, tmp_path):
+    for file in folder.glob("*.nwb"):
+        (tmp_path / file.name).symlink_to(file)
+    (tmp_path / "a_behavior.nwb").write_text("no session at all")
+    said = "passed over, without `ecephys` in their names: a_behavior.nwb"
+    assert said in build([tmp_path], bootstraps=50).notes
+
+
 @pytest.mark.parametrize("protocol", ["strict", "paper-code"])
 def test_a_folder_builds_a_benchmark(folder, protocol):
     shares = []
