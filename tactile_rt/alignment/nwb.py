@@ -99,7 +99,7 @@ def read_nwb(
         try:
             reading = read_session(path, window, read, clock, wanted)
         except ConfigError as error:
-            why = str(error).removeprefix(f"{path}: ").removeprefix(f"{path} ")
+            why = str(error).replace(str(path), path.name)
             spoilt.append(f"session {path.stem} left out: {why}")
         else:
             if wanted.task in (None, reading.task) and reading.session.rates.shape[1]:

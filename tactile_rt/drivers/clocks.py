@@ -275,7 +275,7 @@ def _slope_below(points: Sequence[tuple[float, float]]) -> float:
 
 
 class SteadyClock:
-    """Dates the samples of a device that tells neither time nor count, by its steady rate.
+    """Dates samples of a device without clock or counter by its steady rate.
 
     That a sample is lost without a trace shows in all later ones, which come a period late. In the
     first two seconds, also after a silence, and where the rate is far from the nominal, samples are
@@ -325,7 +325,7 @@ class SteadyClock:
         return t_ns
 
     def _count_lost(self, arrived: int, late_ns: int, settled: bool) -> None:
-        """Skip the numbers of samples that must have been lost, so late are all later ones."""
+        """Skip the numbers of samples that must have been lost."""
         self._late.append((arrived, late_ns))
         while len(self._late) > LOST_PACKETS and arrived - self._late[1][0] >= LOST_NS:
             del self._late[0]

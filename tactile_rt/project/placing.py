@@ -11,7 +11,7 @@ from tactile_rt.sim_backend.sweep import Sweep, centrelines, draw_sweep, usual_d
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
 
-__all__ = ["Placing", "place_objects"]
+__all__ = ["ObjectPlacing", "place_objects"]
 
 SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
 ABOUT_MM = 6.0  # how far an object of 40 mm passes above or below the middle of the tips
@@ -20,7 +20,7 @@ TRIALS, ENOUGH = 48, 0.97  # sweeps that are tried, and the share of them that i
 
 
 @dataclass(frozen=True)
-class Placing:
+class ObjectPlacing:
     """Sizes and places of objects that touch an array.
 
     Attributes:
@@ -36,7 +36,7 @@ class Placing:
     touching: float
 
 
-def place_objects(animals: tuple[WhiskerArray, ...], kinds: Sequence[str]) -> Placing:
+def place_objects(animals: tuple[WhiskerArray, ...], kinds: Sequence[str]) -> ObjectPlacing:
     """Find sizes and places at which nearly all sweeps touch; else those where most do.
 
     Objects are as large as the tips are apart, at the height of the tips, and as near as need be:
@@ -53,7 +53,7 @@ def place_objects(animals: tuple[WhiskerArray, ...], kinds: Sequence[str]) -> Pl
     for nearer in NEARER:
         near, far = (round(share * nearer * usual, 2) for share in SPREAD)
         touching = _share_touching(animals, kinds, size, (near, far), height)
-        tried.append(Placing(size, (near, far), height, touching))
+        tried.append(ObjectPlacing(size, (near, far), height, touching))
         if touching >= ENOUGH:
             break
     return max(tried, key=lambda one: one.touching)

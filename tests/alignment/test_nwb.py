@@ -342,7 +342,7 @@ def test_a_session_that_cannot_be_read_is_left_out_alone(folder, tmp_path):
     (tmp_path / "text.nwb").write_text("hello")
     made = build([*files, tmp_path / "text.nwb"], bootstraps=50)
     assert [t.name for t in made.targets] == ["a", "b"]
-    assert any(re.match(r"session text left out: cannot be", n) for n in made.notes)
+    assert any(re.match(r"session text left out: text\.nwb: cannot be", n) for n in made.notes)
 
 
 def test_units_have_their_columns_and_rates_their_course(session):

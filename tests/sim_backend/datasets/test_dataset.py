@@ -344,7 +344,7 @@ def test_a_shape_that_cannot_be_made_ends_the_run(
     monkeypatch.setattr(
         dataset, "run_processes", lambda work, names, processes: [(n, "it died") for n in names]
     )
-    with pytest.raises(TactileError, match="mug-0 cannot be made: it died"):
+    with pytest.raises(TactileError, match="mug-2 cannot be made: it died"):
         list(make_sweeps(RECIPE, tmp_path))
     assert not (tmp_path / "skipped.json").exists()
 
