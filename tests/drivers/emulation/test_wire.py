@@ -113,12 +113,14 @@ def test_the_host_commands_the_rate():
             with serial.Serial(emulated.port, 1_000_000, timeout=PATIENCE_S) as host:
                 host.write(bytes.fromhex(packet))
                 counts = []
-                for _ in range(hz):
+                for _ in range(max(hz, 90)):
                     host.read_until(b"\xaa\x07\x08\x0a")
                     counts.append((int.from_bytes(host.read(12)[:2], "big"), time.monotonic()))
             assert emulated.codec.commanded_hz == hz
-            (first, began), (last, ended) = counts[0], counts[-1]
-            assert (last - first) / (ended - began) == pytest.approx(hz, rel=0.2)  # a busy machine
+            # A busy machine reads some late: the median of many spans.
+            half = len(counts) // 2
+            spans = [np.subtract(counts[k + half], counts[k]) for k in range(half)]
+            assert np.median([n / s for n, s in spans]) == pytest.approx(hz, rel=0.2)
 
 
 def test_a_wire_carries_what_it_can_and_no_more():
