@@ -34,8 +34,9 @@ SEEN_S, GONE_S = 1.0, 2.0  # stated
 HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
 PATIENCE_S = 12.0
 # Two looks further apart, or a thread (of the daemon, an array or this process) that waited longer
-# for a processor, beside what every turn takes: the machine has other things to do.
-BUSY_S, WAITED_S, TURN_NS = 0.25, 0.15, 150_000
+# for a processor, beside what every turn takes: the machine has other things to do. As late as that
+# a model skips.
+BUSY_S, WAITED_S, TURN_NS = 0.15, 0.15, 150_000
 RETRIES = 3
 DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
 DIAGNOSTIC = re.compile(rb"^tactile_diagnostic\{.*\} 1$", re.M)
@@ -50,7 +51,8 @@ class Repetition:
         seen_s: Time from the effect until the fault was told, s; infinite: never.
         gone_s: Time from the end of the fault until nothing was told any more, s.
         wrong: What was told and is not true: ``part: what: why``.
-        disagreed: Number of looks at which the metric was another than what health told.
+        disagreed: Number of looks, two running, at which the metric was another than what health
+            told: they are three requests, between which what is told may change.
         retried: Number of times that it was repeated as the machine was busy with others.
     """
 
@@ -74,7 +76,7 @@ class _Watcher:
     def __init__(self, port: int) -> None:
         self._port = port
         self.looks: list[_Look] = []
-        self.disagreed = 0
+        self.disagreed, self._differs = 0, False
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -121,7 +123,8 @@ class _Watcher:
                 # A daemon that is kept short answers seconds later.
                 slow = time.monotonic() - began > BUSY_S
                 right = slow or min(both) <= int(found[1]) <= max(both)
-                self.disagreed += not (right and int(found[1]) == listed)
+                before, self._differs = self._differs, not (right and int(found[1]) == listed)
+                self.disagreed += before and self._differs
             time.sleep(max(0.0, ASK_S - (time.monotonic() - began)))
 
     def _ask(self, path: str) -> bytes:
