@@ -39,8 +39,8 @@ them every other figure that misses its bar, marked **MISSED**. All figures, wit
 compared with and how it was measured, are in the JSON file of the area. Timings are those of the
 machine named above the table: run the command on yours.
 
-More results: [real objects](realtouch.md), [networks compared](../explain/results.md),
-[the physics](../explain/physics.md).
+More results: [shapes of real things](realtouch-2.md), [names of them](realtouch.md),
+[networks compared](../explain/results.md), [the physics](../explain/physics.md).
 """
 HEADLINES = tomllib.loads(Path(__file__).with_name("headlines.toml").read_text("utf-8"))
 

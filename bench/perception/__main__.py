@@ -1,10 +1,12 @@
 """Run the benchmark, and write its page.
 
-python -m bench.perception [--folder FOLDER] [--model FILE.onnx ...] [--page FILE] [--quick]
+python -m bench.perception [--folder FOLDER] [--model FILE.onnx ...] [--folds FOLDER]
+                           [--objects FOLDER] [--page FILE] [--quick]
 
 FOLDER (data/realtouch) is where the sweeps of generated objects are, and are made if they are not,
-and where networks are trained; quick needs none, and leaves out what does. A model file is tested
-on the kinds that it knows.
+and where networks are trained; quick needs none, and leaves out what does. `--folds` has a model
+file for each fold of makers, as `bench.shipped --without` makes them; `--objects` the meshes, for
+the bounds of what touch can tell.
 """
 
 import argparse
@@ -26,11 +28,15 @@ def main() -> int:
     )
     parser.add_argument("--folder", type=Path, default=FOLDER)
     parser.add_argument("--model", type=Path, action="append", default=[])
+    parser.add_argument("--folds", type=Path)
+    parser.add_argument("--objects", type=Path)
     parser.add_argument("--page", type=Path, default=PAGE)
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args()
     try:
-        results = measure(given.quick, given.folder, tuple(given.model), print)
+        results = measure(
+            given.quick, given.folder, tuple(given.model), given.folds, given.objects, print
+        )
     except TactileError as error:
         print(f"bench.perception: {error}", file=sys.stderr)  # noqa: T201
         return 2

@@ -117,7 +117,8 @@ def pack(parts: Sequence[Portion], origins: Mapping[str, Origin]) -> bytes:
         values.append(np.round(data.sweeps.values / step).astype(np.int32))
         objects.append(data.sweeps.objects)
         for name in dict.fromkeys(data.sweeps.objects.tolist()):
-            category, of = data.manifest.category(name), msgspec.structs.asdict(origins[name])
+            of = {field: getattr(origins[name], field) for field in Origin.__struct_fields__}
+            category = data.manifest.category(name)
             told[name] = BenchmarkObject(category=category, split=part.split, **of)
     steps = np.diff(np.concatenate(values), axis=1, prepend=0)
     if np.abs(steps).max() > np.iinfo(np.int16).max:

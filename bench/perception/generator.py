@@ -1,7 +1,7 @@
 """What a method makes of generated objects when the world or the sensor is not as it was taught.
 
 The objects are the plain shapes, 4 of each of their 24 kinds that no method has seen, 3 sweeps
-each. Every row changes one thing.
+each, labelled by their shape. Every row changes one thing.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,8 @@ from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import Choice, Range
 
-RECIPE, FIRST, OBJECTS, DRAWS = "default24", 48, 4, 3
+RECIPE = str(Path(__file__).parents[1] / "shipped" / "recipes" / "upright24.toml")
+FIRST, OBJECTS, DRAWS = 48, 4, 3
 UPRIGHT = "upright, 40 mm large, 28 to 40 mm/s"
 SHAKEN = "head shaken with 0.5 g, 10 to 100 Hz"
 FAR_MM = 80.0  # where no whisker reaches

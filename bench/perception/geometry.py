@@ -4,12 +4,14 @@ Both need the meshes. An object is 40 mm large and upright, as it is swept.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from bench.perception.data import Data
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.models.evaluation.svm import PENALTIES, fit
@@ -23,12 +25,39 @@ PICTURES = 4  # of every object, each from a side and at a height of its own
 HEIGHTS_MM = (-8.0, 4.0)
 
 
+@dataclass(frozen=True)
+class Bounds:
+    """What could be told of the held-out objects.
+
+    Attributes:
+        whole: By the nearest of all whole shapes learnt from.
+        one, four: By so many noise-free pictures of a side.
+    """
+
+    whole: Interval
+    one: Interval
+    four: Interval
+
+
+def measure_bounds(data: Data, folder: Path) -> Bounds:
+    """Measure the bounds on the held-out objects, whose meshes are in a folder."""
+    split = {
+        side: {n: data.kinds.index(o.category) for n, o in data.origins.items() if o.split == side}
+        for side in ("train", "validation", "test")
+    }
+    surfaces = read_surfaces(folder, [n for names in split.values() for n in names])
+    pictures = score_pictures(surfaces, split["train"], split["validation"], split["test"])
+    whole = score_whole_shapes(surfaces, split["train"], split["test"])
+    return Bounds(whole, *pictures)
+
+
 def read_surfaces(folder: Path, names: Sequence[str]) -> dict[str, Floats]:
     """Read (point, 3) points, mm, on the surface of each object of a folder, the first ones few."""
     objects = open_objects(folder)
+    path_of = {path.replace("/", "-"): path for path in objects.origins}
     found = {}
     for name in names:
-        pieces = trimesh.util.concatenate(objects.load(name).pieces)
+        pieces = trimesh.util.concatenate(objects.load(path_of.get(name, name)).pieces)
         points, _ = trimesh.sample.sample_surface(pieces, DENSE, seed=0)
         found[name] = SIZE_MM * np.asarray(points, dtype=np.float64)
     return found

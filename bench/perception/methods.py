@@ -7,7 +7,6 @@ split of what it learns from, each for itself.
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +17,9 @@ from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.export.release import fit_temperature
 from tactile_rt.models.checkpoints import load_checkpoint
-from tactile_rt.models.datasets import SweepSet, joined
+from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.coverage import score_known
 from tactile_rt.models.evaluation.measures import run_on
 from tactile_rt.models.evaluation.svm import PENALTIES, fit, window_features
 from tactile_rt.models.evaluation.windows import stepped
@@ -31,10 +29,9 @@ from tactile_rt.sets.objects import Sweeps
 from tactile_rt.sim_backend.datasets import recipes
 
 Floats = NDArray[np.float32]
-REAL, GENERATED, BOTH = "real", "generated", "generated + real"
+REAL, GENERATED = "real", "generated"
 RATES = (1e-3, 2e-3, 5e-3)  # of the GRU, of which validation chooses
 UPDATES = 3000  # of the GRU
-REPEATS = 3  # of the real sweeps beside the generated ones, which are more
 
 
 @dataclass(frozen=True)
@@ -47,49 +44,28 @@ class Method:
         kinds: The kinds that it tells apart.
         posteriors: The posteriors (sweep, kind) of a set's sweeps under a disturbance; NaN where it
             finds no contact.
-        familiar: How sure (sweep,) it is that the things are of kinds that it knows; None: as sure
-            as of the most probable kind.
     """
 
     name: str
     taught: str
     kinds: tuple[str, ...]
     posteriors: Callable[[SweepSet, Disturbance], Floats]
-    familiar: Callable[[SweepSet], Floats] | None = None
-
-    def score_known(self, sweeps: SweepSet) -> Floats:
-        """How sure (sweep,) it is that things are of kinds that it knows."""
-        if self.familiar is not None:
-            return self.familiar(sweeps)
-        return np.nan_to_num(self.posteriors(sweeps, CLEAN).max(axis=1), nan=0.0)
 
 
-def baselines(
-    data: Data, generated: tuple[SweepSet, SweepSet] | None, runs: Path | None
-) -> Iterator[Method]:
+def baselines(data: Data, runs: Path | None) -> Iterator[Method]:
     """The methods that every model is compared with.
 
     Args:
         data: of the benchmark.
-        generated: training and validation sweeps of generated objects; None leaves out what needs
-            them.
         runs: where networks are trained, and found trained; None leaves them out.
     """
     real = data.sets["train"], data.sets["validation"]
     yield _guess(data.kinds)
     counts = np.bincount(real[0].sweeps.labels, minlength=len(data.kinds)).astype(float)
     yield _majority(data.kinds, counts)
-    if generated:
-        yield _svm(GENERATED, *generated)
     yield _svm(REAL, *real)
-    if runs and generated:
-        yield _gru(GENERATED, *generated, runs)
     if runs:
         yield _gru(REAL, *real, runs)
-    if runs and generated:
-        kinds = tuple(dict.fromkeys((*data.kinds, *generated[0].manifest.categories)))
-        both = joined([of_kinds(one, kinds) for one in (generated[0], *[real[0]] * REPEATS)])
-        yield _gru(BOTH, both, of_kinds(real[1], kinds), runs)
 
 
 def onnx_model(path: Path) -> Method:
@@ -100,8 +76,7 @@ def onnx_model(path: Path) -> Method:
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return measures.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
-    taught, familiar = _learnt_from(card), partial(score_known, path)
-    return Method(path.stem, taught, card.classes, posteriors, familiar)
+    return Method(path.stem, _learnt_from(card), card.classes, posteriors)
 
 
 def _learnt_from(card: ModelCard) -> str:

@@ -175,6 +175,15 @@ class ModelCard(msgspec.Struct, frozen=True):
         """The array that the model was trained on."""
         return ArraySpec.from_json(self.spec)
 
+    @property
+    def class_of(self) -> dict[str, str]:
+        """Classes by the categories that count as them, by the first sweep set's recipe."""
+        with suppress(TypeError, KeyError, msgspec.ValidationError):
+            classes = self.provenance["sweep_set"]["objects"]["classes"]
+            merged = msgspec.convert(classes, dict[str, tuple[str, ...]])
+            return {category: one for one, some in merged.items() for category in some}
+        return {}
+
 
 def kind_columns(kinds: Mapping[str, Sequence[str]]) -> dict[str, slice]:
     """Find the columns of the output ``names`` that belong to each class."""

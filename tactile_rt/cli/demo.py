@@ -191,6 +191,7 @@ class Demonstration:
             self._source = source = SimSource("mouse", options)
             self.passes = source.passes
         self.classifier = Classifier(model, self._source.spec)
+        self._class_of = self.classifier.card.class_of
         self._session = Session(self._source, self.classifier)
         self.target: Any = None
         self.decision: Classification | None = None
@@ -286,12 +287,15 @@ class Demonstration:
         self._miss_before(number)
         self.target, self.decision = self.passes[number], decision
         if decision.final:
-            of = self.target.name, self.target.category
-            self.outcomes.append(SweepOutcome(*of, decision.label, decision.probability))
+            self._settle(self.target, decision.label, decision.probability)
 
     def _miss_before(self, number: int) -> None:
         for missed in self.passes[len(self.outcomes) : number]:
-            self.outcomes.append(SweepOutcome(missed.name, missed.category))
+            self._settle(missed)
+
+    def _settle(self, passed: Any, *decision: Any) -> None:
+        category = self._class_of.get(passed.category, passed.category)
+        self.outcomes.append(SweepOutcome(passed.name, category, *decision))
 
     def __enter__(self) -> Self:
         return self

@@ -226,10 +226,10 @@ class Loop:
 
     @property
     def _passes(self) -> "list[tuple[int, str]]":
-        """When each object began to come by, in the driver's time, ns, and its category."""
-        began_ns = self._first_ns or 0
+        """When each object began to come by, in the driver's time, ns, and its class."""
+        began_ns, class_of = self._first_ns or 0, self._direct.card.class_of
         passes = getattr(self._tee.inner, "passes", ())
-        return [(p.start_ns - began_ns, p.category) for p in passes]
+        return [(p.start_ns - began_ns, class_of.get(p.category, p.category)) for p in passes]
 
     def _space_evenly(self, chunk: Chunk, numbers: NDArray[np.int64]) -> Chunk:
         """Return a chunk whose samples, of these numbers, are a period apart."""

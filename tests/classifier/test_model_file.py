@@ -46,6 +46,20 @@ def test_the_card_comes_back_as_it_was_written(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("objects", "found"),
+    [
+        ({"classes": {"cup": ["mug", "can"], "disc": ["gear"]}}, ("cup", "cup", "disc")),
+        ({"classes": {"cup": "mug"}}, (None,) * 3),
+        ({"classes": 3}, (None,) * 3),
+        ("mug", (None,) * 3),
+    ],
+)
+def test_categories_count_as_the_classes_that_the_first_set_says(objects, found) -> None:
+    card = msgspec.structs.replace(CARD, provenance={"sweep_set": {"objects": objects}})
+    assert tuple(map(card.class_of.get, ("mug", "can", "gear"))) == found
+
+
 def test_a_batch_is_a_batch_of_independent_streams(tmp_path: Path) -> None:
     session, _ = load_model(write_model(tmp_path / "m.onnx"))
     rng = np.random.default_rng(0)

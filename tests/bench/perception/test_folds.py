@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sklearn")
 
+from bench.perception.area import restrict
 from bench.perception.data import Portion
 from bench.perception.folds import (
     EVERYONE,
@@ -19,7 +20,6 @@ from bench.perception.folds import (
     write_views,
 )
 from bench.perception.methods import Method
-from bench.perception.shapes import restricted
 from tactile_rt.models.datasets import SweepSet, check_sets
 from tactile_rt.sets.manifest import SPLITS, SweepManifest
 from tactile_rt.sim_backend.objects.object_sets import Origin
@@ -86,5 +86,5 @@ def test_a_view_reads_as_any_set_and_a_portion_takes_the_first_sweeps(source, tm
 def test_a_method_asked_for_some_kinds_shares_its_posterior_among_them():
     found = np.array([[0.5, 0.3, 0.2], [0.0, 0.0, 1.0]], np.float32)
     method = Method("any", "nothing", ("a", "b", "c"), lambda sweeps, disturbance: found)
-    asked = restricted(method, ("b", "a")).posteriors(None, None)
+    asked = restrict(method, ("b", "a")).posteriors(None, None)
     np.testing.assert_allclose(asked, [[0.375, 0.625], [0, 0]], rtol=1e-6)
