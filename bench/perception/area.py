@@ -191,15 +191,6 @@ def records_of(results: BenchmarkResults) -> list[Record]:
                 for figure, (value, bar) in values.items()
                 if not isnan(value.value)
             ]  # fmt: skip
-    if not any(m.name == shipped for scores in results.scores.values() for m in scores):
-        for test, bars in FLOORS.items():
-            found += [
-                Record(
-                    f"perception.{shipped}, shape, {figure}", 0.0, "%", f">= {bar:g}", test,
-                    "it does not know the shapes, and so is right in none",
-                )
-                for figure, bar in zip(("one sweep", "four sweeps"), bars, strict=True)
-            ]  # fmt: skip
     return found + list(_records_of_makers(results))
 
 
