@@ -10,9 +10,9 @@ import email
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
-import tarfile
 import tempfile
 import venv
 import zipfile
@@ -73,8 +73,7 @@ def main() -> None:
 def check_sdist(out: Path) -> None:
     """Unpack it elsewhere, and let it find its tests."""
     (archive,) = (out / "dist").glob("*.tar.gz")
-    with tarfile.open(archive) as packed:
-        packed.extractall(out, filter="data")
+    shutil.unpack_archive(archive, out)
     tree = out / archive.name.removesuffix(".tar.gz")
     pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     here = {**os.environ, "PYTHONPATH": str(tree)}  # before a checkout that is installed
