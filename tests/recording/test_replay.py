@@ -127,10 +127,13 @@ def decisions_of(url, model):
 def test_every_speed_gives_the_same_chunks_and_decisions(channel, path, tmp_path):
     tiny_model = pytest.importorskip("tests.helpers.tiny_model")
     model = tiny_model.write_model(tmp_path / "tiny.onnx")
-    fake = FakeSerial(touches(), spec=SPEC)
-    recorded, _ = record_device(fake, path, 800)
-    first = decisions_of(f"replay:{path}?from={channel}&speed=0", model)
-    assert first[0] == all_parts(recorded)
+    for _ in range(5):  # a busy machine may open the line when the touch is under way
+        fake = FakeSerial(touches(), spec=SPEC)
+        recorded, _ = record_device(fake, path, 800, force=True)
+        first = decisions_of(f"replay:{path}?from={channel}&speed=0", model)
+        assert first[0] == all_parts(recorded)
+        if len(first[1]) >= tiny_model.STEPS:
+            break
     assert len(first[1]) >= tiny_model.STEPS
     for speed in (0, 0, 10, 10, 10, 1, 1, 1):
         assert decisions_of(f"replay:{path}?from={channel}&speed={speed}", model) == first
