@@ -22,6 +22,7 @@ AXES = 16  # directions in which touches of a class differ
 SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction
 FOLDS = 10
 REFUSED = 0.06  # of the touches, leave-one-out, at most, are taken for unknown
+ENOUGH = 5  # touches of a class, below which they do not tell how far others may be
 MAD, FARTHEST = 1.4826, 2.5  # standard deviations of the logarithm of the distance, at most
 LIMIT = 5.0  # standardised features are limited to, either way: one outlier is not the decision
 # A feature's scale is no less than so many times the median one of its kind, and than this share
@@ -44,6 +45,8 @@ class TouchClasses:
         axes: (step, feature, axis) The directions in which touches of a class differ, each
             as long as a unit along it weighs less than a unit across all.
         rest: (step,) The variance in all other directions.
+        share: (class,) The part of the squared distance from a class that is left when what comes
+            from its mean of few touches is taken off.
         reach: (step,) The squared distance from the nearest class beyond which a touch is unknown.
         temperature: The number by which half of the squared distances is divided, so that
             posteriors mean what they say.
@@ -55,6 +58,7 @@ class TouchClasses:
     centres: Floats
     axes: Floats
     rest: Floats
+    share: Floats
     reach: Floats
     temperature: float
 
@@ -63,7 +67,8 @@ class TouchClasses:
         found = np.clip((features - self.mean) / self.scale, -LIMIT, LIMIT)
         away = found[:, :, None] - self.centres
         along = np.einsum("tscf,sfa->tsca", away, self.axes)
-        return np.asarray(np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1))
+        whole = np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1)
+        return np.asarray(self.share * whole)
 
 
 @dataclass(frozen=True)
@@ -93,13 +98,15 @@ def fit_classes(
     check_enough(labels)
     told = told or leave_one_out(features, labels, kinds)
     nearest = told.distances.min(axis=2)  # (touch, step)
-    rank = min(len(labels) - 1, int(np.ceil((1 - REFUSED) * (len(labels) + 1))) - 1)
+    classes, own = np.unique(np.asarray(labels), return_inverse=True)
+    many = np.bincount(own)[own] >= ENOUGH
+    nearest = nearest[many] if many.any() else nearest
+    rank = min(len(nearest) - 1, int(np.ceil((1 - REFUSED) * (len(nearest) + 1))) - 1)
     # A touch under a wrong name is far from its class; it is not to let everything through.
     logs = np.log(nearest + TINY)
     middle = np.median(logs, axis=0)
     spread = MAD * np.median(np.abs(logs - middle), axis=0)
     reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
-    classes, own = np.unique(np.asarray(labels), return_inverse=True)
     temperature = _temperature(told.distances[:, -1], own)
     names = tuple(str(name) for name in classes)
     return TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
@@ -117,10 +124,9 @@ def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
     turn = np.empty(len(own), dtype=int)
     for k in range(len(classes)):
-        turn[own == k] = np.arange((own == k).sum())
+        count = int((own == k).sum())
+        turn[own == k] = np.arange(count) % min(FOLDS, count)
     distances = np.empty((*features.shape[:2], len(classes)))
-    few = int(np.bincount(own).min())
-    turn %= min(FOLDS, few)
     for fold in range(turn.max() + 1):
         out = turn == fold
         learnt = TouchClasses(
@@ -139,9 +145,10 @@ def check_enough(labels: Sequence[str]) -> None:
 
 def _shared(
     features: Floats, own: NDArray[np.intp], kinds: Sequence[slice]
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """mean, scale, centres, axes and rest, as `TouchClasses` has them."""
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """mean, scale, centres, axes, rest and share, as `TouchClasses` has them."""
     count = int(own.max()) + 1
+    share = 1 - 1 / (np.bincount(own) + 1.0)
     freedom = max(1, len(own) - count)
     mean = features.mean(axis=0)
     scale = np.sqrt(np.square(features - _means(features, own)[own]).sum(axis=0) / freedom)
@@ -162,7 +169,7 @@ def _shared(
     along /= np.linalg.norm(along, axis=1, keepdims=True) + TINY
     kept = (1 - SHARE) * np.maximum(values, 0) + rest[:, None]
     less = np.sqrt(np.maximum(0, 1 / rest[:, None] - 1 / kept))
-    return mean, scale, np.swapaxes(centres, 0, 1), along * less[:, None], rest
+    return mean, scale, np.swapaxes(centres, 0, 1), along * less[:, None], rest, share
 
 
 def _means(features: Floats, own: NDArray[np.intp]) -> Floats:

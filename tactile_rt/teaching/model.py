@@ -174,7 +174,8 @@ def _head(g: OnnxGraph, features: str, count: str, timing: Timing, classes: Touc
     whole = g("ReduceSum", g("Mul", away, away), g.integers(2), keepdims=0)
     whole = g("Mul", whole, now(1 / classes.rest[:, None]))
     less = g("ReduceSum", g("Mul", along, along), g.integers(2), keepdims=0)
-    distances = g("Concat", g("Sub", whole, less), now(classes.reach[:, None]), axis=1)
+    nearer = g("Mul", g("Sub", whole, less), g.constant(classes.share))
+    distances = g("Concat", nearer, now(classes.reach[:, None]), axis=1)
     return g("Mul", distances, g.constant(-0.5))
 
 

@@ -166,7 +166,7 @@ class Teacher:
                 lines.append(f"{name}: one touch is too few, and was not learnt")
             elif count < FEW and len(learnt) > 1:
                 lines.append(
-                    f"{name}: {count} touches make refusals of strange things weak: "
+                    f"{name}: {count} touches are few: later ones may be called unknown: "
                     f"give it {wanted - count} more"
                 )
         return lines

@@ -200,7 +200,7 @@ def test_one_touch_of_a_class_is_told_to_be_too_few(taught, tmp_path):
     teach(lesson, ["press", "press", "slide"], seed=8)
     assert Teacher(lesson, [], 2).summary()[-1] == "slide: one touch is too few, and was not learnt"
     teach(lesson, ["slide"] * 5, seed=9)
-    said = "press: 2 touches make refusals of strange things weak: give it 8 more"
+    said = "press: 2 touches are few: later ones may be called unknown: give it 8 more"
     assert Teacher(lesson, [], 10).summary()[-1] == said
 
 
@@ -273,6 +273,17 @@ def test_the_floor_is_that_of_the_noise_or_of_the_steps():
     assert floor[1] == pytest.approx(0.3 * 5.1, rel=0.1)
     still = measured_floor(cut(np.full((400, 3, 2), 235.0), 100.0))
     assert (still > 0).all() and (still < 1).all()
+
+
+def test_a_class_of_two_touches_does_not_let_strangers_through(taught):
+    kept = [t for t in taught.touches if t.label != "double"]
+    kept += [t for t in taught.touches if t.label == "double"][:2]
+    features = np.stack([t.features for t in kept]).astype(float)
+    classes = fit_classes(features, [t.label for t in kept], taught.taught.network.kinds)
+    listener, chunks = taught.listener(wrench_spec()), cut(felt(["push"] * 10, seed=3), RATE_HZ)
+    strangers = np.stack([touch for chunk in chunks for *_, touch in listener.push(chunk)])
+    nearest = classes.distances(strangers.astype(float))[:, -1].min(axis=1)
+    assert (nearest > classes.reach[-1]).sum() >= 9
 
 
 def test_a_touch_under_a_wrong_name_is_found(taught):
