@@ -120,6 +120,9 @@ class DecisionMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
     coverage: float64
     names: sequence[str]
     names_coverage: float64
+    object: str
+    object_margin: float64
+    object_touches: uint32
     model_ms: float64
     latency_ms: float64
     age_ms: float64

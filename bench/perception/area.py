@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.perception.data import NAME, SHAPES_FILE, Data, load
+from bench.perception.enrolment import measure_enrolment
 from bench.perception.folds import FOLDS, KINDS, MAKER
 from bench.perception.generator import UPRIGHT, false_touches, measured, rows
 from bench.perception.geometry import Bounds, measure_bounds
 from bench.perception.methods import Method, baselines, of_kinds, onnx_model
 from bench.perception.scores import Figures, robustness, score
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation.coverage import (
     Coverage,
@@ -37,6 +38,7 @@ Floats = NDArray[np.float32]
 FOLDER = Path("data") / NAME
 OBJECTS, LEANING, NEVER = "held-out objects", "the same, leaning", "kinds never met"
 SEVEN_OBJECTS, MAKERS = "held-out objects of seven shapes", "held-out makers, mean of folds"
+BOTH = "held-out objects, upright or leaning"
 SEVEN = ("block", "panel", "ball", "bottle", "bowl", "disc", "chair")
 FLOORS = {  # of the shipped model, in percent, by test: one sweep, four
     OBJECTS: (58.0, 66.0),
@@ -44,6 +46,14 @@ FLOORS = {  # of the shipped model, in percent, by test: one sweep, four
     MAKERS: (48.0, 54.0),
 }
 CALIBRATION = 6.0  # percent at most
+ENROLMENT = {  # of the shipped model, in percent, by test
+    OBJECTS: {
+        "likeliest, 1 judged": 75.0,
+        "strangers refused, 1 judged": 40.0,
+        "AUROC, 1 judged": 82.0,
+    },
+    BOTH: {"likeliest, 2 judged": 83.0},
+}
 NETWORK = "shipped model"  # its likes, learnt without a fold
 
 
@@ -62,6 +72,7 @@ class BenchmarkResults:
         names: Coverage and size of the sets of names of model files, by name and class.
         faults: The share of loads that no touch makes that each model file refuses, by their name.
         bounds: What a whole surface, and a noise-free picture of a side, tell; None: not measured.
+        enrolment: Of model files that enrol objects, by name and test, see `measure_enrolment`.
         false_touches: Touches a minute found while the head is shaken and nothing is near, without
             and with the rated noise; None: not measured.
     """
@@ -74,6 +85,7 @@ class BenchmarkResults:
     coverage: dict[str, dict[str, Coverage]] = field(default_factory=dict)
     names: dict[str, dict[str, Interval]] = field(default_factory=dict)
     faults: dict[str, dict[str, Interval]] = field(default_factory=dict)
+    enrolment: dict[str, dict[str, dict[str, Interval]]] = field(default_factory=dict)
     bounds: Bounds | None = None
     false_touches: tuple[float, float] | None = None
 
@@ -122,17 +134,22 @@ def measure(
             results.robust[method] = robustness(method, seven, conditions(seven))
             results.generator[method] = measured(method, changed)
     plain = changed[UPRIGHT][0][0] if changed else tests[OBJECTS]
-    for path in found:
+    for path, method in found.items():
         progress(f"{path.stem}: its coverage and refusals")
+        labelled = {name: of_kinds(one, method.kinds) for name, one in tests.items()}
         on = {
-            OBJECTS: (tests[OBJECTS], CLEAN),
-            f"{OBJECTS}, rated noise": (tests[OBJECTS], Disturbance(noise=1)),
-            LEANING: (tests[LEANING], CLEAN),
-            NEVER: (tests[NEVER], CLEAN),
+            OBJECTS: (labelled[OBJECTS], CLEAN),
+            f"{OBJECTS}, rated noise": (labelled[OBJECTS], Disturbance(noise=1)),
+            LEANING: (labelled[LEANING], CLEAN),
+            NEVER: (labelled[NEVER], CLEAN),
         }
         covered = {name: measure_coverage(path, *one) for name, one in on.items()}
         results.coverage[path.stem] = {n: c for n, c in covered.items() if c is not None}
-        results.names[path.stem] = dict(measure_names(path, tests[OBJECTS]))
+        every = joined([tests[OBJECTS], tests[LEANING]])
+        for name, test in {OBJECTS: tests[OBJECTS], BOTH: every}.items():
+            if enrolled := measure_enrolment(path, test):
+                results.enrolment.setdefault(path.stem, {})[name] = enrolled
+        results.names[path.stem] = dict(measure_names(path, labelled[OBJECTS]))
         results.faults[path.stem] = dict(named_faults(path, plain))
     if not quick:
         for fold, makers in FOLDS.items():
@@ -184,14 +201,26 @@ def records_of(results: BenchmarkResults) -> list[Record]:
             }
             found += [
                 Record(
-                    f"perception.{method.name}, {figure}", 100 * value.value, "%", bar,
-                    f"{test}; taught by {method.taught}; {len(method.kinds)} shapes",
+                    f"perception.{method.name}, {test}: {figure}", 100 * value.value, "%", bar,
+                    f"taught by {method.taught}; {len(method.kinds)} shapes",
                     f"95 % interval {100 * value.low:.0f} to {100 * value.high:.0f}, by object",
                 )
                 for figure, (value, bar) in values.items()
                 if not isnan(value.value)
             ]  # fmt: skip
-    return found + list(_records_of_makers(results))
+    return [*found, *_records_of_enrolment(results), *_records_of_makers(results)]
+
+
+def _records_of_enrolment(results: BenchmarkResults) -> Iterator[Record]:
+    for name, tests in results.enrolment.items():
+        for test, figures in tests.items():
+            bars = ENROLMENT[test] if name == shipped_model().stem else {}
+            for figure, value in figures.items():
+                yield Record(
+                    f"perception.{name}, ten enrolled of {test}: {figure}", 100 * value.value, "%",
+                    f">= {bars[figure]:g}" if figure in bars else "", "three touches each",
+                    f"{100 * value.low:.0f} to {100 * value.high:.0f} in 95 of 100 draws",
+                )  # fmt: skip
 
 
 def _records_of_makers(results: BenchmarkResults) -> Iterator[Record]:

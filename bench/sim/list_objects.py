@@ -1,11 +1,11 @@
-"""Make the lists of objects that ship, from clones of the repositories that they name.
+"""Make the list `real` of objects, from clones of the repositories that it names.
 
 What is of which kind is said here, by hand, as patterns of file names. What is of the same shape is
 measured: two objects of a kind are variants, mirror images or copies of each other if the distances
 between random pairs of points of their surfaces, and the heights of these points, are spread alike.
 Scans and parts of the same YCB object are told by their names.
 
-Run: python -m bench.sim.list_objects LIST CLONES [--out FILE]
+Run: python -m bench.sim.list_objects CLONES [--out FILE]
 """
 
 import argparse
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.objects.mesh_files import read_parts
 
-OUT = Path("tactile_rt/sim_backend/objects/lists")
+OUT = Path("tactile_rt/sim_backend/objects/lists/real.csv")
 PAIRS, BINS = 40_000, 48
 ALIKE = 0.12  # of all pairs and heights that may lie in other bins
 YCB = re.compile(r"^\d+_|^plastic_|_base$")
@@ -132,90 +132,21 @@ KINDS = {
     "tree": r"tree\w+|cactus_\w+|bush",
     "wall": r"wall\w*|Wall\w*|Primitive_Wall\w*|Primitive_Window|Primitive_Doorway|arch\w*",
 }
-# One library has some nine hundred things, most of them alone of their kind: a single one of which
-# nothing below knows is a "thing", of which one can learn what is unknown.
-EVERYDAY_REPOSITORIES = (
-    Repository(
-        "M3-org/base-meshes", r"models/(?P<name>[^/]+)/[^/]+\.glb", "CC0-1.0", "y", "1"
-    ),
-)  # fmt: skip
-EVERYDAY = {
-    "ball": r"apple|globe|d20_dice",
-    "barrel": r"oil_barrel|wood_barrel|wooden_barrel_basic|bucket|mop_bucket",
-    "bench": r"\w*_bench|\w+_bench_\d+|\w*pallet",
-    "book": r"book_\d+",
-    "bottle": r"\w+_bottle(_\d+)?|cleaning_spray|decanter|soap_dispenser|spray_can|milk_jug"
-    r"|flat_bottomed_flask|conical_flask",
-    "bowl": r"\w*bowl(_\d+)?|ash_tray|octagonal_dish",
-    "box": r"cardboard_box_\d+|\w+_box|take_away_box_\d+|cigarette_packet|drink_carton_\d+",
-    "cabinet": r"bedside_table_\d+|chest_of_drawers_\d+|filing_cabinet|locker"
-    r"|organizer_drawers_\d+|microwave",
-    "can": r"canned_food_\d+|soda_can|paint_stripper_can",
-    "candle": r"candle_holder_\d+|tealight|iron_flambeaux_\d+|incense_holder",
-    "chair": r"(dining|folding|lounge|wooden)_chair_\d+|office_chair|outdoor_folding_chair"
-    r"|small_plastic_chair|viking_bog_chair|deck_chair|wheelchair_\d+",
-    "clamp": r"g_clamp|clamp|bulldog_clip",
-    "crate": r"military_crate_\d+|wine_crate|wooden_crate_\d+|wooden_produce_crate|pallet_box_\d+"
-    r"|cardboard_produce_tray|storage_basket\w*",
-    "cup": r"coffee_cup|egg_cup|greek_cup|whiskey_glass|beaker|pen_tidy|cupcake_case",
-    "door": r"(\w+_)?door(_\d+)?",
-    "dumbbell": r"hex_dumbbell|circular_barbell",
-    "fence": r"border_fence|rounded_picket_fence|walking_trail_fence|pedestrian_guardrail"
-    r"|crowd_control_barrier|colorado_barrier|wooden_rope_barrier|\w+_trellis|wooden_gate_\d+",
-    "food": r"lemon|apple_\w+|avocado\w*|cheeseburger|pizza|pizza_slice|salmon_\w+|slice_of_bread"
-    r"|swiss_cheese_slice|potato_waffle|ice_lolly|lollipop|candy_cane|chocolate_bar",
-    "goblet": r"goblet_\d+|wine_glass|cocktail_glass|trophy",
-    "grave": r"headstone_\d+|stone_tomb_\d+|\w*plaque\w*",
-    "hammer": r"hammer|brick_hammer|sledgehammer|wooden_mallet|kalimba_tuning_hammer",
-    "house": r"birdhouse",
-    "jar": r"glass_jar_\d+|ceramic_urn|\w*vase\w*|roman_pottery_\d+",
-    "ladder": r"\w+_ladder(_\d+)?",
-    "lamp": r"desk_lamp|lamp_post_\d+|japanese_stone_lantern_\d+|outdoor_wall_light",
-    "marker": r"pen_\d+|pencil|crayon|lipstick",
-    "mug": r"mug",
-    "mushroom": r"mushroom_\d+",
-    "pan": r"flan_tin|loaf_tin|roasting_tray|cupcake_baking_tray",
-    "picture": r"\w*painting_frame\w*|photo_frame|mounted_picture_frame|framed_poster",
-    "pillar": r"\w*column\w*|\w*pillar|plinth|obelisk_\d+|decorative_bollard_\d+",
-    "plate": r"(decorative_)?plate|petri_dish\w*|chopping_board|tea_tray_\d+|metal_tray"
-    r"|chinese_coin|cd|vinyl",
-    "rock": r"rock_\d+|crystal|dirt_pile_\d+",
-    "screwdriver": r"\w*screwdriver",
-    "shelf": r"corner_shelf_\d+|hexagon_shelf|honeycomb_shelving|industrial_shelving_\d+"
-    r"|medieval_bookcase|shelving_unit|storage_shelving_\d+",
-    "skull": r"skull\w*|deer_head",
-    "spoon": r"\w*spoon|\w*fork|\w*knife|\w*spatula|ladle|fish_slice|cleaver",
-    "spring": r"spring",
-    "stairs": r"\w*staircase_\d+|stepstool",
-    "stool": r"\w*stool(_\d+)?",
-    "table": r"coffee_table\w*|food_prep_table\w*|office_desk|square_table|stem_bar_table"
-    r"|writing_desk",
-    "teapot": r"teapot",
-    "tile": r"\w*_tile(_\d+)?|\w*paving\w*|paving_circle|stone_tile_\w+|drain_cover_\d+"
-    r"|drainage_grate_\d+|metal_grating_\d+",
-    "tool": r"spanner\w*|pliers|hacksaw_\d+|saw|chisel|trowel|brick_trowel|crowbar|bradawl"
-    r"|tweezers|allen_key|key|key_\d+|ornate_key|padlock|stapler",
-    "wall": r"\w+_bond_brick|stone_archway_\d+|office_cubicle_wall|wood_wall_panel",
-    "thing": r"(?!\w*(texture|icon|logo|cornice|architrave|skirting|kerb|profile|symbol)).*",
-}
-LISTS = {"real": (REPOSITORIES, KINDS), "everyday": (EVERYDAY_REPOSITORIES, EVERYDAY)}
 ENOUGH = 8  # shapes in a kind that can be learnt
 
 
 def main() -> None:
     """Write the list, and say how many of each kind there are."""
     parser = argparse.ArgumentParser(prog="python -m bench.sim.list_objects")
-    parser.add_argument("list", choices=LISTS)
     parser.add_argument("clones", type=Path)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, default=OUT)
     asked = parser.parse_args()
-    repositories, kinds = LISTS[asked.list]
     rows: list[dict[str, str]] = []
     spread: dict[str, list[tuple[str, NDArray[np.float64]]]] = defaultdict(list)
     shape: dict[tuple[str, str], str] = {}
-    for repository in repositories:
+    for repository in REPOSITORIES:
         for name, files in _objects(asked.clones, repository):
-            kind = next((k for k, known in kinds.items() if re.fullmatch(known, name)), None)
+            kind = next((k for k, known in KINDS.items() if re.fullmatch(known, name)), None)
             if kind is None:
                 continue
             kind, name = kind.replace(" ", "_"), f"{_short(repository)}-{name}"
@@ -244,7 +175,7 @@ def main() -> None:
             ]
     shapes = Counter(kind for kind, _ in {(k, s) for (k, _), s in shape.items()})
     rows.sort(key=lambda row: (row["category"], row["name"], row["path"]))
-    with (asked.out or OUT / f"{asked.list}.csv").open("w", newline="") as file:
+    with asked.out.open("w", newline="") as file:
         table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         table.writeheader()
         table.writerows(rows)

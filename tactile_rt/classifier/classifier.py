@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from tactile_rt.classifier.decision_rules import (
     PredictionSetRule,
     fitting,
 )
+from tactile_rt.classifier.enrolment import identify
 from tactile_rt.classifier.model_card import decided, kind_columns, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
@@ -57,6 +58,7 @@ ABSURD = 1e9
 IMPLAUSIBLE = 10.0
 IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
 TOUCHES = 256
+FUSED = 8  # touches, at most, that are judged together
 log = logging.getLogger(__name__)
 
 
@@ -91,6 +93,12 @@ class Classification:
             box, crate; empty where the class has none or there is no rule, as `prediction_set`.
         names_coverage: The share of touches of things of that class of which the true kind is among
             the names of every step; None: there are no names.
+        object: The enrolled object that it is, or "none of these"; empty where none is enrolled,
+            and before a touch's last step.
+        object_margin: By how much the likeness to the likeliest object is above what is needed;
+            below 0 it is none of these; None without objects.
+        object_touches: The number of touches that `object` rests on, more than 1 where they are
+            fused; 0 without objects.
     """
 
     onset_ns: int
@@ -107,6 +115,9 @@ class Classification:
     embedding: Floats | None = None
     names: tuple[str, ...] = ()
     names_coverage: float | None = None
+    object: str = ""
+    object_margin: float | None = None
+    object_touches: int = 0
 
     @property
     def probability(self) -> float:
@@ -166,6 +177,8 @@ class Classifier:
             network skips to the ``newest`` sample, or takes ``all`` steps.
         behind_s: the greatest age of a step's newest sample when its decision is there, s; None:
             three steps, or 0.15 s if that is more.
+        fuse_s: how soon after the last decision on an object a touch must begin to be of the same
+            thing, s: which enrolled object it is, these touches tell together; 0: each tells alone.
 
     Attributes:
         detector: The contact detector, which holds the stream's contact state and baseline.
@@ -202,11 +215,14 @@ class Classifier:
         catch_up: CatchUp = "all",
         behind_s: float | None = None,
         skips: Iterable[Skip] = (),
+        fuse_s: float = 0.0,
     ) -> None:
         if mode not in get_args(Mode):
             raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
         if mode == "sliding" and sure is not None:
             raise ConfigError("sure: windows that slide have no early end; decide by episodes")
+        if fuse_s < 0:
+            raise ConfigError(f"fuse_s: {fuse_s} s; it must be 0 or more")
         self._exit = EarlyExit(sure, in_a_row)
         names = onnxruntime_names(providers)
         session, self.card = load_model(model, names, threads)
@@ -246,6 +262,9 @@ class Classifier:
         self._set_rule: PredictionSetRule | None = None  # of the episode
         self._columns = kind_columns(self.card.kinds)
         self._name_rules: dict[str, PredictionSetRule | None] = {}  # likewise, by class
+        self._fuse_ns = fuse_s * NS_PER_S
+        self._felt = deque[Floats](maxlen=FUSED)  # embeddings of touches of one thing
+        self._felt_ns = 0  # when the last of them was decided
 
     @property
     def deciding(self) -> bool:
@@ -273,6 +292,7 @@ class Classifier:
         self.detector = ContactDetector((shape[0], shape[1]), floor)
         self._resampler = Resampler(self.card.period_ns, self._rate_hz)
         self._onset_ns, self._next_seq = None, 0
+        self._felt.clear()
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
@@ -388,6 +408,8 @@ class Classifier:
         label = self.card.labels[best]
         name_rule = None if self._decided else self._name_rules.get(label)
         names = self._names_left(name_rule, label, lane, step) if name_rule else ()
+        whole = step == self.card.steps and not self._decided
+        found = self._identify(onset_ns, t_ns, lane) if whole and self.card.enrolled else {}
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
             self.stats.withheld += 1
@@ -407,7 +429,18 @@ class Classifier:
             embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
             names=names,
             names_coverage=name_rule.coverage if name_rule else None,
+            **found,
         )
+
+    def _identify(self, onset_ns: int, t_ns: int, lane: int) -> dict[str, Any]:
+        """Return what a decision says of enrolled objects, at the end of a touch."""
+        if onset_ns - self._felt_ns > self._fuse_ns:
+            self._felt.clear()
+        self._felt.append(self._stepper.embedding[lane].copy())
+        self._felt_ns = t_ns
+        assert self.card.identity is not None
+        name, margin = identify(self.card.identity, self.card.enrolled, self._felt)
+        return {"object": name, "object_margin": margin, "object_touches": len(self._felt)}
 
     def _names_left(
         self, rule: PredictionSetRule, label: str, lane: int, step: int

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -24,13 +24,13 @@ from tactile_rt.classifier.decision_rules import (
     PredictionSetRule,
     named,
 )
+from tactile_rt.classifier.enrolment import EnrolledObject, IdentityRule, enrolment_fault
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
 from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch, name_some
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import SensorSpec, channel_limits
 
 __all__ = [
-    "EmbeddingStatistics",
     "Kind",
     "ModelCard",
     "StateTensor",
@@ -65,39 +65,6 @@ class StateTensor(msgspec.Struct, frozen=True):
     in_place: bool = False
 
 
-class EmbeddingStatistics(msgspec.Struct, frozen=True):
-    """Where touches of the known classes lie, by the mean of their steps' embeddings.
-
-    Attributes:
-        means: (class, unit) The mean of each class's touches, float16, little-endian.
-        covariance: (unit, unit) The covariance within a class, float16, little-endian.
-    """
-
-    means: bytes
-    covariance: bytes
-
-    @classmethod
-    def of(cls, means: NDArray[np.float64], covariance: NDArray[np.float64]) -> Self:
-        """Those of arrays."""
-        return cls(*(array.astype("<f2").tobytes() for array in (means, covariance)))
-
-    def arrays(self, classes: int, units: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(class, unit) means and (unit, unit) covariance.
-
-        Raises:
-            ValueError: there are not so many numbers, or some are none.
-        """
-        means, covariance = (
-            np.frombuffer(data, "<f2").astype(float).reshape(-1, units)
-            for data in (self.means, self.covariance)
-        )
-        if len(means) != classes or len(covariance) != units:
-            raise ValueError(f"{len(means)} means, {len(covariance)} rows of covariance")
-        if not (np.isfinite(means).all() and np.isfinite(covariance).all()):
-            raise ValueError("numbers that are none")
-        return means, covariance
-
-
 class ModelCard(msgspec.Struct, frozen=True):
     """The metadata of a model file, stored as JSON under ``tactile_rt``.
 
@@ -130,8 +97,9 @@ class ModelCard(msgspec.Struct, frozen=True):
         names: The rules of prediction sets of these kinds, by the names of the classes.
         refusals: The last of the labels, if any: those that name no class, but say that the object
             is unknown, or what is wrong with the loads.
-        embeddings: The places of touches of the known classes, so that others can be told from them
-            without the data; None if it is not told.
+        identity: The rule by which touches are of an enrolled object, of networks whose embedding
+            was trained to tell objects apart; None: the file cannot enrol any.
+        enrolled: The objects that it knows beside its classes, by touches of each.
         license: The licence of the file, an SPDX expression such as "Apache-2.0"; empty if it is
             not told.
     """
@@ -162,7 +130,8 @@ class ModelCard(msgspec.Struct, frozen=True):
     candidates: tuple[PredictionSetRule, ...] = ()
     kinds: dict[str, tuple[str, ...]] = {}
     names: dict[str, tuple[PredictionSetRule, ...]] = {}
-    embeddings: EmbeddingStatistics | None = None
+    identity: IdentityRule | None = None
+    enrolled: tuple[EnrolledObject, ...] = ()
     license: str = ""
 
     @property
@@ -327,11 +296,8 @@ def parse_card(path: Path, text: str) -> ModelCard:
         raise damaged("refusals are not the last of the labels")
     if len(card.refusals) == len(card.labels):
         raise damaged("there are no labels but refusals")
-    if card.embeddings is not None:
-        try:
-            card.embeddings.arrays(len(card.classes), card.embedding)
-        except ValueError as error:
-            raise damaged(f"embeddings: {error}") from None
+    if wrong := enrolment_fault(card.identity, card.enrolled, card.embedding):
+        raise damaged(wrong)
     return card
 
 

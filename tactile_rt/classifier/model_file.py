@@ -63,11 +63,11 @@ __all__ = [
 METADATA_KEY = "tactile_rt"
 MESSAGE = 300  # characters of what a file, or onnxruntime, has us say
 Described = tuple[tuple[Any, ...], str]
-SHIPPED = Path(__file__).parents[1] / "assets" / "mouse44.onnx"
+SHIPPED = Path(__file__).parents[1] / "assets" / "mouse13.onnx"
 
 
 def shipped_model() -> Path:
-    """The model that comes with the package: 44 kinds of object, on the right mouse array."""
+    """The model that comes with the package: twelve shapes, on the right mouse array."""
     return SHIPPED
 
 

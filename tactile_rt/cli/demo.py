@@ -57,6 +57,7 @@ LEVELS: tuple[tuple[float, str, str], ...] = (
 )
 LARGEST_UN = 9999.0  # that a cell has room for
 BAR = 18  # columns
+MOST_NAMES = 2  # kinds of a class that are shown
 GREEN, RED, GREY = "#2f9e62", "#d64545", "#8a8fa3"
 
 
@@ -68,6 +69,7 @@ class SweepOutcome:
     category: str
     said: str | None = None  # None: it passed without a decision
     probability: float = 0.0
+    names: tuple[str, ...] = ()  # kinds of that class that it may be
 
     @property
     def right(self) -> bool:
@@ -76,9 +78,15 @@ class SweepOutcome:
 
     def line(self) -> str:
         """Return one line with the object, the decision and the verdict."""
-        what = f"taken for {self.said}" if self.said else "no decision"
+        what = f"taken for {describe(self.said, self.names)}" if self.said else "no decision"
         verdict = "right" if self.right else "WRONG"
-        return f"{self.name:<12} {what:<25} {100 * self.probability:3.0f} %  {verdict}"
+        return f"{self.name:<12} {what:<42} {100 * self.probability:3.0f} %  {verdict}"
+
+
+def describe(label: str, names: Sequence[str]) -> str:
+    """Return a class with the kinds of it that are possible: other (birdcage, ladder)."""
+    more = ", ..." if len(names) > MOST_NAMES else ""
+    return f"{label} ({', '.join(names[:MOST_NAMES])}{more})" if names else label
 
 
 @dataclass(frozen=True)
@@ -287,15 +295,18 @@ class Demonstration:
         self._miss_before(number)
         self.target, self.decision = self.passes[number], decision
         if decision.final:
-            self._settle(self.target, decision.label, decision.probability)
+            self._settle(self.target, decision.label, decision.probability, decision.names)
 
     def _miss_before(self, number: int) -> None:
         for missed in self.passes[len(self.outcomes) : number]:
             self._settle(missed)
 
     def _settle(self, passed: Any, *decision: Any) -> None:
-        category = self._class_of.get(passed.category, passed.category)
-        self.outcomes.append(SweepOutcome(passed.name, category, *decision))
+        self.outcomes.append(SweepOutcome(passed.name, self.true_class(passed), *decision))
+
+    def true_class(self, passed: Any) -> str:
+        """Return the class that an object is of: a shape, where the model answers shapes."""
+        return str(self._class_of.get(passed.category, passed.category))
 
     def __enter__(self) -> Self:
         return self
@@ -363,17 +374,18 @@ def _draw_guess(demo: Demonstration) -> Text:
     text = Text(f"whiskers  {state if detector.ready else 'measuring at rest'}\n", no_wrap=True)
     if demo.decision is None:
         return text.append("\nwaiting for the first object", GREY)
-    truth, decision, card = demo.target.category, demo.decision, demo.classifier.card
+    truth, decision = demo.true_class(demo.target), demo.decision
     text.append("object    ").append(truth, f"bold {GREEN}").append(f"  ({demo.target.name})\n")
-    text.append(f"step      {decision.step:>2}/{card.steps}\n\n")
+    text.append(f"step      {decision.step:>2}/{demo.classifier.card.steps}\n\n")
     for label, probability in decision.top(5):
         style = GREEN if label == truth else GREY
         text.append(f"{label[:9]:<10}", f"bold {style}" if label == truth else "")
         text.append(f"{'█' * round(BAR * probability):<{BAR}}", style)
         text.append(f" {100 * probability:3.0f} %\n")
     if decision.prediction_set:
-        possible = f"prediction set: {len(decision.prediction_set)} of {len(card.classes)} kinds"
-        text.append(possible, GREY)
+        left, of = len(decision.prediction_set), len(demo.classifier.card.classes)
+        possible = describe(decision.label, decision.names) if decision.names else ""
+        text.append(possible or f"prediction set: {left} of {of}", GREY)
     right = decision.label == truth
     verdict = ("✓ " if right else "✗ ") + ("RIGHT" if right else f"WRONG, it is a {truth}")
     return text.append(f"\n{verdict if decision.final else ''}", f"bold {GREEN if right else RED}")

@@ -13,7 +13,7 @@ from tactile_rt.cli.app import add_group, app, check_output, needing
 from tactile_rt.cli.options import STDOUT, Json, Quick
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
-from tactile_rt.core.errors import ModelError
+from tactile_rt.core.errors import ModelError, name_some
 
 __all__ = []
 
@@ -51,8 +51,7 @@ def show(file: File, json: Json = None) -> None:
         f"({card.steps * card.substeps * period_ms / 1e3:.3g} s)",
         "classes": f"{len(card.classes)}: {', '.join(card.classes[:MANY])}{rest}",
         "refusals": ", ".join(card.refusals),
-        "embedding": f"{card.embedding} units"
-        + (", and where its classes lie" if card.embeddings else ""),
+        "embedding": f"{card.embedding} units",
         "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
         "sensor": _pairs(card.sensor),
         "clip": _channels(spec, card.clip),
@@ -63,6 +62,10 @@ def show(file: File, json: Json = None) -> None:
         "prediction sets": "\n".join(map(_describe_set, card.candidates)),
         "kinds": "\n".join(f"{c}: {', '.join(kinds)}" for c, kinds in card.kinds.items()),
         "names": "\n".join(f"{c}: {_describe_set(of[0])}" for c, of in card.names.items() if of),
+        "identity": f"enrols objects, measured on {card.identity.objects}; enrolled: "
+        f"{name_some((one.name for one in card.enrolled), MANY) or 'none'}"
+        if card.identity
+        else "",
         "figures": _pairs(card.figures),
         "licence": card.license,
         "probe": "stored" if card.probe else "none stored",

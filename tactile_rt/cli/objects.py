@@ -19,7 +19,7 @@ objects = add_group("objects", "Download objects to simulate, and check meshes o
 @objects.command(epilog="tactile-rt objects get real objects")
 def get(
     wanted: Annotated[
-        str, typer.Argument(metavar="LIST", help="The list: real, real2, everyday, or a CSV file.")
+        str, typer.Argument(metavar="LIST", help="The list: real, real2, or a CSV file.")
     ],
     folder: Annotated[Path, typer.Argument(help="Folder to write: FOLDER/CATEGORY/NAME.ply.")],
     clones: Annotated[

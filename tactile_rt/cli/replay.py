@@ -188,6 +188,7 @@ class _Replay:
             self._model, spec, mode=table.get("mode", "episode"), every=table.get("every") or None,
             sure=table.get("sure") or None, in_a_row=table.get("in_a_row", 2),
             providers=tuple(table.get("providers", ("cpu",))),
+            fuse_s=table.get("fuse_s", 0.0),
             skips=[Skip(s["from_ns"], s["until_ns"]) for s in self._skips],
         )  # fmt: skip
 

@@ -23,6 +23,12 @@ def run(
     final_only: Annotated[
         bool, typer.Option("--final-only", help="Print only the last decision of each touch.")
     ] = False,
+    fuse: Annotated[
+        float,
+        typer.Option(
+            min=0, max=3600, help="Touches that follow within so many seconds are of one object."
+        ),
+    ] = 0.0,
     seconds: Seconds = None,
     sets: Settings = None,
 ) -> None:
@@ -39,12 +45,14 @@ def run(
     label, the most probable class, or a refusal to name one ("unknown"); probabilities of all of
     them; prediction_set, the classes that are still possible, and coverage, how often the true
     one is among them; names, the kinds of the label's class that are still possible, and
-    names_coverage, how often the true one is among these; latency_ms of the model step.
+    names_coverage, how often the true one is among these; object, the enrolled object that it is,
+    or "none of these", at a touch's last step, its object_margin above what is needed, and
+    object_touches that it rests on; latency_ms of the model step.
 
     A summary goes to stderr. Ctrl-C ends it.
     """
     if file is not None:
-        if source is not None or model is not None or final_only:
+        if source is not None or model is not None or final_only or fuse:
             raise ConfigError(
                 f"{file} says source, model and decisions: change them there or by --set, as "
                 "--set source.NAME.url=..."
@@ -67,7 +75,7 @@ def run(
     opened = open_url(source)
     with opened:
         try:
-            classifier = Classifier(file, opened.spec)
+            classifier = Classifier(file, opened.spec, fuse_s=fuse)
         except SpecMismatch as error:
             raise SpecMismatch(f"{source}: {error}") from None
         if is_made_up(source):
@@ -94,6 +102,9 @@ def run(
                         "coverage": d.coverage,
                         "names": d.names,
                         "names_coverage": d.names_coverage,
+                        "object": d.object,
+                        "object_margin": d.object_margin and round(d.object_margin, 4),
+                        "object_touches": d.object_touches,
                         "latency_ms": round(1e3 * d.latency_s, 3),
                     }
                     typer.echo(msgspec.json.encode(fields))  # which flushes

@@ -29,7 +29,10 @@ RESTS = 3  # tries to be at rest
 PAGE_S = 1.5  # a page asks twice a second
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 RESTING = f"touch nothing for {REST_S:g} s"
-HELP = "type and press Enter: a class or its number, n the next, u takes a touch back, q learns"
+HELP = (
+    "type and press Enter: a name or its number, n the next, u takes a touch back, q learns; "
+    "list, forget NAME, rename OLD NEW"
+)
 ORDERS = {"n": "next", "u": "undo", "q": "done"}
 HASTY = "that came too soon after the last touch to be one: wait a second"
 
@@ -41,24 +44,31 @@ def teach(
         Path, typer.Argument(help="Folder of the lesson; an existing one continues.")
     ],
     classes: Annotated[
-        str, typer.Option(help="Classes to touch, comma-separated; more can be added later.")
+        str,
+        typer.Option(help="Classes or objects to touch, comma-separated; more can come later."),
     ] = "",
-    touches: Annotated[int, typer.Option(min=2, max=1000, help="Touches of each class.")] = 10,
+    touches: Annotated[
+        int | None,
+        typer.Option(min=2, max=1000, help="Touches of each; default 10, of objects 5."),
+    ] = None,
     page: Annotated[
         str, typer.Option(help="Serve buttons for a browser, e.g. at 127.0.0.1:8791.")
     ] = "",
     model: Annotated[
         str,
-        typer.Option(help="Add the classes to this .onnx file, or to `shipped`."),
+        typer.Option(help="Network to enrol objects on: an .onnx file, or `shipped`."),
     ] = "",
     seconds: Seconds = None,
     json: Json = None,
 ) -> None:
-    """Teach a model new classes by ten touches of each.
+    """Teach classes by ten touches of each, or enrol objects by five.
 
     This is few-shot learning. Keep the sensor untouched for two seconds, then touch as prompted.
     Type a class's name or number, n (next), u (undo the last touch) or q (learn FOLDER/model.onnx,
-    and stop).
+    and stop); list, forget NAME and rename OLD NEW change what is there.
+
+    With --model, a network that was trained to tell objects apart enrols objects instead: which of
+    them is it, or none? Another network than before feels the recordings of FOLDER again.
     """
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.core.locks import alone_in
@@ -84,7 +94,7 @@ def teach(
     with opened, alone_in(folder), Orders(at) as orders:
         with leaving(seconds):
             lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
-            orders.teacher = Teacher(lesson, wanted, touches)
+            orders.teacher = Teacher(lesson, wanted, touches or lesson.taught.each)
             _teach(orders.teacher, opened, source, orders)
         teacher = orders.teacher
         if lesson is None or teacher is None or not lesson.taught_enough:
@@ -102,6 +112,7 @@ def teach(
     told = {
         "model": folder / MODEL,
         "classes": card.classes,
+        "objects": [one.name for one in card.enrolled],
         "touches": {name: lesson.count(name) for name in learnt},
         "leave_one_out_right": {
             name: {"right": good, "of": count} for name, count, good in teacher.progress.classes
@@ -110,10 +121,11 @@ def teach(
         "missing": opened.stats.missing,
     }
     told_as_json(told, json)
-    others = len(card.classes) - len(learnt)
-    knows = ", ".join(learnt) + (f" beside {others} others" if others else "")
+    others = len(card.classes) - (0 if card.enrolled else len(learnt))
+    beside = f" beside {others} {'classes' if card.enrolled else 'others'}" if others else ""
+    strange = "is none of these" if card.enrolled else "it does not know"
     typer.echo(
-        f"{folder / MODEL}: knows {knows}, and what it does not know; "
+        f"{folder / MODEL}: knows {', '.join(learnt)}{beside}, and what {strange}; "
         f"{sum(map(lesson.count, learnt))} touches, learnt in {time.process_time() - began:.1f} s"
     )
     typer.echo(
@@ -187,6 +199,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     except SpecMismatch as error:
         raise SpecMismatch(f"{error}, or teach in another folder") from None
     typer.echo(_greeting(lesson, source))
+    _say(lesson.taught.note)
     path = lesson.next_recording()
     orders.listen()
     with StreamWriter(path, source, url=url) as writer:
@@ -239,16 +252,22 @@ def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":
     """The lesson that a folder holds; None: none.
 
     Args:
-        base: the model that is taught new classes, if one is.
+        base: the network that objects are enrolled on, if one is.
     """
     from tactile_rt.classifier.model_file import hash_of
+    from tactile_rt.core.locks import alone_in
     from tactile_rt.teaching.lesson import FEATURES, Lesson
 
     if not (folder / FEATURES).exists():
         return None
-    if base is not None and hash_of(base) != hash_of(folder / FEATURES):
-        raise ConfigError(f"{folder} holds a lesson of another model than {base}: name another")
-    return Lesson.read(folder)
+    if base is None or hash_of(base) == hash_of(folder / FEATURES):
+        return Lesson.read(folder)
+    with alone_in(folder):
+        lesson = Lesson.embedded_again(folder, base)
+    typer.echo(f"touches that {base} finds in the recordings: {len(lesson.touches)}")
+    for name in dict.fromkeys(lesson.unfelt):
+        typer.echo(f"{name}: touches that {base} does not find: {lesson.unfelt.count(name)}")
+    return lesson
 
 
 def _check_labels(names: list[str]) -> None:

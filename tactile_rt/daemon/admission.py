@@ -95,6 +95,7 @@ class Admission:
             deadline_s=config.deadline_ms / 1e3 or None, late=config.late,
             providers=config.providers, age=self._age if live else None,
             catch_up=config.catch_up, behind_s=config.behind_ms / 1e3 or None,
+            fuse_s=config.fuse_s,
         )  # fmt: skip
         if file_stamp(self.file) != self.stamp:
             raise ModelError(f"{self.file} was written while it was being tried: try again")

@@ -74,6 +74,8 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
         sure: Probability that ends an episode early when one class reaches it `in_a_row` steps
             running; 0 for never.
         in_a_row: Number of steps running for `sure`, at most those of an episode.
+        fuse_s: Time within which touches that follow each other are of one thing, s: which enrolled
+            object it is, they tell together; 0 for each alone.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
     """
 
@@ -89,6 +91,7 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     late: Literal["count", "report", "skip"] = "count"
     catch_up: Literal["newest", "all"] = "newest"
     behind_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 0.0
+    fuse_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
     providers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = ("cpu",)
 
 
@@ -207,6 +210,7 @@ source = "whiskers"            # needed if there are several
 # late = "count"               # or "report" in the log, "skip": late decisions are not published
 # catch_up = "newest"          # what is behind skips to the newest sample; "all": takes every step
 # behind_ms = 0                # how far it may be behind; 0: three steps, at least 150 ms
+# fuse_s = 0                   # touches within so long are of one object, of those enrolled
 
 [[publisher]]
 kind = "jsonl"                 # also zmq, zenoh, foxglove, ros2

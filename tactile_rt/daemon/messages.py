@@ -94,6 +94,10 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
             empty if the model tells none apart.
         names_coverage: The share of touches of things of that class of which the true kind is among
             the names of every step; null without any.
+        object: The enrolled object that it is, or "none of these", in the decision of a touch's
+            last step; empty before, and where none is enrolled.
+        object_margin: By how much its likeness is above what is needed; null without objects.
+        object_touches: The number of touches that it rests on.
     """
 
     topic: ClassVar[str] = "decision"
@@ -111,6 +115,9 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     coverage: float | None = None
     names: tuple[str, ...] = ()
     names_coverage: float | None = None
+    object: str = ""
+    object_margin: float | None = None
+    object_touches: int = 0
 
 
 class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
@@ -249,7 +256,9 @@ def _decision(item: Decision) -> DecisionMessage:
         latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), age_ms=round(age_ns / 1e6, 3),
         late=d.late or (0 < item.deadline_ns < age_ns),
         prediction_set=d.prediction_set, coverage=d.coverage,
-        names=d.names, names_coverage=d.names_coverage,
+        names=d.names, names_coverage=d.names_coverage, object=d.object,
+        object_margin=None if d.object_margin is None else round(d.object_margin, DIGITS),
+        object_touches=d.object_touches,
     )  # fmt: skip
 
 

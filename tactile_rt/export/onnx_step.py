@@ -21,7 +21,8 @@ import torch
 from torch import Tensor, nn
 
 from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
-from tactile_rt.classifier.model_card import CARD_VERSION, EmbeddingStatistics, Kind
+from tactile_rt.classifier.enrolment import IdentityRule
+from tactile_rt.classifier.model_card import CARD_VERSION, Kind
 from tactile_rt.classifier.model_file import (
     METADATA_KEY,
     ModelCard,
@@ -91,7 +92,7 @@ def export_checkpoint(
     temperature: float = 1.0,
     rules: tuple[OpenSetRule | None, tuple[PredictionSetRule, ...]] = (None, ()),
     names: Mapping[str, tuple[PredictionSetRule, ...]] | None = None,
-    embeddings: EmbeddingStatistics | None = None,
+    identity: IdentityRule | None = None,
     figures: dict[str, Any] | None = None,
     precision: Precision = "fp32",
     kind: Kind = "step",
@@ -105,6 +106,7 @@ def export_checkpoint(
         temperature: divides the logits at run time.
         rules: when the model refuses to name a class, and of its prediction sets.
         names: of the prediction sets of kinds, by class.
+        identity: by which touches are of an enrolled object.
         kind: "step" or "window".
 
     Raises:
@@ -126,7 +128,7 @@ def export_checkpoint(
         candidates=rules[1],
         kinds={name: tuple(kinds) for name, kinds in saved.get("kinds", {}).items()},
         names=dict(names or {}),
-        embeddings=embeddings,
+        identity=identity,
         state=(),
         clip=tuple(model.inputs.clip.tolist()),
         scale=tuple(model.inputs.scale.tolist()),

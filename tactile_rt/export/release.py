@@ -18,7 +18,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import onnx
-import torch
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import (
@@ -29,16 +28,16 @@ from tactile_rt.classifier.decision_rules import (
     PredictionSetRule,
     mass_above,
 )
-from tactile_rt.classifier.model_card import EmbeddingStatistics, Kind
+from tactile_rt.classifier.model_card import Kind
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, file_outputs, load_model
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.export.graph_forms import Precision
+from tactile_rt.export.identity import fit_identity
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.models.checkpoints import load_checkpoint, trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
 from tactile_rt.models.disturbances import Disturbance
-from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.models.evaluation.measures import (
     Floats,
     Labels,
@@ -113,6 +112,7 @@ def release(
     unknown, prediction_sets = fit_rules(sets, run_on(model), temperature, told, len(known))
     kinds = saved.get("kinds", {})
     names = fit_names(sets, run_on(model, "names"), kinds) if kinds else {}
+    identity = model.network.config.identity
     card = export_checkpoint(
         checkpoint,
         (model, saved),
@@ -122,7 +122,7 @@ def release(
         temperature=temperature,
         rules=(unknown, prediction_sets),
         names=names,
-        embeddings=embedding_statistics(model, validation, len(known)),
+        identity=fit_identity(sets, run_on(model, "embedding")) if identity else None,
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         precision=precision,
         kind=kind,
@@ -131,28 +131,6 @@ def release(
     if precision == "fp32":
         return card
     return _described(path, card, quantisation_figures(run_on(model), path, validation))
-
-
-def embedding_statistics(
-    model: TactileClassifier, data: SweepSet, classes: int
-) -> EmbeddingStatistics | None:
-    """Where labelled sweeps of the known classes lie; None if a class has fewer than two."""
-
-    def embed(*loads: Floats) -> Floats:
-        device = model.inputs.clip.device
-        windows = (torch.from_numpy(a).to(device) for a in loads)
-        with torch.inference_mode():
-            steps = model.eval().network.embed(model.inputs(*windows))
-            mean: Floats = steps.mean(dim=1).float().cpu().numpy()
-        return mean
-
-    found, touched = run_over(cut_windows(data), embed)
-    found, labels = found[touched].astype(float), data.sweeps.labels[touched]
-    if np.bincount(labels, minlength=classes)[:classes].min() < 2:
-        return None
-    means = np.stack([found[labels == k].mean(axis=0) for k in range(classes)])
-    apart = found - means[labels]
-    return EmbeddingStatistics.of(means, apart.T @ apart / len(apart))
 
 
 def run_file(path: Path) -> Step:

@@ -37,7 +37,8 @@ __all__ = [
 ]
 
 FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
-         "prediction_set", "coverage", "names", "names_coverage")  # fmt: skip
+         "prediction_set", "coverage", "names", "names_coverage",
+         "object", "object_margin", "object_touches")  # fmt: skip
 # A recording ends with its source; what was being decided just then came too late for it.
 END_NS = NS_PER_S
 

@@ -34,6 +34,8 @@ __all__ = [
     "label_of_file",
     "lines_of",
     "read_labels",
+    "relabel",
+    "relabel_line",
     "remove_label",
 ]
 
@@ -43,7 +45,8 @@ COLUMNS = ("recording", *NEEDED, "object")
 # Of a name, as it becomes part of a file's: with a label and an object that has 255 bytes at most.
 LONGEST, MOST_BYTES = 60, 120  # characters, of which some need several bytes
 LONGEST_LINE = 10_000  # bytes, that are looked at
-RESERVED = ("unknown", "unlabelled")  # a model's refusal, and a touch that nobody labelled
+# A model's refusals, and a touch that nobody labelled.
+RESERVED = ("unknown", "none of these", "unlabelled")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,6 +219,23 @@ def remove_label(path: Path, line: str) -> None:
         del lines[there[-1]]
         data = "".join(lines).encode(errors="surrogateescape")
         write_whole(path, lambda file: file.write(data))
+
+
+def relabel(path: Path, old: str, new: str) -> None:
+    """Replace a label in a file at once; an empty one removes its lines."""
+    lines = "".join(relabel_line(line, old, new) for line in lines_of(path))
+    data = lines.encode(errors="surrogateescape")
+    write_whole(path, lambda file: file.write(data))
+
+
+def relabel_line(line: str, old: str, new: str) -> str:
+    """Replace the label of a line if it is the old one; empty: no line."""
+    cells = [cell.strip() for cell in next(csv.reader([line]), [])]
+    at = COLUMNS.index("label")
+    if len(cells) != len(COLUMNS) or cells[at] != old or tuple(cells) == COLUMNS:
+        return line
+    cells[at] = new
+    return _line(*cells) if new else ""
 
 
 def _cells(line: bytes) -> tuple[str, ...]:

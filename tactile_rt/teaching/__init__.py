@@ -2,7 +2,7 @@
 
     Source --> Classifier(features.onnx) --> Lesson --> model.onnx     (`tactile-rt teach`)
 
-`lesson` keeps touches and what each was; `features` and `head` are what is learnt with,
-`class_incremental` what a network is taught beside what it knows; `model` and `onnx_bytes` write
-the file; `teacher` and `page` lead whoever touches. Nothing here needs torch, or the package onnx.
+`lesson` keeps touches and what each was; `features` and `head` are what is learnt with; `model` and
+`onnx_bytes` write the file, that of a network with enrolled objects too; `teacher` and `page` lead
+whoever touches. Nothing here needs torch, or the package onnx.
 """

@@ -5,7 +5,7 @@
 A lesson is a folder, so that it can be gone on with, looked at and corrected:
 
     features.onnx      what is looked at: the array, and its noise when the lesson began; or the
-                       network that is taught new classes
+                       network that objects are enrolled on
     session-1.mcap     everything that was felt, one recording each time
     labels.csv         which part of it was which touch; a line is written as a touch ends
     model.onnx         what was learnt: runs like any other model
@@ -37,17 +37,24 @@ from tactile_rt.recording.labels import (
     drop_torn_label,
     lines_of,
     read_labels,
+    relabel,
+    relabel_line,
     remove_label,
 )
-from tactile_rt.teaching.class_incremental import check_new_classes
 from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
-from tactile_rt.teaching.model import TOUCH, ClassIncremental, FewShot, write_features
+from tactile_rt.teaching.model import (
+    TOUCH,
+    Enrolment,
+    FewShot,
+    write_features,
+)
 
 __all__ = [
     "BEFORE_NS",
     "FEATURES",
     "MODEL",
+    "NAMING",
     "ORDERS",
     "Lesson",
     "LessonProgress",
@@ -55,10 +62,11 @@ __all__ = [
     "check_label",
 ]
 
-ORDERS = ("next", "undo", "done")  # to a teacher; any other word is the label from now on
+ORDERS = ("next", "undo", "done", "list")  # to a teacher; another word is the label from now on
+NAMING = ("forget", "rename")  # those with names after them
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
-SAME, ENOUGH = 0.65, 5  # share of the touches of two classes told apart; touches of each
+SAME = 0.65  # share of the touches of two classes that are told apart
 ODD = 3.0  # times as far from its class as its others are, a touch is odd
 
 Floats = NDArray[np.float64]
@@ -86,12 +94,14 @@ class Lesson:
         touches: All touches, in their order.
         lost: The number of touches in the list that are not in the recordings, as their last
             moment was not written when the program was killed.
+        unfelt: The labels of those of them that are whole in the list.
     """
 
     folder: Path
-    taught: FewShot | ClassIncremental
+    taught: FewShot | Enrolment
     touches: list[TaughtTouch] = field(default_factory=list)
     lost: int = 0
+    unfelt: list[str] = field(default_factory=list)
 
     @classmethod
     def begun(cls, folder: Path, spec: ArraySpec, floor: NDArray[np.float32]) -> "Lesson":
@@ -109,7 +119,7 @@ class Lesson:
 
     @classmethod
     def on(cls, folder: Path, model: Path) -> "Lesson":
-        """Begin a class-incremental lesson, that teaches a network new classes.
+        """Begin a lesson that enrols objects on a network.
 
         Args:
             folder: where to; made if it is not there.
@@ -120,7 +130,7 @@ class Lesson:
             ModelError: the file cannot be used.
         """
         _check_free(folder)
-        taught = ClassIncremental(model)
+        taught = Enrolment(model)
         folder.mkdir(parents=True, exist_ok=True)
         data = model.read_bytes()
         write_whole(folder / FEATURES, lambda file: file.write(data))
@@ -135,13 +145,30 @@ class Lesson:
         card = load_model(path)[1]
         few = card.labels == (TOUCH,)
         floor = np.array(card.floor, dtype=np.float32)
-        lesson = cls(folder, FewShot(card.array, floor) if few else ClassIncremental(path))
-        if (folder / LABELS).exists():
-            lesson._read_touches()
+        lesson = cls(folder, FewShot(card.array, floor) if few else Enrolment(path))
+        lesson._read_touches(path)
         return lesson
 
-    def _read_touches(self) -> None:
+    @classmethod
+    def embedded_again(cls, folder: Path, model: Path) -> "Lesson":
+        """Go on with a network's lesson on another one, which feels all recordings again.
+
+        Raises:
+            ConfigError: the lesson is of no network, or this one cannot enrol objects.
+            SpecMismatch: the network is of another array than the recordings.
+        """
+        if load_model(folder / FEATURES)[1].labels == (TOUCH,):
+            raise ConfigError(f"{folder} holds a lesson without a network: name another folder")
+        lesson = cls(folder, Enrolment(model))
+        data = model.read_bytes()
+        lesson._read_touches(model)
+        write_whole(folder / FEATURES, lambda file: file.write(data))
+        return lesson
+
+    def _read_touches(self, model: Path) -> None:
         labels = self.folder / LABELS
+        if not labels.exists():
+            return
         self.lost += drop_torn_label(labels)
         if not labels.stat().st_size:
             return  # its first line was torn
@@ -152,21 +179,22 @@ class Lesson:
         for path, intervals in told.items():
             if not intervals:
                 continue
-            felt = self._felt(path)
+            felt = self._felt(path, model)
             for interval in intervals:
                 begin, end = interval.start_s, interval.end_s
                 inside = [features for at_s, features in felt if begin <= at_s < end]
                 if not inside:
                     self.lost += 1
+                    self.unfelt.append(interval.label)
                     continue
                 line = lines[int(interval.where.rpartition(":")[2]) - 1].rstrip("\r\n")
                 self.touches.append(TaughtTouch(interval.label, inside[0], path.name, line))
 
-    def _felt(self, path: Path) -> list[tuple[float, NDArray[np.float32]]]:
+    def _felt(self, path: Path, model: Path) -> list[tuple[float, NDArray[np.float32]]]:
         """Onset, in seconds since the beginning, and features of every touch in a recording."""
         recording = Recording(path)
         # which of them counted, the labels tell
-        listener = Listener(self.folder / FEATURES, recording.spec, self.taught.felt, hasty_ns=0)
+        listener = Listener(model, recording.spec, self.taught.describe, hasty_ns=0)
         found = []
         for chunk in recording:
             found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
@@ -174,7 +202,7 @@ class Lesson:
 
     def listener(self, spec: ArraySpec) -> Listener:
         """That finds touches in a stream of an array."""
-        return Listener(self.folder / FEATURES, spec, self.taught.felt)
+        return Listener(self.folder / FEATURES, spec, self.taught.describe)
 
     def next_recording(self) -> Path:
         """The path of the recording that goes on with the lesson."""
@@ -201,10 +229,27 @@ class Lesson:
         remove_label(self.folder / LABELS, self.touches[-1].line)
         return self.touches.pop()
 
+    def rename(self, old: str, new: str) -> None:
+        """Give all touches of a label another one, or forget them if that is empty.
+
+        Raises:
+            ConfigError: there is no such label, or the new one cannot be.
+        """
+        if old not in (*self.labels, *self.unfelt):
+            raise ConfigError(f"there is no {old!r}: `list` tells the names")
+        if new:
+            self.check(new)
+        relabel(self.folder / LABELS, old, new)
+        self.touches = [
+            replace(one, label=new, line=relabel_line(one.line, old, new).rstrip("\n"))
+            if one.label == old
+            else one
+            for one in self.touches
+            if new or one.label != old
+        ]
+
     def check(self, label: str) -> str:
         """The label itself."""
-        if isinstance(self.taught, ClassIncremental):
-            check_new_classes(self.taught.card, (label,))
         return check_label(label)
 
     def count(self, label: str) -> int:
@@ -230,7 +275,7 @@ class Lesson:
         if not used:
             return LessonProgress((), (), ())
         found = self.taught.leave_one_out(self._features(used), names)
-        progress = _progress(used, names, found)
+        progress = _progress(used, names, found, self.taught.few)
         if isinstance(self.taught, FewShot) and len(set(names)) < 2:
             return replace(progress, classes=())
         return progress
@@ -283,7 +328,9 @@ class LessonProgress:
         return sum(c[2] for c in self.classes), sum(c[1] for c in self.classes)
 
 
-def _progress(used: Sequence[int], names: Sequence[str], found: LeaveOneOut) -> LessonProgress:
+def _progress(
+    used: Sequence[int], names: Sequence[str], found: LeaveOneOut, few: int
+) -> LessonProgress:
     classes = np.unique(np.asarray(names))
     own = np.searchsorted(classes, names)
     distances = found.distances[:, -1]
@@ -307,7 +354,7 @@ def _progress(used: Sequence[int], names: Sequence[str], found: LeaveOneOut) -> 
         both = (own == a) | (own == b)
         counts = (own == a).sum(), (own == b).sum()
         nearer = (distances[both, a] < distances[both, b]) == (own[both] == a)
-        if min(counts) >= ENOUGH and nearer.mean() < SAME:
+        if min(counts) >= few and nearer.mean() < SAME:
             alike.append((str(classes[a]), str(classes[b])))
     return LessonProgress(told, tuple(odd), tuple(pairs), tuple(alike))
 
@@ -323,7 +370,7 @@ def check_label(name: str) -> str:
     """The label itself."""
     if why := check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
-    if name in ORDERS:
+    if name in ORDERS or name.partition(" ")[0] in NAMING:
         raise ConfigError(f"label {name!r}: is an order to who teaches; name it otherwise")
     return name
 

@@ -21,24 +21,25 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, OpenSetRule
+from tactile_rt.classifier.enrolment import EnrolledObject, margins, project
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_logits, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing
-from tactile_rt.teaching.class_incremental import (
-    check_new_classes,
-    extend_card,
-    extend_graph,
-    fit_new_classes,
-    join_features,
-    leave_one_out_new_classes,
-)
 from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.head import LIMIT, LeaveOneOut, TouchClasses, fit_classes, leave_one_out
-from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
+from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph, with_metadata
 
-__all__ = ["FASTEST_NS", "TOUCH", "ClassIncremental", "FewShot", "write_features", "write_few_shot"]
+__all__ = [
+    "FASTEST_NS",
+    "TOUCH",
+    "Enrolment",
+    "FewShot",
+    "write_features",
+    "write_few_shot",
+]
 
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
@@ -59,6 +60,9 @@ class FewShot:
 
     spec: ArraySpec
     floor: NDArray[np.float32]
+    each = 10  # touches of a class that are worth their time
+    few = 5  # below which refusals are weak
+    note = ""  # what else a user is told
 
     @property
     def period_ns(self) -> int:
@@ -75,7 +79,7 @@ class FewShot:
         """That gives the features."""
         return FeatureNetwork.drawn(self.spec, self.timing.substeps, self.timing.steps)
 
-    def felt(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
+    def describe(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
         """(step, feature) of a touch, from what `write_features`' model said of it."""
         return np.stack([step.embedding for step in steps if step.embedding is not None])
 
@@ -92,41 +96,65 @@ class FewShot:
         )
 
 
-class ClassIncremental:
-    """What is needed to teach a network new classes, class-incremental.
+class Enrolment:
+    """What is needed to enrol objects on a network that tells objects apart.
 
     Raises:
         ModelError: it cannot be used.
-        ConfigError: it does not tell what is needed.
+        ConfigError: it was not trained to tell objects apart, or some are enrolled in it already.
     """
+
+    each, few = 5, 3
+    note = "names are objects: the model enrols them beside its classes"
 
     def __init__(self, model: Path) -> None:
         self.card, _, self._data = read_model(model)
         self.spec = self.card.array
         self.floor = np.array(self.card.floor, dtype=np.float32)
-        check_new_classes(self.card, ())
+        if self.card.identity is None:
+            raise ConfigError(
+                f"{model} cannot enrol objects: it has no rule `identity`. Train it with identity, "
+                "and 20 objects or more for validation; or teach without --model"
+            )
+        if self.card.enrolled:
+            raise ConfigError(
+                f"model {model} has enrolled objects: go on with its lesson, or name its network"
+            )
 
-    def felt(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
-        """(step, unit and label) of a touch, from what the model said of it."""
-        embeddings = np.stack([step.embedding for step in steps if step.embedding is not None])
-        posteriors = np.stack([step.probabilities for step in steps])
-        logits = np.log(np.maximum(posteriors, TINY)) * np.float32(self.card.temperature)
-        return join_features(embeddings, logits).astype(np.float32)
+    def describe(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
+        """Return the embedding (1, unit) of a whole touch."""
+        embedding = steps[-1].embedding
+        assert embedding is not None
+        return embedding[None]
 
     def leave_one_out(self, features: Floats, labels: Sequence[str]) -> LeaveOneOut:
-        """Judge every touch by the others alone, at its last step."""
-        return leave_one_out_new_classes(self.card, features[:, -1], labels)
+        """Judge every touch (touch, 1, unit) by the others alone."""
+        rule = self.card.identity
+        assert rule is not None
+        touches = project(rule, features[:, -1])
+        names, own = np.unique(np.asarray(labels), return_inverse=True)
+        mine = own[:, None] == np.arange(len(names))  # (touch, object)
+        others = mine.sum(axis=0) - mine
+        total = mine.T.astype(float) @ touches - mine[..., None] * touches[:, None]
+        above = margins(rule, total / others[..., None], others, touches)
+        return LeaveOneOut(-above[:, None], (above.argmax(axis=1) == own) & (above[mine] >= 0))
 
     def learn(
         self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
     ) -> ModelCard:
-        """Write the network with the classes of these touches beside its own."""
-        classes = fit_new_classes(self.card, features[:, -1], labels)
-        card = extend_card(self.card, classes)
+        """Write the same network with the objects of these touches in its card."""
+        own = np.asarray(labels)
         card = msgspec.structs.replace(
-            card, name=name, provenance={**card.provenance, **_made_by(), **told}
+            self.card,
+            name=name,
+            provenance={**self.card.provenance, **_made_by(), **told},
+            enrolled=tuple(
+                EnrolledObject.of(one, features[own == one, -1]) for one in dict.fromkeys(labels)
+            ),
         )
-        return write_checked(path, extend_graph(self._data, self.card, classes), card)
+        data = with_metadata(self._data, METADATA_KEY, msgspec.json.encode(card).decode())
+        write_whole(path, lambda file: file.write(data))
+        return card
 
 
 def write_features(path: Path, taught: FewShot) -> ModelCard:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tactile_rt.classifier.onnx_check import split_fields
 
-__all__ = ["OnnxGraph"]
+__all__ = ["OnnxGraph", "with_metadata"]
 
 IR_VERSION, OPSET = 10, 20
 PRODUCER = "tactile_rt"
@@ -69,12 +69,14 @@ def _name(value: memoryview) -> str:
     return next(str(text, "utf-8") for number, text, _ in split_fields(value) if number == 1)
 
 
-def _renamed(node: memoryview, name: str) -> bytes:
-    """A node with another name for one of the values that it reads or writes."""
-    return b"".join(
-        _bytes(number, f"hidden_{name}") if number in (1, 2) and value == name.encode() else whole
-        for number, value, whole in split_fields(node)
+def with_metadata(data: bytes, key: str, text: str) -> bytes:
+    """Replace one entry of a model file's metadata; the rest stays, byte for byte."""
+    kept = (
+        bytes(whole)
+        for number, value, whole in split_fields(data)
+        if number != 14 or _name(value) != key
     )
+    return b"".join((*kept, _bytes(14, _bytes(1, key) + _bytes(2, text))))
 
 
 @dataclass
@@ -86,28 +88,6 @@ class OnnxGraph:
         default_factory=lambda: [_bytes(8, _bytes(1, "") + _number(2, OPSET))]
     )
     _names: int = 0
-
-    @classmethod
-    def of(cls, data: bytes, hidden: str) -> "OnnxGraph":
-        """The graph of a model file, to be gone on with.
-
-        Args:
-            data: the file, one that `onnx_check` lets pass, of the operators' version that is
-                written here.
-            hidden: an output that it is to have no more; its values are ``hidden_NAME`` now.
-        """
-        graph = cls(opsets=[])
-        for number, value, whole in split_fields(data):
-            if number == 8:
-                graph.opsets.append(bytes(whole))
-            if number != 7:
-                continue
-            for kind, part, raw in split_fields(value):
-                if kind == 1:
-                    graph.parts.append(_bytes(1, _renamed(part, hidden)))
-                elif kind == 5 or (kind in (11, 12) and _name(part) != hidden):
-                    graph.parts.append(bytes(raw))
-        return graph
 
     def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:
         """Store a tensor; returns its name."""

@@ -3,6 +3,7 @@
 orders (keys, lines, a page's buttons) --> Teacher <-- touches
 """
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.teaching.lesson import ORDERS, Lesson, LessonProgress
+from tactile_rt.teaching.lesson import NAMING, ORDERS, Lesson, LessonProgress
 
 __all__ = ["ORDERS", "Teacher"]
 
-FEW = 5  # touches of a class, below which others are hardly told from it
 LONG = 9  # digits: more are no class's number
 
 
@@ -49,7 +49,10 @@ class Teacher:
         self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
 
     def obey(self, order: str) -> str:
-        """Do what is asked: one of `ORDERS`, a class's name, or its number. What to say of it."""
+        """Do what is asked: one of `ORDERS`, a class's name, or its number. What to say of it.
+
+        ``forget NAME`` and ``rename OLD NEW`` take names with spaces in quotes.
+        """
         return self.note(self._obey(order.strip()))
 
     def note(self, said: str) -> str:
@@ -65,6 +68,10 @@ class Teacher:
             return self._undo()
         if order == "next":
             return self._next()
+        if order == "list":
+            return "\n".join(self._list()) or "nothing is taught yet"
+        if order.partition(" ")[0] in NAMING:
+            return self._rename(order)
         if order.isdecimal() and order not in self.wanted:
             number = int(order) if len(order) < LONG else 0
             if not 1 <= number <= len(self.wanted):
@@ -160,16 +167,40 @@ class Teacher:
         learnt = self.lesson.taught_enough
         if learnt and not lines:
             lines = [f"{learnt[0]} is the only class: teach another, to see if they are told apart"]
+        few = self.lesson.taught.few
         for name in self.lesson.labels:
-            count, wanted = self.lesson.count(name), max(FEW, self.each)
+            count, wanted = self.lesson.count(name), max(few, self.each)
             if name not in learnt:
                 lines.append(f"{name}: one touch is too few, and was not learnt")
-            elif count < FEW and len(learnt) > 1:
+            elif count < few and len(learnt) > 1:
                 lines.append(
                     f"{name}: {count} touches are few: later ones may be called unknown: "
                     f"give it {wanted - count} more"
                 )
         return lines
+
+    def _list(self) -> list[str]:
+        right = {name: f", {good} right" for name, _, good in self.progress.classes}
+        names = self.lesson.labels
+        return [f"{name}: {self.lesson.count(name)} touches{right.get(name, '')}" for name in names]
+
+    def _rename(self, order: str) -> str:
+        """Rename or forget a class."""
+        try:
+            verb, old, *new = shlex.split(order)
+            if len(new) != (verb == "rename"):
+                raise ValueError
+            self.lesson.rename(old, "".join(new))
+        except ConfigError as error:
+            return str(error)
+        except ValueError:
+            return "say forget NAME or rename OLD NEW; a name with spaces in quotes"
+        names = (new[0] if name == old and new else name for name in self.wanted)
+        self.wanted = list(dict.fromkeys(n for n in names if new or n != old))
+        self.progress = self.lesson.leave_one_out()
+        if self.label == old:
+            self.label = "".join(new)
+        return f"{old} is {f'called {new[0]} now' if new else 'forgotten'}\n{self.prompt()}"
 
     def _told_apart(self) -> str:
         right, of = self.progress.right

@@ -145,7 +145,7 @@ def written(path, encoder, attender, decoder, width=1 / 32, trained=True):
     model = TactileClassifier(card.array, config, channel_limits(card.array)).eval()
     if trained:
         stir(model)
-    plain = change(card, provenance={}, figures={}, embeddings=None)
+    plain = change(card, provenance={}, figures={}, kinds={}, names={}, identity=None)
     export_step(model, plain, path)
     return model
 

@@ -11,7 +11,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.models.grid.outcomes import POINT
 from tests.helpers.source_tree import ROOT
 
-CHECKPOINT = ROOT / "bench" / "shipped" / "mouse44.pt"
+CHECKPOINT = ROOT / "bench" / "shipped" / "mouse13.pt"
 
 
 @pytest.fixture
@@ -51,9 +51,9 @@ def test_a_run_of_a_grid_is_called_by_its_task(run):
 
 def test_a_file_says_its_own_name(run, tmp_path):
     np.savez(tmp_path / "brain.npz", hidden=np.ones((6, 3)))
-    paths = [shipped_model(), CHECKPOINT, run("mouse44"), tmp_path / "brain.npz"]
+    paths = [shipped_model(), CHECKPOINT, run("mouse13"), tmp_path / "brain.npz"]
     assert check_models(paths) == (
-        "mouse44", "mouse44 (mouse44.pt)", "mouse44 (best.pt)", "brain"
+        "mouse13", "mouse13 (mouse13.pt)", "mouse13 (best.pt)", "brain"
     )  # fmt: skip
 
 

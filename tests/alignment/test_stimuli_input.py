@@ -34,7 +34,7 @@ def test_a_model_of_another_sample_period_is_refused(tmp_path):
 
 @pytest.mark.parametrize("period_ms, taken", [(9, True), (10, False)])
 def test_so_is_a_checkpoint_that_says_its_period(tmp_path, period_ms, taken):
-    saved = torch.load(ROOT / "bench" / "shipped" / "mouse44.pt", weights_only=True)
+    saved = torch.load(ROOT / "bench" / "shipped" / "mouse13.pt", weights_only=True)
     torch.save({**saved, "period_ns": period_ms * MS}, tmp_path / "a.pt")
     if taken:
         assert checkpoint_layers(tmp_path / "a.pt", FELT)[0].traces

@@ -35,7 +35,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
         "align", "score", MODEL, "--benchmark", frozen / "6.json", "--json", scores,
         "--out", page,
     )  # fmt: skip
-    assert code == 0 and "mouse44" in out and "raw sensor" in out
+    assert code == 0 and "mouse13" in out and "raw sensor" in out
     model = json.loads(scores.read_text())["models"][0]
     assert model["layers"][0] == "encoder.layer0"
     assert page.read_text().startswith("<!doctype html>")
@@ -45,7 +45,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
     other = tmp_path / "other.json"
     other.write_bytes(scores.read_bytes())
     assert call("align", "report", scores, other, "--out", again)[0] == 0
-    assert "<h3>mouse44 (other.json) <small>score" in again.read_text()
+    assert "<h3>mouse13 (other.json) <small>score" in again.read_text()
     # The model is no worse than itself; random geometries are no match for it, though.
     told = tmp_path / "gate.json"
     code, out, _ = call(
@@ -207,7 +207,7 @@ def test_a_model_to_which_all_is_the_same_has_no_score_and_it_says_so(call, froz
 def test_a_model_has_no_score_for_want_of_animals_and_it_says_so(call, frozen):
     code, _, err = call("align", "score", MODEL, "--benchmark", frozen / "1.json")
     said = "no score: the benchmark has 1 reliable animal, and a layer is chosen on the others"
-    assert code == 0 and f"mouse44: {said}: two are needed\n" in err
+    assert code == 0 and f"mouse13: {said}: two are needed\n" in err
 
 
 def test_an_array_without_a_layer_s_name_is_refused(refused, frozen, tmp_path):

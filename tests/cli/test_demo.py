@@ -74,7 +74,7 @@ def test_view_fits_a_terminal_and_says_what_it_shows():
 
 def decision(onset_ns, t_ns, label, final=True):
     p = np.array([0.5, 0.5], np.float32)
-    return Classification(onset_ns, t_ns, 22, final, label, ("mug", "car"), p, 1e-3)
+    return Classification(onset_ns, t_ns, 22, final, label, ("cup", "block"), p, 1e-3)
 
 
 @simulated
@@ -83,18 +83,18 @@ def test_only_the_first_episode_of_each_pass_is_scored():
     demo = Demonstration(shipped_model(), sweeps=1, seed=0, fast=True)
     demo.passes = [
         SimpleNamespace(start_ns=100 * i, name=f"mug-{i}", category="mug") for i in range(6)
-    ]
+    ]  # cups
     decisions = [
-        decision(110, 130, "car", final=False),  # pass 0 brought no decision
-        decision(110, 150, "mug"),
-        decision(160, 190, "car"),  # the same object again: does not count
-        decision(210, 310, "mug"),  # ends while the next object is on its way
-        decision(340, 390, "car"),
+        decision(110, 130, "block", final=False),  # pass 0 brought no decision
+        decision(110, 150, "cup"),
+        decision(160, 190, "block"),  # the same object again: does not count
+        decision(210, 310, "cup"),  # ends while the next object is on its way
+        decision(340, 390, "block"),
     ]
     (sample,) = cut(np.zeros((1, 1, 1)), 1000.0)
     demo._session = [(sample, [d]) for d in decisions]
     settled = [outcome.said for outcomes in demo.run() for outcome in outcomes]
-    assert settled == [None, "mug", "mug", "car", None, None]
+    assert settled == [None, "cup", "cup", "block", None, None]
     assert demo.right == 2
 
 

@@ -40,8 +40,8 @@ def test_show_says_what_the_shipped_model_is(call):
         f"{sum(contents.operators.values())} operators, opset 20",
         "mouse-right: 30 elements x fx, fy, fz, mx, my, mz at 1000 Hz",
         "a step is 5 x 9 ms, an episode 22 steps",
-        "44: beehive, birdcage",
-        "embedding 256 units",
+        "13: ball, other, bottle",
+        "embedding 128 units",
     ):
         assert said in words
 

@@ -26,7 +26,8 @@ def test_run_prints_every_step_of_an_episode(call):
     for line in lines:
         assert list(line) == [
             "type", "t_ns", "onset_ns", "step", "final", "label", "probabilities", "prediction_set",
-            "coverage", "names", "names_coverage", "latency_ms",
+            "coverage", "names", "names_coverage", "object", "object_margin", "object_touches",
+            "latency_ms",
         ]  # fmt: skip
         assert line["type"] == "classification"
         # the sample at onset is the first of the first step

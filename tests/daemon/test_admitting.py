@@ -6,6 +6,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import EVERY
+from tactile_rt.classifier.enrolment import EnrolledObject
 from tactile_rt.classifier.trial import Trial, TrialLimits
 from tactile_rt.core.errors import ModelError
 from tactile_rt.daemon import admission as module
@@ -13,8 +14,8 @@ from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
 from tactile_rt.testing import ArraySource, cut
-from tests.helpers.tiny_model import CARD, STEPS, write_model
-from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
+from tests.helpers.tiny_model import CARD, STEPS, force_rule, write_model
+from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, pushes, signal, stream
 from tests.helpers.waiting import PATIENCE_S
 
 LIMITS = LimitsConfig(model_mb=300.0, model_s=7.0)
@@ -82,6 +83,14 @@ def test_one_that_cannot_keep_up_is_admitted_and_told(model, monkeypatch, step_m
     assert ("it cannot keep up" in made.words) == said
     assert made.words.startswith(f"{model}, sha256 {'a' * 12}: warm after 0.25 s, 22 MB, ")
     assert "cannot keep up" not in admitted(model, None).words
+
+
+def test_touches_within_fuse_s_are_of_one_object(tmp_path, monkeypatch):
+    Trials(monkeypatch)
+    objects = (EnrolledObject.of("cup", np.array([[4.0, 8.0]])),)
+    model = write_model(tmp_path / "cup.onnx", identity=force_rule(), enrolled=objects)
+    found = push_all(admitted(model, opened(), fuse_s=2.0).classifier, pushes([8, 8]))
+    assert [(d.object, d.object_touches) for d in found if d.final] == [("cup", 1), ("cup", 2)]
 
 
 def test_behind_ms_and_deadline_ms_are_milliseconds(model, monkeypatch):

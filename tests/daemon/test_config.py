@@ -163,7 +163,7 @@ def test_a_model_that_cannot_fit_its_source_is_refused_beforehand(tmp_path, monk
     )
     found = refusal_of(tmp_path, SMALL.replace("synthetic:5x6", url) + "[[model]]\n")
     assert found.startswith("robot.toml:5: model[0].file: source whiskers: ")
-    assert "mouse44.onnx was made for another array than" in found
+    assert "mouse13.onnx was made for another array than" in found
     assert "; name a model of it" in found
 
 

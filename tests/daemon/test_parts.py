@@ -190,6 +190,7 @@ def test_messages_are_as_documented():
         "frame": "mount", "model": "m", "onset_ns": 10, "step": 3, "final": True, "label": "y",
         "probabilities": {"x": 0.25, "y": 0.75}, "model_ms": 1.2, "latency_ms": 2.5, "age_ms": 2.0,
         "late": False, "prediction_set": [], "coverage": None, "names": [], "names_coverage": None,
+        "object": "", "object_margin": None, "object_touches": 0,
     }  # fmt: skip
     assert said[1] == {
         "type": "health", "version": 1, "t_ns": 1_500_000_000, "utc_ns": 1_500_000_000 + utc,

@@ -15,6 +15,7 @@ import numpy as np
 import onnx
 import onnx.parser
 
+from tactile_rt.classifier.enrolment import LOG_ODDS, IdentityRule
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor
 from tactile_rt.testing import small_spec
 
@@ -98,6 +99,20 @@ def write_model(
         onnx.helper.set_model_props(model, {METADATA_KEY: metadata})
     onnx.save(model, path)
     return path
+
+
+def identity_rule(spread: float, between: tuple[float, ...], *thresholds: float) -> IdentityRule:
+    """Of touches that differ by so much in each unit, and objects by `between` times that."""
+    units, among = len(between), (1, 5)[: len(thresholds) // 10]
+    directions = (np.eye(units) / spread).astype("<f2").tobytes()
+    return IdentityRule(
+        LOG_ODDS, 0.05, among, thresholds, 40, bytes(2 * units), directions, between
+    )
+
+
+def force_rule() -> IdentityRule:
+    """Of this model: objects differ by their last sample, N, touches of one by half of one."""
+    return identity_rule(0.5, (1e-6, 100.0), *[0.5] * 10)
 
 
 def logits_of(probabilities: np.ndarray, temperature: float = 1.0) -> np.ndarray:

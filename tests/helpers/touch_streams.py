@@ -38,6 +38,13 @@ def stream(values: np.ndarray, samples: int = 7) -> list[Chunk]:
     return cut(values, SAME_RATE.rate_hz, samples)
 
 
+def pushes(sizes: Sequence[float], seed: int = 0) -> list[Chunk]:
+    """Touches of these sizes, most of a second apart."""
+    begins = [QUIET + 100 * k for k in range(len(sizes))]
+    touches = [(t, t + 30, size) for t, size in zip(begins, sizes, strict=True)]
+    return stream(signal(touches, begins[-1] + 200, seed))
+
+
 def push_all(classifier: Classifier, chunks: list[Chunk]) -> list[Classification]:
     return [decision for chunk in chunks for decision in classifier.push(chunk)]
 

@@ -9,14 +9,16 @@ import torch
 from torch.nn import functional as F
 
 from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.enrolment import EnrolledObject, identify
 from tactile_rt.classifier.model_card import kind_columns
 from tactile_rt.classifier.model_file import file_outputs, load_model, verify_model
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.core.stream import Chunk
+from tactile_rt.export.identity import fit_gaussians, identity_thresholds
 from tactile_rt.export.release import fit_names, release
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, read_splits, windows
-from tactile_rt.models.evaluation.measures import macro_accuracy
+from tactile_rt.models.evaluation.measures import cut_windows, macro_accuracy
 from tactile_rt.models.evaluation.model_file import evaluate_model
 from tactile_rt.models.training.batches import TrainingBatches, order_in_twos
 from tactile_rt.models.training.config import TrainingConfig
@@ -24,8 +26,7 @@ from tactile_rt.models.training.loop import train
 from tactile_rt.models.training.objectives import build_objective, identity_loss
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.splits import join_manifests
-from tactile_rt.teaching.class_incremental import extend_card, extend_graph, fit_new_classes
-from tactile_rt.teaching.model import write_checked
+from tactile_rt.teaching.model import Enrolment
 from tests.helpers.tiny_model import write_model
 from tests.helpers.tiny_sweeps import write_tiny_set
 
@@ -56,7 +57,9 @@ def trained(data, tmp_path_factory):
 @pytest.fixture(scope="module")
 def exported(trained, tmp_path_factory):
     path = tmp_path_factory.mktemp("file") / "model.onnx"
-    release(trained, path, "named")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tactile_rt.export.identity.FEWEST", 6)  # there are six
+        release(trained, path, "named")
     return path
 
 
@@ -183,6 +186,44 @@ def test_steps_and_window_give_the_same_names_and_embedding(trained, exported, t
         assert np.allclose(values, window[name], atol=1e-4), name
 
 
+def test_a_release_measures_when_touches_are_of_an_enrolled_object(data, exported):
+    rule = load_model(exported)[1].identity
+    assert rule.objects == 6
+    table = np.reshape(rule.thresholds, (4, 5, 2))
+    assert (table[:, 3:] == table[:, 2:3]).all(), "there are four touches of an object"
+    assert (table[1:] == table[0, 0, 0]).all(), "and no five objects in a half"
+    assert np.isfinite(table).all() and len(rule.between) == 1, "of so few objects"
+    found = Enrolment(exported)
+    one = SweepSet.read(data, "test")
+    cut_of = next(cut_windows(one))
+    session, card = load_model(exported)
+    loads = cut_of.samples, cut_of.offset, cut_of.sigma
+    features = file_outputs(session, card, *loads)["embedding"][:, -1:].astype(float)
+    right = found.leave_one_out(features, one.sweeps.objects.tolist()).right
+    assert right.mean() > 0.3, "of six objects, of which pairs are of one kind"
+
+
+def test_so_few_touches_of_enrolled_objects_are_refused_as_the_rule_says():
+    rng = np.random.default_rng(0)
+    places = np.repeat(rng.normal(size=(400, 16)), 7, axis=0)
+    names = np.repeat(np.arange(400).astype(str), 7)
+    touches = (places + rng.normal(size=places.shape)).astype(np.float32)
+    table = identity_thresholds(touches[:1400], names[:1400])
+    rule = fit_gaussians(touches[:1400], names[:1400], table)
+    assert (np.diff(table[:, 0, 0]) > 0).all(), "one of many is always somewhat like it"
+    rest = touches[1400:].reshape(200, 7, 16)
+    for n, m, many in ((1, 1, 1), (3, 1, 20), (5, 2, 5), (1, 2, 100)):
+        objects = [EnrolledObject.of(f"{k}", own[:n]) for k, own in enumerate(rest)]
+        margins = [
+            identify(rule, objects[k // many * many :][:many], own[n : n + m])[1]
+            for k, own in enumerate(rest)
+        ]
+        assert 0.01 < np.mean(np.array(margins) < 0) < 0.12
+    assert np.isnan(identity_thresholds(touches[:70], names[:70])).all()
+    few = identity_thresholds(touches[: 7 * 20], np.repeat(np.arange(70).astype(str), 2))
+    assert (few == few[:, :1, :1]).all() and (few[3] == few[2]).all()
+
+
 def test_a_decision_carries_names_of_its_class(data, exported):
     manifest, test = SweepManifest.read(data), SweepSet.read(data, "test")
     spec = replace(manifest.spec, rate_hz=1e9 / manifest.period_ns)
@@ -279,17 +320,3 @@ def test_a_network_begins_with_the_kinds_that_another_knew(data, trained, tmp_pa
 def test_damaged_kinds_are_refused(tmp_path, change, said):
     with pytest.raises(ModelError, match=said):
         load_model(write_model(tmp_path / "model.onnx", **change))
-
-
-def test_a_class_taught_beside_leaves_kinds_as_they_are(exported, tmp_path):
-    _, card = load_model(exported)
-    features = np.random.default_rng(0).normal(size=(4, card.embedding + len(card.labels)))
-    classes = fit_new_classes(card, features, ["ring"] * 4)
-    proto = extend_graph(exported.read_bytes(), card, classes)
-    taught = write_checked(tmp_path / "taught.onnx", proto, extend_card(card, classes))
-    session, again = load_model(tmp_path / "taught.onnx")
-    assert taught.labels[3] == "ring" and again.kinds == KINDS and again.names == card.names
-    samples = np.zeros((1, card.steps, card.substeps, *card.array.shape), np.float32)
-    loads = samples, samples[:, 0, 0], samples[:, 0, 0] + np.float32(1e-6)
-    before = file_outputs(*load_model(exported), *loads)["names"]
-    assert np.allclose(file_outputs(session, again, *loads)["names"], before, atol=1e-5)

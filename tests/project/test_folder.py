@@ -78,7 +78,7 @@ def test_a_robot_s_project_is_its_array_behind_its_codec(name: str, tmp_path: Pa
 def test_a_model_of_another_array_is_refused(project: Project, refused) -> None:
     shutil.copy(shipped_model(), project.model)
     said = refused("config", "check", project.folder / "robot.toml")
-    assert "source whiskers" in said and "mouse44.onnx" not in said
+    assert "source whiskers" in said and "mouse13.onnx" not in said
 
 
 def test_the_device_meets_what_the_sweeps_say(tmp_path: Path) -> None:

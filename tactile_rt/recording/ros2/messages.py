@@ -63,6 +63,9 @@ class _Decision(_Told):
     coverage: float | None = None
     names: list[str] = []
     names_coverage: float | None = None
+    object: str = ""
+    object_margin: float | None = None
+    object_touches: UInt32 = 0
     model_ms: float = 0.0
     latency_ms: float = 0.0
     age_ms: float = 0.0
@@ -95,6 +98,9 @@ def decision_message(text: bytes) -> bytes:
             "coverage": math.nan if said.coverage is None else said.coverage,
             "names": said.names,
             "names_coverage": math.nan if said.names_coverage is None else said.names_coverage,
+            "object": said.object,
+            "object_margin": math.nan if said.object_margin is None else said.object_margin,
+            "object_touches": said.object_touches,
             "model_ms": said.model_ms, "latency_ms": said.latency_ms, "age_ms": said.age_ms,
             "late": said.late, "json": text.decode(),
         },

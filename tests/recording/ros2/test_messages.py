@@ -148,11 +148,12 @@ def test_a_decision_s_prediction_set_and_probabilities():
     assert (found["labels"], found["probabilities"]) == (["a", "b"], [0.25, 0.75])
     assert (found["coverage"], found["prediction_set"], found["is_final"]) == (0.9, ["b"], True)
     assert found["header"]["stamp"] == {"sec": 1, "nanosec": 7}
-    named = messages.decision_message(b'{"names": ["box", "crate"], "names_coverage": 0.9}')
-    found = cdr.decode(messages.DECISION, named)
-    assert (found["names"], found["names_coverage"]) == (["box", "crate"], 0.9)
+    said = {"names": ["box", "crate"], "names_coverage": 0.9, "object": "my cup",
+            "object_margin": 0.25, "object_touches": 2}  # fmt: skip
+    found = cdr.decode(messages.DECISION, messages.decision_message(msgspec.json.encode(said)))
+    assert {name: found[name] for name in said} == said
     none = cdr.decode(messages.DECISION, messages.decision_message(b'{"coverage": null}'))
-    assert math.isnan(none["coverage"])
+    assert math.isnan(none["coverage"]) and math.isnan(none["object_margin"])
 
 
 def test_only_one_element_that_measures_a_whole_force_in_newton_has_a_wrench():

@@ -241,7 +241,7 @@ def test_the_list_of_shapes_has_enough_of_every_shape() -> None:
 
 
 def test_the_list_that_ships_has_enough_of_enough_kinds() -> None:
-    assert shipped_lists() == ("everyday", "real", "real2")
+    assert shipped_lists() == ("real", "real2")
     shapes: dict[str, set[str]] = {}
     for thing in read_list("real"):
         first = thing.files[0]
@@ -249,13 +249,6 @@ def test_the_list_that_ships_has_enough_of_enough_kinds() -> None:
         assert first.licence in ("CC0-1.0", "MIT")
     assert len(shapes) >= 30
     assert sum(len(some) >= 8 for some in shapes.values()) >= 20
-
-
-def test_the_list_of_everyday_things_has_hundreds_that_are_alone_of_their_kind() -> None:
-    things = read_list("everyday")
-    assert {thing.files[0].licence for thing in things} == {"CC0-1.0"}
-    assert len({thing.name for thing in things}) == len(things) > 800
-    assert sum(thing.files[0].category == "thing" for thing in things) > 400
 
 
 def test_kinds_within_a_category_come_from_the_folder_s_table(tmp_path: Path) -> None:

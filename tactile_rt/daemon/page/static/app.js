@@ -78,7 +78,8 @@ const take = {
     const from = last && last.onset === onset ? last.t : Math.max(onset, t - STEP_MS);
     decisions.push({ t, from, onset, model: m.model, step: m.step, final: m.final, label: m.label,
       p: m.probabilities, prediction_set: m.prediction_set || [], coverage: m.coverage,
-      names: m.names || [], names_coverage: m.names_coverage });
+      names: m.names || [], names_coverage: m.names_coverage,
+      object: m.object || "", touches: m.object_touches });
     if (decisions.length > 2000) decisions.splice(0, 1000);
     dirty = true;
   },
@@ -413,8 +414,9 @@ function possible(names, coverage) {
 }
 
 function sets(decision) {
-  const { prediction_set, coverage, names, names_coverage, label } = decision;
+  const { prediction_set, coverage, names, names_coverage, label, object, touches } = decision;
   return [
+    object ? `object: ${object}${touches > 1 ? ` (${touches} touches)` : ""}` : "",
     prediction_set.length ? `if it is of a known kind, ${possible(prediction_set, coverage)}` : "",
     names.length ? `if it is a ${label}, ${possible(names, names_coverage)}` : "",
   ].filter(Boolean).join("; ");

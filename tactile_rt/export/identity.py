@@ -1,0 +1,127 @@
+"""The rule by which touches are of an enrolled object, measured on validation sweeps.
+
+Half of the objects tell how objects and touches differ, and the other half below which score few
+touches are of their own object, and the other way round; a file has the Gaussians of all.
+"""
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.enrolment import (
+    ENROLLED,
+    JUDGED,
+    LOG_ODDS,
+    IdentityRule,
+    log_odds,
+    project,
+)
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.disturbances import Disturbance
+from tactile_rt.models.evaluation.measures import Floats, Names, Step, cut_windows, run_over
+
+__all__ = ["fit_gaussians", "fit_identity", "identity_thresholds"]
+
+REFUSED = 0.05  # of touches of enrolled objects
+AMONG = (1, 5, 20, 100)  # objects that are enrolled
+FEWEST = 20  # objects below which that share is not measured
+DRAWS = 20  # of touches to enrol an object by, and to judge
+SHARED = 0.2  # of the covariance of touches is taken to be the same in all directions
+DIRECTIONS, LEAST = 32, 0.05  # at most; variance of objects in each, at least
+TINY = 1e-6  # variance of embeddings of length 1
+PER_DIRECTION = 4  # objects, at least: of fewer, how they differ is not known in so many
+
+Doubles = NDArray[np.float64]
+NONE_YET = np.zeros((len(AMONG), ENROLLED, JUDGED))
+
+
+def fit_identity(sets: Sequence[SweepSet], run: Step) -> IdentityRule | None:
+    """Measure when touches are of an enrolled object; None with few objects.
+
+    Args:
+        sets: sweeps of objects that the network has not learnt from.
+        run: (samples, offset, sigma) of windows to (batch, step, unit) embeddings.
+    """
+    embeddings, objects = [], []
+    for k, one in enumerate(sets):
+        found, touched = run_over(cut_windows(one, disturbance=Disturbance(noise=1.0)), run)
+        embeddings.append(found[touched, -1])
+        objects += [f"{k} {name}" for name in one.sweeps.objects[touched]]
+    touches, names = np.concatenate(embeddings), np.array(objects, dtype=str)
+    table = identity_thresholds(touches, names)
+    return None if np.isnan(table).any() else fit_gaussians(touches, names, table)
+
+
+def identity_thresholds(embeddings: Floats, objects: Names) -> Doubles:
+    """Measure the score that few touches of enrolled objects lack.
+
+    Args:
+        embeddings: (touch, unit) of touches, at their last step.
+        objects: (touch,) what each is of.
+
+    Returns:
+        (among, enrolled, judged) thresholds, by the number of objects and of touches; with too few
+        for one, that of fewer; NaN where there is none.
+    """
+    rng = np.random.default_rng(0)
+    table = np.full((len(AMONG), ENROLLED, JUDGED), np.nan)
+    names, count = np.unique(objects, return_counts=True)
+    if (count > 1).sum() < FEWEST:
+        return table
+    halves = [np.isin(objects, names[k::2]) for k in range(2)]
+    rules = [fit_gaussians(embeddings[half], objects[half]) for half in halves]
+    for n, m in product(range(1, ENROLLED + 1), range(1, JUDGED + 1)):
+        best: list[list[float]] = [[] for _ in AMONG]
+        for k, rule in enumerate(rules[::-1]):
+            places = project(rule, embeddings)
+            known = [np.flatnonzero(objects == name) for name in names[k::2]]
+            known = [own for own in known if len(own) >= n + m]
+            for _ in range(DRAWS if known else 0):
+                drawn = np.stack([places[rng.permutation(own)[: n + m]] for own in known])
+                enrolled, judged = drawn[:, :n].mean(axis=1), drawn[:, n:].mean(axis=1)
+                odds = log_odds(np.array(rule.between), enrolled, n, judged[:, None], m)
+                order = rng.permutation(len(known))
+                for many, scores in zip(AMONG, best, strict=True):
+                    groups = order[: len(order) // many * many].reshape(-1, many)
+                    scores += odds[groups[:, :, None], groups[:, None]].max(axis=2).ravel().tolist()
+        found = table[:, n - 1, m - 1]
+        found[:] = table[:, n - 2, m - 1] if n > 1 else table[:, 0, m - 2]
+        for j, scores in enumerate(best):
+            if len(scores) >= FEWEST * DRAWS:
+                found[j] = np.quantile(scores, REFUSED, method="lower")
+            elif j and np.isnan(found[j]):
+                found[j] = found[j - 1]
+    return table
+
+
+def fit_gaussians(
+    embeddings: Floats, objects: Names, thresholds: Doubles = NONE_YET
+) -> IdentityRule:
+    """Fit how objects and touches differ; return it as a rule of these thresholds."""
+    names, own, count = np.unique(objects, return_inverse=True, return_counts=True)
+    means = np.stack([embeddings[own == k].mean(axis=0) for k in range(len(names))]).astype(float)
+    apart = embeddings - means[own]
+    within = apart.T @ apart / max(1, len(own) - len(names))
+    alike = np.trace(within) / len(within) * np.eye(len(within))
+    values, vectors = np.linalg.eigh((1 - SHARED) * within + SHARED * alike)
+    whitening = vectors / np.sqrt(np.maximum(values, TINY))
+    origin = means.mean(axis=0)
+    spread = (means - origin) @ whitening
+    # of what the means of few touches vary, touches of one object are a part
+    values, vectors = np.linalg.eigh(spread.T @ spread / (len(names) - 1))
+    between = (values - (1 / count).mean())[::-1]
+    known = min(DIRECTIONS, len(names) // PER_DIRECTION, int((between > LEAST).sum()))
+    most = max(1, known)
+    directions = whitening @ vectors[:, ::-1][:, :most]
+    return IdentityRule(
+        LOG_ODDS,
+        REFUSED,
+        AMONG,
+        tuple(thresholds.ravel().tolist()),
+        len(names),
+        origin.astype("<f2").tobytes(),
+        directions.astype("<f2").tobytes(),
+        tuple(float(value) for value in np.maximum(between[:most], LEAST)),
+    )
