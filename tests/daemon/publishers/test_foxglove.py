@@ -266,6 +266,12 @@ def test_it_comes_back_after_close_and_names_a_port_that_is_taken():
         while client.line.recv(PATIENCE_S):  # what was on the way
             pass
     client.close()
+
+    def free() -> bool:  # the server lets go of its port in a thread of its own
+        with socket.socket() as line:
+            return line.connect_ex(("127.0.0.1", port)) != 0
+
+    until(free)
     with running(other, View(FORCES)):
         client = Client(other)
         client.subscribed()
