@@ -52,7 +52,7 @@ class Repetition:
         gone_s: Time from the end of the fault until nothing was told any more, s.
         wrong: What was told and is not true: ``part: what: why``.
         disagreed: Number of looks, two running, at which the metric was another than what health
-            told: they are three requests, between which what is told may change.
+            told: health may change between the requests for the two.
         retried: Number of times that it was repeated as the machine was busy with others.
     """
 

@@ -27,7 +27,7 @@ HEIGHTS_MM = (-8.0, 4.0)
 
 @dataclass(frozen=True)
 class Bounds:
-    """What could be told of the held-out objects.
+    """Bounds of what can be told of held-out objects.
 
     Attributes:
         whole: By the nearest of all whole shapes learnt from.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["FEWEST", "LeaveOneOut", "TouchClasses", "check_enough", "fit_classes", "leave_one_out"]
+__all__ = ["ENOUGH", "FEWEST", "LeaveOneOut", "TouchClasses", "fit_classes", "leave_one_out"]
 
 FEWEST = 2  # touches of a class
 AXES = 16  # directions in which touches of a class differ
@@ -95,7 +95,7 @@ def fit_classes(
         kinds: which features are of one kind, and so of one scale.
         told: what `leave_one_out` said of these touches; None: it is asked.
     """
-    check_enough(labels)
+    _check_enough(labels)
     told = told or leave_one_out(features, labels, kinds)
     nearest = told.distances.min(axis=2)  # (touch, step)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
@@ -120,7 +120,7 @@ def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice
         labels: (touch,) the class of each; at least two touches of each class.
         kinds: as `fit_classes` takes them.
     """
-    check_enough(labels)
+    _check_enough(labels)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
     turn = np.empty(len(own), dtype=int)
     for k in range(len(classes)):
@@ -136,7 +136,7 @@ def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice
     return LeaveOneOut(distances, distances[:, -1].argmin(axis=1) == own)
 
 
-def check_enough(labels: Sequence[str]) -> None:
+def _check_enough(labels: Sequence[str]) -> None:
     """Refuse labels of which one has fewer than two touches."""
     for name in dict.fromkeys(labels):
         if list(labels).count(name) < FEWEST:

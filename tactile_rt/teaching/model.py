@@ -29,7 +29,14 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing
 from tactile_rt.teaching.features import FeatureNetwork
-from tactile_rt.teaching.head import LIMIT, LeaveOneOut, TouchClasses, fit_classes, leave_one_out
+from tactile_rt.teaching.head import (
+    ENOUGH,
+    LIMIT,
+    LeaveOneOut,
+    TouchClasses,
+    fit_classes,
+    leave_one_out,
+)
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph, with_metadata
 
 __all__ = [
@@ -61,8 +68,8 @@ class FewShot:
     spec: ArraySpec
     floor: NDArray[np.float32]
     each = 10  # touches of a class that are worth their time
-    few = 5  # below which refusals are weak
-    note = ""  # what else a user is told
+    few = ENOUGH  # fewer are told
+    note = ""  # for the user, before the first touch
 
     @property
     def period_ns(self) -> int:

@@ -84,9 +84,6 @@ class OnnxGraph:
     """A graph that is built operator by operator, in the order in which they run."""
 
     parts: list[bytes] = field(default_factory=list)
-    opsets: list[bytes] = field(
-        default_factory=lambda: [_bytes(8, _bytes(1, "") + _number(2, OPSET))]
-    )
     _names: int = 0
 
     def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:
@@ -119,8 +116,9 @@ class OnnxGraph:
         """The file."""
         graph = b"".join(self.parts) + _bytes(2, name)
         pairs = (_bytes(14, _bytes(1, key) + _bytes(2, text)) for key, text in metadata.items())
-        head = (_number(1, IR_VERSION), _bytes(2, PRODUCER), _bytes(7, graph))
-        return b"".join((*head, *self.opsets, *pairs))
+        opset = _bytes(8, _bytes(1, "") + _number(2, OPSET))
+        head = (_number(1, IR_VERSION), _bytes(2, PRODUCER), _bytes(7, graph), opset)
+        return b"".join((*head, *pairs))
 
     def _node(
         self, operator: str, inputs: Sequence[str], outputs: Sequence[str], attributes: Any
