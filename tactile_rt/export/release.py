@@ -11,7 +11,6 @@ may be from it.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +56,7 @@ from tactile_rt.sets.splits import join_manifests
 __all__ = ["fit_open_set", "fit_prediction_sets", "fit_temperature", "release"]
 
 TEMPERATURES = np.geomspace(0.25, 4.0, 81)
-COVERAGE = 0.95
-NAMED = 0.9  # the same of kinds within a class
+COVERAGE = 0.9
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
 LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
 FEWEST = 50  # objects below which there is no rule: nearly all classes would be in each set
@@ -254,23 +252,29 @@ def fit_names(
     With few objects of a class, all of its kinds are in the set.
 
     Args:
-        sets: labelled sweeps that the model has not learnt from.
+        sets: labelled sweeps that the model has not learnt from, as groups of which each is to
+            have the coverage.
         run: (samples, offset, sigma) of windows to (batch, step, name) logits.
         kinds: those that it tells apart, by class.
     """
     rules: dict[str, tuple[PredictionSetRule, ...]] = {}
     for bound, ends in NOISE.items():
-        drawn: dict[str, list[tuple[Floats, Labels, Names]]] = {}
-        for one, level in product(sets, ends):
-            logits, found = run_over(cut_windows(one, disturbance=Disturbance(noise=level)), run)
-            split = split_by_class(logits, found, one.kinds(kinds), kinds)
-            for name, at, posteriors, labels in split:
-                if found[at].any():
-                    group = posteriors, labels, one.sweeps.objects[at]
-                    drawn.setdefault(name, []).append(group)
-        for name, parts in drawn.items():
-            p, labels, objects = map(np.concatenate, zip(*parts, strict=True))
-            rule = fit_prediction_sets([(p, labels, objects)], bound, NAMED, fewest=1)
+        groups: dict[str, list[tuple[Any, ...]]] = {}
+        for one in sets:
+            drawn: dict[str, list[tuple[Floats, Labels, Names]]] = {}
+            for level in ends:
+                windows = cut_windows(one, disturbance=Disturbance(noise=level))
+                logits, found = run_over(windows, run)
+                split = split_by_class(logits, found, one.kinds(kinds), kinds)
+                for name, at, posteriors, labels in split:
+                    if found[at].any():
+                        part = posteriors, labels, one.sweeps.objects[at]
+                        drawn.setdefault(name, []).append(part)
+            for name, parts in drawn.items():
+                together = map(np.concatenate, zip(*parts, strict=True))
+                groups.setdefault(name, []).append(tuple(together))
+        for name, several in groups.items():
+            rule = fit_prediction_sets(several, bound, fewest=1)
             assert rule is not None
             rules[name] = (*rules.get(name, ()), rule)
     return rules

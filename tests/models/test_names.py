@@ -261,8 +261,8 @@ def test_macro_accuracy_weighs_classes_alike():
     assert estimate.low == 0.5  # a class that is not drawn does not count
 
 
-def test_names_are_covered_in_each_class(data):
-    """One class whose kinds a network tells apart, one where it guesses: each has its coverage."""
+def test_names_are_covered_in_each_class_of_each_set(data):
+    """Kinds that a network tells apart in one set and guesses in the other, and the reverse."""
     objects = 400
     one = SweepSet.read(data, "train")
     names = [f"{c}-{k}" for c in ("ball", "cube") for k in range(objects)]
@@ -273,27 +273,37 @@ def test_names_are_covered_in_each_class(data):
     sweeps = replace(one.sweeps[at], objects=np.array(names), labels=np.repeat([0, 1], objects))
     many = replace(one, manifest=manifest, sweeps=sweeps)
     truth = many.kinds(KINDS)
-    strength = np.where(truth < 2, 6.0, 0.3)
 
-    def draw(which):
-        logits = rng.normal(size=(len(which), 22, 4))
-        logits[np.arange(len(which)), :, truth[which]] += strength[which][:, None]
+    def draw(strength):
+        logits = rng.normal(size=(len(names), 22, 4))
+        logits[np.arange(len(names)), :, truth] += np.repeat(strength, objects)[:, None]
         return logits.astype(np.float32)
 
-    batches = iter(np.array_split(np.arange(len(names)), range(64, len(names), 64)) * 5)
-    rules = fit_names([many], lambda *_: draw(next(batches)), KINDS)
+    strengths = (6.0, 0.3), (0.3, 6.0)
+    per_noise = (2, 1, 1)
+    batches = iter(
+        [
+            batch
+            for repeats in per_noise
+            for strength in strengths
+            for _ in range(repeats)
+            for batch in np.array_split(draw(strength), range(64, len(names), 64))
+        ]
+    )
+    rules = fit_names([many, many], lambda *_: next(batches), KINDS)
     assert [rule.noise for rule in rules["ball"]] == [0.3, 1.2, 2.2]
-    logits, kept, size = draw(np.arange(len(names))), [], []
-    for k, row in enumerate(logits):
-        name = "ball" if truth[k] < 2 else "cube"
-        p = np.exp(row[:, kind_columns(KINDS)[name]])
-        p /= p.sum(axis=1, keepdims=True)
-        sets = [rules[name][0].prediction_set(v, t) for t, v in enumerate(p, start=1)]
-        kept.append(all(truth[k] % 2 in one for one in sets))
-        size.append(len(sets[-1]))
-    kept, size = np.reshape(kept, (2, objects)), np.reshape(size, (2, objects))
-    assert (kept.mean(axis=1) > 0.86).all()
-    assert size[0].mean() < 1.5 < size[1].mean()
+    for strength in strengths:
+        logits, kept, size = draw(strength), [], []
+        for k, row in enumerate(logits):
+            name = "ball" if truth[k] < 2 else "cube"
+            p = np.exp(row[:, kind_columns(KINDS)[name]])
+            p /= p.sum(axis=1, keepdims=True)
+            sets = [rules[name][0].prediction_set(v, t) for t, v in enumerate(p, start=1)]
+            kept.append(all(truth[k] % 2 in one for one in sets))
+            size.append(len(sets[-1]))
+        kept, size = np.reshape(kept, (2, objects)), np.reshape(size, (2, objects))
+        assert (kept.mean(axis=1) > 0.86).all()
+        assert size[np.argmax(strength)].mean() < size[np.argmin(strength)].mean()
 
 
 def test_a_network_begins_with_the_kinds_that_another_knew(data, trained, tmp_path):
