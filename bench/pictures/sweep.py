@@ -46,7 +46,7 @@ def draw(out: Path) -> None:
     array = load_array("mouse")
     simulation = SweepSimulation(array, make_object(*TARGET), SWEEP, PROFILES[PROFILE], whole=True)
     footage = record(simulation, array_spec(array.whiskers, array.name), AVERAGE_MS)
-    forces = 1e3 * footage.forces  # (frame, whisker) mN
+    forces = 1e3 * footage.sizes  # (frame, whisker) mN
 
     figure = Figure(figsize=(12.6, 8.0), dpi=100)
     FigureCanvasAgg(figure)
@@ -65,7 +65,8 @@ def draw(out: Path) -> None:
             figure.text(right - 0.075, 0.511, "the mug moves", color=MUG, va="center", ha="right")
             figure.text(left + 0.105, 0.54, "bases on the cheek", color=QUIET, ha="right")
             place = (right + 0.005, 0.56, 0.195, 0.26)
-            ForceMap(figure, place, footage.spec, SCALE, True).show(footage.loads[frame])
+            force_map = ForceMap(figure, place, footage.spec, SCALE, True)
+            force_map.show(footage.loads[frame], footage.sizes[frame])
             figure.text(right + 0.1, 0.835, "force on each base", ha="center", color=INK)
             draw_scale(figure, (right + 0.04, 0.535, 0.12, 0.012), SCALE)
             traces.axvline(moment, color=INK, lw=1, ls="--", zorder=1)
@@ -74,7 +75,7 @@ def draw(out: Path) -> None:
     title = f"A mug sweeps past {len(array.whiskers)} simulated mouse whiskers and bends {touched}"
     figure.text(0.012, 0.955, f"{title} of them", fontsize=15, weight="bold", color=INK)
     small = (
-        f"arrows: force on a base, {SCALE.arrow_mm:g} mm for {SCALE.top_mn:g} mN, and in the map "
+        f"arrows: force on a base, {SCALE.arrow_mm:g} mm for {SCALE.top:g} mN, and in the map "
         "its direction along the cheek; whiskers are drawn thicker than they are"
     )
     figure.text(0.012, 0.928, small, fontsize=9.5, color=QUIET)

@@ -94,7 +94,8 @@ class Classification:
         names_coverage: The share of touches of things of that class of which the true kind is among
             the names of every step; None: there are no names.
         object: The enrolled object that it is, or "none of these"; empty where none is enrolled,
-            and before a touch's last step.
+            and before a touch's last step, also where `sure` ends it: only of last steps is it
+            measured what is refused.
         object_margin: By how much the likeness to the likeliest object is above what is needed;
             below 0 it is none of these; None without objects.
         object_touches: The number of touches that `object` rests on, more than 1 where they are

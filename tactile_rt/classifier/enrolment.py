@@ -4,7 +4,8 @@ A network that was trained to tell objects apart puts touches of one object near
 objects differ, and how touches of one do, was measured on objects that it was not trained on: two
 Gaussians (probabilistic linear discriminant analysis: Ioffe 2006, doi:10.1007/11744085_41). They
 give the log odds that touches are of an object, of which some touches are known, against one of
-which none are. Below a threshold they are of none that is enrolled.
+which none are. Below a threshold they are of none that is enrolled. Network, Gaussians and
+thresholds are fitted to last steps: of embeddings of earlier ones the rule promises nothing.
 """
 
 from collections.abc import Sequence

@@ -83,7 +83,7 @@ def check(
     if plot:
         with needing("view"):
             from tactile_rt.sim_backend.views.contact_sheet import write_contact_sheet
-        things = {n: opened.load(n) if n in usable else None for n in opened.names}
+        things = {n: opened.load(n).pieces if n in usable else None for n in opened.names}
         write_contact_sheet(plot, things)
     found = []
     for kind in dict.fromkeys(opened.categories.values()):

@@ -10,7 +10,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import told_as_json
+from tactile_rt.cli.tables import show_table, told_as_json
 
 if TYPE_CHECKING:
     from tactile_rt.project.making import MakeProgress
@@ -43,6 +43,10 @@ def make(
     minutes: Annotated[
         float, typer.Option(help="Time for all steps; less time makes a smaller model.")
     ] = 60.0,
+    preview: Annotated[
+        bool,
+        typer.Option("--preview", help="Only try a minute of sweeps, and draw FOLDER/preview.png."),
+    ] = False,
     json: Json = None,
 ) -> None:
     """Make a project's model: simulate, train, export, evaluate.
@@ -54,7 +58,23 @@ def make(
         from tactile_rt.models.evaluation.records import as_dicts
         from tactile_rt.project.folder import Project
         from tactile_rt.project.making import make as make_project
+        from tactile_rt.project.making import preview_sweeps
     project = Project(folder)
+    if preview:
+        with progress_bar(console, "sweeping", timed=False):
+            counts = preview_sweeps(project, picture := folder / "preview.png")
+        headings = {
+            "kind": "kind", "sweeps": "sweeps", "touch": "touch, %", "beyond": "beyond range, %",
+            "change": "what to change",
+        }  # fmt: skip
+        rows = []
+        for kind, count in counts.items():
+            touch, beyond = count.shares
+            row = (kind, count.sweeps, 100 * touch, 100 * beyond, count.shortcomings)
+            rows.append(dict(zip(headings, row, strict=True)))
+        show_table(rows, headings, json)
+        console.print(f"{picture} shows an object of each kind where it first touches")
+        return
     with progress_bar(console, "reading", timed=False) as update:
         seen = ""
 

@@ -205,7 +205,8 @@ def _draw_models(now: "Snapshot") -> Table:
         "MODEL, STATE, >DECISIONS, >FINAL, >P50 MS, >P99, >MAX, >STEP, >LATE, >SKIP, >DROP, NEWEST"
     )
     for m in now.models:
-        newest = _draw_line(f"{m.label} {m.probability:.0%}" if m.label else "", m.part.reason)
+        what = f"{m.label} {m.probability:.0%}" if m.label else ""
+        newest = _draw_line(f"{what}, object: {m.object}" if m.object else what, m.part.reason)
         if m.touching and not m.part.reason:
             newest.append(" touching", style="green")
         table.add_row(

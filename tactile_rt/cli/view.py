@@ -46,7 +46,7 @@ def view(
         set_option("An option of the sweep or the mesh: size_mm=30, yaw_deg=45, hull=true"),
     ] = None,
 ) -> None:
-    """Draw a simulated sweep and its forces: a picture or a video."""
+    """Draw a simulated sweep and what the array reads: a picture or a video."""
     check_output(out)
     try:
         with needing("view"):
@@ -55,6 +55,7 @@ def view(
             from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
             from tactile_rt.sim_backend.sweep import Sweep, usual_distance
             from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
+            from tactile_rt.sim_backend.transducer import device_spec, sensor_of
             from tactile_rt.sim_backend.views.film import (
                 IMAGES,
                 Film,
@@ -63,7 +64,7 @@ def view(
                 write_video,
             )
             from tactile_rt.sim_backend.views.footage import VIEWS, record
-            from tactile_rt.sim_backend.world import PROFILES, world_spec
+            from tactile_rt.sim_backend.world import PROFILES
     except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver
         if "MUJOCO_GL" not in os.environ:
             raise
@@ -80,7 +81,7 @@ def view(
     usual = {"distance_mm": usual_distance(animals)}
     sweep, mesh = take_sets("view", sets or (), Sweep, MeshDetail, usual=usual)
     thing = load_object(target, mesh)
-    spec = world_spec(animals)
+    spec, sensor = device_spec(animals), sensor_of(animals)
     simulation = SweepSimulation(animals, thing, sweep, PROFILES[profile], whole=True)
     if at is not None and not 0 <= at <= simulation.duration_ms:
         raise ConfigError(f"--at {at:g}: the sweep lasts {simulation.duration_ms:.0f} ms")
@@ -89,8 +90,8 @@ def view(
         console.print(f"{thing.name} passes without touching: --set height_mm or distance_mm")
     period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (FPS * slow)))
     with progress_bar(console, "simulating", total=1.0) as update:
-        footage = record(simulation, spec, period, lambda done: update(completed=done))
-    detail = f"{camera} view · {thing.name} moves from nose to ear"
+        footage = record(simulation, spec, period, lambda done: update(completed=done), sensor)
+    detail = f"{camera} view · {thing.name} moves along -y"
     if suffix not in IMAGES:
         detail += f" · {FPS * period / 1000:.2g} x real speed"
     title = (

@@ -135,6 +135,7 @@ class ModelState:
     lost: Losses = field(default_factory=Losses)  # samples that were dropped from its mailbox
     refused: str = ""  # why the model that was to take the place of this one does not
     implausible: bool = False  # the newest touch has loads far beyond those that it learnt from
+    object: str = ""  # enrolled one that the newest decision's touch is of, or "none of these"
 
 
 @dataclass(frozen=True)

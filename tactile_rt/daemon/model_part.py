@@ -69,6 +69,7 @@ class ModelPart(Part):
         self.sensor: SensorSpec | None = None  # what the model was made for, if it tells
         self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
+        self._object = ""  # that the touch of the newest decision is of
         self._touching = False
         self._latency, self._step = LatencyMeter(), LatencyMeter()
         self._skips, self._age_s = 0, 0.0
@@ -86,7 +87,7 @@ class ModelPart(Part):
             self._latency.state, self._step.state, self._late, self._bad_samples,
             1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
-            self.refused, classifier is not None and classifier.implausible,
+            self.refused, classifier is not None and classifier.implausible, self._object,
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -313,6 +314,8 @@ class ModelPart(Part):
         """Publish a decision, at once: what else is in the chunk may take its time."""
         made = time.monotonic_ns()
         sample = self._completed(d, run, opened.stream)
+        if d.object or self._newest is None or d.onset_ns != self._newest.onset_ns:
+            self._object = d.object  # also while windows of the same touch follow
         self._newest = d
         self._decisions += 1
         self._final += d.final

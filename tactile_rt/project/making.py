@@ -7,9 +7,11 @@ Each part is made once: what is there is not made again, and what was interrupte
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -28,10 +30,21 @@ from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized,
 from tactile_rt.project.folder import Project
 from tactile_rt.project.report import write_report
 from tactile_rt.sets.objects import read_skipped, write_skipped
-from tactile_rt.sim_backend.datasets.dataset import describe_set, finished_objects, make_sweeps
-from tactile_rt.sim_backend.datasets.inventory import tally, write_sums
+from tactile_rt.sim_backend.arrays.files import load_animals
+from tactile_rt.sim_backend.datasets.dataset import (
+    describe_set,
+    finished_objects,
+    make_sweeps,
+    simulate_sweep,
+)
+from tactile_rt.sim_backend.datasets.inventory import Tally, tally, write_sums
+from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
+from tactile_rt.sim_backend.sweep import Sweep, centrelines
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
+from tactile_rt.sim_backend.views.contact_sheet import write_contact_sheet
+from tactile_rt.sim_backend.world import PROFILES
 
-__all__ = ["MakeProgress", "make"]
+__all__ = ["MakeProgress", "make", "preview_sweeps"]
 
 LEAST_MINUTES = 1.0
 SWEPT_BY = 0.48  # of the time given, even where sweeps take longer than those that were timed
@@ -40,6 +53,7 @@ PILOT = 24  # updates that are timed
 MOST_EPOCHS = 60
 FEWEST_UPDATES = 200
 RECIPE = "small"  # of the training
+PREVIEW_S, PREVIEWED = 50.0, 12  # for all sweeps of a preview; sweeps of a kind
 
 Splits = tuple[SweepSet, SweepSet]
 
@@ -64,6 +78,38 @@ class _OutOfTime(Exception):
 
 
 Tell = Callable[[MakeProgress], None]
+
+
+def preview_sweeps(project: Project, picture: Path) -> dict[str, Tally]:
+    """Count some sweeps of each kind, and draw where its first one touches (.png)."""
+    recipe, end = project.recipe(), time.monotonic() + PREVIEW_S
+    objects, animals = choose_objects(recipe.objects), load_animals(recipe.array)
+    kinds: dict[str, list[str]] = {}
+    for name in chain.from_iterable(objects.split.values()):
+        kind = objects.category_of.get(name) or name.rpartition("-")[0]
+        kinds.setdefault(kind, []).append(name)
+    counts, touches = {kind: Counter[str]() for kind in kinds}, {}
+    for number, kind in ((n, kind) for n in range(PREVIEWED) for kind in kinds):
+        if number and time.monotonic() > end:
+            break
+        try:
+            target = objects.load(kinds[kind][number % len(kinds[kind])])
+        except ConfigError:  # a mesh that the set leaves out, too
+            continue
+        found = simulate_sweep(recipe, target, number % len(recipe.sweeps)).parameters
+        counts[kind].update(
+            sweeps=1, misses=not found["touches"], unstable=found["unstable"] > 0,
+            wedged=found["wedged"] > 0, saturated=found["saturated"] > 0,
+        )  # fmt: skip
+        if counts[kind]["sweeps"] == 1:
+            sweep = Sweep(**{field.name: found[field.name] for field in fields(Sweep)})
+            made = SweepSimulation(animals, target, sweep, PROFILES[recipe.profile], whole=True)
+            touches[f"{kind}, {sweep.size_mm:.3g} mm"] = made.first_touch()
+    if not touches:
+        raise ConfigError("no object can be used: `tactile-rt objects check` says why")
+    whiskers = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
+    write_contact_sheet(picture, touches, whiskers)
+    return {kind: Tally(**count) for kind, count in counts.items()}
 
 
 def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[Record]:

@@ -90,22 +90,21 @@ def confused(
 
 
 def _describe_sweeps(folder: Path) -> str:
-    """Say what the sweeps are for, and what share of them touches and saturates."""
+    """Say how many sweeps are for what, and what share of them touches and saturates."""
     manifest = SweepManifest.read(folder)
     there = {s: [n for n in manifest.split[s] if has_object(folder, n)] for s in SPLITS}
     every = tally(
         folder, manifest.names(SPLITS), draws := len(recipe_of_set(manifest.recipe).sweeps)
     )
-    parts = ", ".join(
-        f"{what} {draws * len(there[split])} of {len(there[split])}"
-        for split, what in zip(
-            SPLITS, ("it learnt from", "was chosen by", "tested on"), strict=True
-        )
+    learnt, chosen, tested = (
+        f"{draws * len(there[split])} sweeps of {len(there[split])}" for split in SPLITS
     )
-    touching, beyond = 1 - every.misses / every.sweeps, every.saturated / every.sweeps
+    touching, beyond = every.shares
     return (
-        f"Sweeps of objects: {parts}. {100 * touching:.0f} % of all touch a whisker; in "
-        f"{100 * beyond:.0f} % a reading is beyond the sensor's range."
+        f"It learnt from {learnt} objects. By {chosen} others it was chosen which of its states in "
+        f"training is kept. {tested} further ones, of which nothing was known until then, are the "
+        f"test. {100 * touching:.0f} % of all touch a whisker; in {100 * beyond:.0f} % "
+        "a reading is beyond the sensor's range."
     )
 
 

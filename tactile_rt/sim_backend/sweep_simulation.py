@@ -211,6 +211,11 @@ class SweepSimulation:
         """The MuJoCo model of the sweep, also where another engine steps it: for pictures."""
         return sweep_model(self._animals, self._names, self._pieces, self._profile)
 
+    def first_touch(self) -> list[trimesh.Trimesh]:
+        """Place the object's pieces where it first touches a whisker, in the world, mm."""
+        place = self._start + self._sweep.gap_mm * self._ahead
+        return [trimesh.Trimesh(p.vertices + place, p.faces, process=False) for p in self._pieces]
+
     def show(self, data: mujoco.MjData) -> None:
         """Put the whiskers and the object of a `model` where they are now."""
         data.qpos[:] = self._world.angles

@@ -114,7 +114,7 @@ class Transducer:
             chunk: (n, element, load) loads at 1 kHz, the first six of
                 `sensor_spec.LOADS` or all.
         """
-        readings = self._readings(chunk.values.astype(np.float64))
+        readings = self.read(chunk.values.astype(np.float64))
         if self._sensor.bandwidth_hz:
             from scipy.signal import lfilter  # which takes longer to import than all else here
 
@@ -153,8 +153,8 @@ class Transducer:
         self._taken += len(due)
         return due
 
-    def _readings(self, loads: Floats) -> Floats:
-        """(n, element, channel) readings of (n, element, load) loads."""
+    def read(self, loads: Floats) -> Floats:
+        """Return readings (n, element, channel) of loads (n, element, load), before any filter."""
         readings = np.zeros((*loads.shape[:2], self._sensitivity.shape[1]))
         # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
         for load in range(loads.shape[2]):

@@ -60,6 +60,13 @@ def test_all_that_matters_is_on_one_screen():
     assert text(picture(busy_snapshot(2), busy_snapshot())) == SHOWN
 
 
+def test_the_enrolled_object_stands_beside_the_class():
+    snapshot = busy_snapshot()
+    model = dataclasses.replace(snapshot.models[0], object="red mug")
+    shown = text(picture(dataclasses.replace(snapshot, models=(model,)), None), 140)
+    assert "mug 93%, object: red mug touching" in shown
+
+
 def test_rates_are_not_made_up():
     first = text(picture(busy_snapshot(), None))
     assert "whiskers  streaming   -  1000     5000" in first

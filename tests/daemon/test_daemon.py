@@ -13,6 +13,7 @@ from rich.console import Console
 
 from tactile_rt.calibration import Calibration, save_calibration
 from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.enrolment import EnrolledObject
 from tactile_rt.cli.top import picture
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.core.locks import AlreadyRunning, Locks
@@ -36,7 +37,7 @@ from tactile_rt.daemon.metrics import exposition
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
-from tests.helpers.tiny_model import write_model
+from tests.helpers.tiny_model import force_rule, write_model
 from tests.helpers.touch_streams import same
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -150,7 +151,8 @@ def seqs(spy, name):
 
 def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
     """Where the line waits for its reader and the mailboxes hold all, on a busy machine, too."""
-    model = write_model(tmp_path / "m.onnx")
+    cup = EnrolledObject.of("cup", np.array([[4.0, 8.0]]))
+    model = write_model(tmp_path / "m.onnx", identity=force_rule(), enrolled=(cup,))
     with (
         FakeSerial(touching(2000), spec=SPEC, pace="fast") as left,
         FakeSerial(touching(2000, 1), spec=small_spec(), pace="fast") as right,
@@ -191,6 +193,8 @@ def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
     assert all(d.decision.final for d in made if d.model == "last")
     assert first.decisions == sum(d.model == "left" for d in made) == first.latency.count
     assert final.final == sum(d.model == "last" for d in made) == second.final
+    objects = [d.decision.object for d in made if d.model == "left" and d.decision.object]
+    assert first.object == objects[-1]
     assert all(d.sample_ns <= d.made_ns and d.frame == "mount" for d in made)
     published = next(c for c in snapshot.consumers if c.kind == "spy")
     assert published.latency.count == len(made) and published.queue.dropped["samples"] == 0

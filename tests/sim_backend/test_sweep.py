@@ -23,7 +23,13 @@ from tactile_rt.sim_backend.objects.catalogue import (
     make_object,
 )
 from tactile_rt.sim_backend.objects.solids import box
-from tactile_rt.sim_backend.sweep import Sweep, draw_sweep, usual_distance
+from tactile_rt.sim_backend.sweep import (
+    Sweep,
+    centrelines,
+    draw_sweep,
+    usual_distance,
+    way_to_contact,
+)
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import (
     MOUNT,
@@ -278,3 +284,10 @@ def test_distances_grow_with_the_reach_of_the_whiskers() -> None:
     near, far = (draw_sweep(np.random.default_rng(1), d) for d in (6.5, 13.0))
     assert far == replace(near, distance_mm=2 * near.distance_mm)
     assert 5.5 <= near.distance_mm <= 8
+
+
+def test_an_object_first_touches_where_it_is_said_to() -> None:
+    simulation = SweepSimulation(ALL, make_object("mug", 1), Sweep(), REALTIME, whole=True)
+    lines = centrelines(ALL.whiskers, ALL.mount)
+    way, _ = way_to_contact(ALL.whiskers, lines, simulation.first_touch())
+    assert way == pytest.approx(0, abs=1e-6)

@@ -1,6 +1,8 @@
 """Views of a simulation, checked in the pixels: projections, arrows, the map, files."""
 
+import re
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,14 +15,16 @@ pytest.importorskip("av")
 import av
 import mujoco
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec
-from tactile_rt.sim_backend.arrays.files import load_array, mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import load_animals, load_array, mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
+from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sim_backend.views.film import (
     Film,
     Stage,
@@ -30,9 +34,10 @@ from tactile_rt.sim_backend.views.film import (
     write_video,
 )
 from tactile_rt.sim_backend.views.footage import VIEWS, Camera, Footage, framing, record
-from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign
+from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, Sheet, rostral_sign
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
 from tests.helpers.refusals import refusal
+from tests.helpers.source_tree import ROOT
 
 SCALE = ForceScale(1.0, 10.0)
 SIDE = 200  # pixels of a test picture
@@ -62,7 +67,8 @@ def still(geoms="", site="", load=(0, 0, 0, 0, 0, 0)):
         orientations=((1.0, 0.0, 0.0, 0.0),), channels=("fx", "fy", "fz", "mx", "my", "mz"),
         units=("N",) * 3 + ("N m",) * 3, rate_hz=1000.0, frame="head",
     )  # fmt: skip
-    return Footage(model, spec, 1.0, np.array([[load]], dtype=float), np.zeros((1, 0)))
+    size = np.array([[np.linalg.norm(load[:3])]])
+    return Footage(model, spec, 1.0, np.array([[load]], dtype=float), np.zeros((1, 0)), size)
 
 
 def thing(kind, size, pos, more=""):
@@ -131,8 +137,9 @@ def test_a_named_view_shows_all_that_it_frames(view, left):
     points = np.random.default_rng(3).normal(size=(50, 3)) * (9, 2, 5) + (40, -7, 1)
     camera = framing(view, points, aspect=2.0, left=left)
     from_middle = points - camera.lookat
-    assert np.abs(from_middle @ camera.right).max() < camera.extent_mm * 2.0 / 2
-    assert np.abs(from_middle @ camera.up).max() < camera.extent_mm / 2
+    nearness = camera.distance_mm / (camera.distance_mm + from_middle @ camera.forward)
+    assert np.abs(nearness * (from_middle @ camera.right)).max() < camera.extent_mm * 2.0 / 2
+    assert np.abs(nearness * (from_middle @ camera.up)).max() < camera.extent_mm / 2
     assert Camera(camera.azimuth, camera.elevation, (0, 0, 0), 1).forward[0] == pytest.approx(
         (-1) ** left * Camera(*VIEWS[view], (0, 0, 0), 1).forward[0]
     )
@@ -177,7 +184,7 @@ def test_a_whisker_shows_through_what_hides_it():
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco><worldbody>{thing("box", ".1 15 15", "-8 0 0")}
           <body name="w"><site name="w"/>{post}</body></worldbody></mujoco>""")
-    picture = photograph(Footage(model, lone.spec, 1.0, lone.loads, lone.states), AHEAD)
+    picture = photograph(replace(lone, model=model), AHEAD)
     hidden, beside = picture[SIDE // 2 - 10, SIDE // 2], picture[SIDE // 2 - 10, SIDE // 2 + 30]
     assert int(beside.min()) - int(hidden.min()) > 20
     assert (picture[2, 2] == 255).all()  # paper
@@ -218,10 +225,10 @@ def test_a_scale_fits_the_forces_but_not_a_rare_snap():
     forces = np.full((200, 30), 0.2e-3)
     forces[7, 3] = 9e-3
     scale = ForceScale.fitting(forces, 40.0)
-    assert 0.1 <= scale.top_mn <= 0.3
-    assert scale.length(scale.top_mn) == scale.arrow_mm
+    assert 0.1 <= scale.top <= 0.3
+    assert scale.length(scale.top) == scale.arrow_mm
     assert scale.length(9.0) <= 2 * scale.arrow_mm
-    assert scale.colour(0.0) == scale.colour(1e-9) != scale.colour(scale.top_mn)
+    assert scale.colour(0.0) == scale.colour(1e-9) != scale.colour(scale.top)
 
 
 # ---- the map and the whole picture
@@ -246,7 +253,7 @@ def test_the_map_points_where_the_force_goes_on_the_head(name, mirrored, head_fo
     loads = np.zeros((len(spec.elements), 6))
     for i, whisker in enumerate(array.whiskers):
         loads[i, :3] = whisker.orientation.T @ np.array(head_force) * 1e-3
-    force_map.show(loads)
+    force_map.show(loads, np.linalg.norm(loads[:, :3], axis=1))
     wanted = np.array(points) * (-1 if mirrored else 1, 1) / np.linalg.norm(points)
     for i in (0, len(spec.elements) // 2, -1):
         np.testing.assert_allclose(arrow_in(force_map, i), wanted, atol=0.05)
@@ -256,9 +263,9 @@ def test_only_touched_cells_change(footage):
     figure = Figure(figsize=(4, 3))
     force_map = ForceMap(figure, (0, 0, 1, 1), footage.spec, SCALE)
     loads = np.zeros((30, 6))
-    assert force_map.show(loads) == []
+    assert force_map.show(loads, loads[:, 0]) == []
     loads[12, 0] = 1e-3
-    changed = force_map.show(loads)
+    changed = force_map.show(loads, loads[:, 0])
     assert len(changed) == 3
     assert changed[2].get_text() == footage.spec.elements[12]
     assert changed[0].get_facecolor() == pytest.approx(SCALE.colour(1.0), abs=1e-6)
@@ -269,6 +276,19 @@ def test_columns_of_a_face_go_to_the_nose_from_both_sides():
     signs = rostral_sign(array_spec(both.whiskers, both.name))
     assert [signs[i] for i, w in enumerate(both.whiskers) if w.name[0] == "R"] == [1] * 30
     assert [signs[i] for i, w in enumerate(both.whiskers) if w.name[0] == "L"] == [-1] * 30
+
+
+def test_a_robot_is_drawn_in_what_its_sensor_reads():
+    magnets = load_animals(str(ROOT / "docs" / "arrays" / "magnets.toml"))
+    sweep, target = Sweep(size_mm=20, speed_mm_s=150, distance_mm=12), make_object("mug", 1)
+    simulation = SweepSimulation(magnets, target, sweep, PROFILES["realtime"], whole=True)
+    footage = record(simulation, device_spec(magnets), 10, sensor=sensor_of(magnets))
+    scale = ForceScale.fitting(footage.sizes, 40.0, "T")
+    assert 1e-6 < footage.sizes.max() < 1e-2 and not footage.sizes[0].any()
+    sheet = Sheet(footage, camera_of(footage, "oblique"), scale, "a", "b", 320)
+    words = " ".join(text.get_text() for text in sheet._figure.findobj(Text))
+    assert f"arrow of {scale.top:g} mT" in words and "size of bx, by, bz" in words
+    assert not re.search(r"nose|cheek|mN", words)
 
 
 @pytest.fixture(scope="module")

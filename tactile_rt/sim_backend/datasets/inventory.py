@@ -34,11 +34,18 @@ class Tally:
     skipped: int = 0
 
     @property
+    def shares(self) -> tuple[float, float]:
+        """Shares of sweeps: that touch a whisker, and with a reading beyond the sensor's range."""
+        sweeps = max(1, self.sweeps)
+        return (self.sweeps - self.misses) / sweeps, self.saturated / sweeps
+
+    @property
     def shortcomings(self) -> str:
         """What is to be told beside the number of sweeps; nothing if all is well."""
         told = {
-            f"{self.misses} miss the array (larger `size_mm`, less `distance_mm`)": self.misses,
-            f"{self.saturated} exceed the sensor's `range`": self.saturated,
+            f"{self.misses} miss the array (larger `size_mm`, less `distance_mm`, other "
+            "`height_mm`)": self.misses,
+            f"{self.saturated} exceed the sensor's `range` (more `distance_mm`)": self.saturated,
             f"{self.unstable} could not be simulated": self.unstable,
             f"{self.wedged} leave no room for a whisker": self.wedged,
             f"{self.skipped} objects are left out ({SKIPPED} says why)": self.skipped,

@@ -1,32 +1,55 @@
 """Contact sheets: many objects in one picture, to see that each is what it should be."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from tactile_rt.core.files import write_whole
-from tactile_rt.sim_backend.objects.solids import TactileObject
 
 __all__ = ["write_contact_sheet"]
 
 ACROSS = 8  # pictures in a row
 
 
-def write_contact_sheet(out: Path, things: Mapping[str, TactileObject | None]) -> None:
-    """Write a picture (.png) of named objects; None: one that cannot be used."""
-    down = -(-len(things) // ACROSS)
-    figure = Figure(figsize=(ACROSS * 1.6, down * 1.85), dpi=100)
-    for place, (name, thing) in enumerate(things.items(), 1):
-        axes: Any = figure.add_subplot(down, ACROSS, place, projection="3d" if thing else None)
-        axes.axis("off")
-        axes.set_title(name[-24:], fontsize=7, color="black" if thing else "firebrick")
-        if thing:
-            solid: Any = trimesh.util.concatenate(list(thing.pieces))
-            axes.plot_trisurf(*solid.vertices.T, triangles=solid.faces, color="0.8")
-            axes.set(xlim=(-0.4, 0.4), ylim=(-0.4, 0.4), zlim=(-0.4, 0.4), box_aspect=(1, 1, 1))
-        else:
+def write_contact_sheet(
+    out: Path,
+    things: Mapping[str, Sequence[trimesh.Trimesh] | None],
+    whiskers: Sequence[NDArray[np.float64]] = (),
+) -> None:
+    """Write a picture (.png) of named objects.
+
+    Args:
+        things: the pieces of each; None: one that cannot be used.
+        whiskers: (point, 3) from base to tip, mm, in the world, as the pieces then are: drawn with
+            every object, which moves along -y.
+    """
+    across, wide = (min(3, len(things)), 4.0) if whiskers else (ACROSS, 1.6)
+    down = -(-len(things) // across)
+    figure = Figure(figsize=(across * wide, down * 1.15 * wide), dpi=100)
+    figure.suptitle("dots: bases of whiskers; arrow: how the object moves" if whiskers else "")
+    for place, (name, pieces) in enumerate(things.items(), 1):
+        axes: Any = figure.add_subplot(down, across, place, projection="3d" if pieces else None)
+        axes.set_title(name[-24:], fontsize=5 + wide, color="black" if pieces else "firebrick")
+        if not whiskers:
+            axes.axis("off")
+        if not pieces:
             axes.text(0.5, 0.5, "cannot be used", ha="center", fontsize=7, color="firebrick")
+            continue
+        solid: Any = trimesh.util.concatenate(list(pieces))
+        axes.plot_trisurf(
+            *solid.vertices.T, triangles=solid.faces, color="0.8", alpha=0.6 if whiskers else 1
+        )
+        for line in whiskers:
+            axes.plot(*line.T, color="black", marker="o", markersize=4, markevery=[0])
+        if whiskers:
+            axes.computed_zorder = False  # they show through what hides them
+            axes.view_init(elev=24, azim=-154)
+            axes.quiver(*solid.bounds[1], 0, -solid.extents[1] / 2, 0, color="tab:red")
+            axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+        axes.set(aspect="equal")
     write_whole(out, lambda file: figure.savefig(file, format="png"))

@@ -106,8 +106,8 @@ class Dressed:
     def pose(self, footage: Footage, moment: int, scale: ForceScale) -> None:
         """Place everything as it was, each whisker in the colour of its force."""
         footage.restore(moment, self.data)
-        for geoms, force in zip(self.links, 1e3 * footage.forces[moment], strict=True):
-            self.model.geom_rgba[geoms] = scale.colour(force)
+        for geoms, size in zip(self.links, scale.per_si * footage.sizes[moment], strict=True):
+            self.model.geom_rgba[geoms] = scale.colour(size)
 
 
 def _add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
@@ -155,17 +155,16 @@ class Stage:
     def picture(self, moment: int) -> NDArray[np.uint8]:
         """(height, width, 3) RGB picture of a moment."""
         self.dressed.pose(self.footage, moment, self.scale)
-        loads = self.footage.loads[moment]
-        whole, bare = (self._draw(loads, opacity) for opacity in (1.0, 0.0))
+        whole, bare = (self._draw(moment, opacity) for opacity in (1.0, 0.0))
         # What hides whiskers is drawn as glass: as one body, not as the pieces it is made of.
         return np.asarray(Image.blend(whole, bare, GHOST).reduce(FINE))
 
-    def _draw(self, loads: NDArray[np.float64], opacity: float) -> Image.Image:
+    def _draw(self, moment: int, opacity: float) -> Image.Image:
         model, data, scene = self.dressed.model, self.dressed.data, self._scene
         self.dressed.cover(opacity)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, self._view, everything, scene)
-        self._add_forces(loads)
+        self._add_forces(moment)
         _add_paper(scene, self.camera)
         pixels = np.empty((self._size[1], self._size[0], 3), dtype=np.uint8)
         area = mujoco.MjrRect(0, 0, *self._size)
@@ -174,18 +173,19 @@ class Stage:
         mujoco.mjr_readPixels(pixels, None, area, self._painter)
         return Image.fromarray(pixels[::-1])
 
-    def _add_forces(self, loads: NDArray[np.float64]) -> None:
-        """Draw a dot and an arrow for each load (element, 6), N and N m."""
+    def _add_forces(self, moment: int) -> None:
+        """Draw a dot for each element, and an arrow where its force points."""
         data, scale, extent_mm = self.dressed.data, self.scale, self.camera.extent_mm
-        for site, load in zip(self.dressed.sites, loads, strict=True):
+        sizes = (scale.per_si * self.footage.sizes[moment]).tolist()
+        loads = self.footage.loads[moment]
+        for site, size, load in zip(self.dressed.sites, sizes, loads, strict=True):
             base = data.site_xpos[site]
-            force = 1e3 * data.site_xmat[site].reshape(3, 3) @ load[:3]
-            size = float(np.linalg.norm(force))
+            force = data.site_xmat[site].reshape(3, 3) @ load[:3]
             rgba = np.array(scale.colour(size), dtype=np.float32)
             _add(self._scene, DOT, np.full(3, BASE * extent_mm), base, rgba)
             if scale.draws(size):
                 arrow = _add(self._scene, ARROW, np.ones(3), base, rgba)
-                end = base + force / size * scale.length(size)
+                end = base + force / max(np.linalg.norm(force), 1e-12) * scale.length(size)
                 mujoco.mjv_connector(arrow, ARROW, SHAFT * extent_mm, base, end)
                 arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
 
@@ -259,7 +259,7 @@ class Film:
         self.footage = footage
         width, height = scene_size(pixels)
         camera = camera_of(footage, view, width / height)
-        scale = ForceScale.fitting(footage.forces, camera.extent_mm)
+        scale = ForceScale.fitting(footage.sizes, camera.extent_mm, footage.spec.units[0])
         self._stage = Stage(footage, camera, scale, width, height)
         self._sheet = Sheet(footage, camera, scale, title, detail, pixels)
         self.size = self._sheet.size

@@ -1,4 +1,4 @@
-"""A simulation as it went: the loads, and its states at even intervals, to draw pictures from."""
+"""A simulation as it went: loads, readings and states at even intervals, to draw pictures from."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,20 +9,22 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream.sensor_spec import LOADS, SensorSpec
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
+from tactile_rt.sim_backend.transducer import Transducer
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
 __all__ = ["VIEWS", "Camera", "Footage", "framing", "record"]
 
-# Azimuth and elevation (degrees) of the named views. `side` and `front` face the animal, `top` has
-# its nose upward; `oblique` looks outward from behind the cheek, whiskers before the object.
+# Azimuth and elevation (degrees) of the named views. `side` and `front` face the array, `top` has
+# its y upward; `oblique` looks outward from behind the bases, whiskers before the object.
 VIEWS: dict[str, tuple[float, float]] = {
     "front": (-90.0, 0.0),
     "side": (180.0, 0.0),
     "top": (90.0, -90.0),
     "oblique": (26.0, -27.0),
 }
-MARGIN = 1.15  # around the framed points: room for arrows
+MARGIN = 1.2  # around the framed points: room for arrows
 # What places everything: joint angles, and the poses of the bodies that are moved.
 _STATE = int(
     mujoco.mjtState.mjSTATE_QPOS
@@ -98,11 +100,12 @@ def framing(
     axes = Camera(azimuth, elevation, (0.0, 0.0, 0.0), 1.0)
     frame = np.stack([axes.right, axes.up, axes.forward])
     seen = points @ frame.T
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    x, y, z = (frame.T @ ((low + high) / 2)).tolist()
-    wide, tall = (high - low)[:2]
-    extent = MARGIN * max(float(wide) / aspect, float(tall), 1e-3)
-    return Camera(azimuth, elevation, (x, y, z), extent)
+    middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
+    x, y, z = (frame.T @ middle).tolist()
+    right, up, forward = (seen - middle).T
+    near = 2 * np.tan(np.radians(axes.fovy_deg) / 2) * np.maximum(-forward, 0)  # looks larger
+    extent = float((2 * np.maximum(abs(right) / aspect, abs(up)) + near).max())
+    return Camera(azimuth, elevation, (x, y, z), MARGIN * max(extent, 1e-3))
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,8 @@ class Footage:
     Attributes:
         loads: The (moment, element, 6) base loads, N and N m, each the mean over the period before.
         states: The (moment, n) places of everything at the end of each period.
+        sizes: The (moment, element) size of the force on each base, or of what the array's sensor
+            reads first, less that of the first moment, SI.
     """
 
     model: mujoco.MjModel
@@ -119,6 +124,7 @@ class Footage:
     period_ms: float
     loads: NDArray[np.float64]
     states: NDArray[np.float64]
+    sizes: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.loads)
@@ -129,14 +135,9 @@ class Footage:
         return self.period_ms * np.arange(1, len(self) + 1, dtype=np.float64)
 
     @property
-    def forces(self) -> NDArray[np.float64]:
-        """(moment, element) size of the force on each base, N."""
-        return np.asarray(np.linalg.norm(self.loads[..., :3], axis=2))
-
-    @property
     def strongest(self) -> int:
-        """The moment in which the forces add up to most; the middle one if there are none."""
-        total = self.forces.sum(axis=1)
+        """The moment in which the sizes add up to most; the middle one if there are none."""
+        total = self.sizes.sum(axis=1)
         return int(total.argmax()) if total.any() else len(self) // 2
 
     def at(self, ms: float) -> int:
@@ -154,22 +155,28 @@ def record(
     spec: ArraySpec,
     period_ms: int = 4,
     progress: Callable[[float], None] = lambda done: None,
+    sensor: SensorSpec | None = None,
 ) -> Footage:
     """Run a simulation to its end.
 
     Args:
         simulation: made with `whole=True`, so that it has all whiskers of the array; fresh or
             advanced, it goes on from where it is.
+        sensor: what reads the array, of which `spec` is; None: nothing, and it is of base loads.
     """
     moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)
-    loads = np.empty((moments, len(spec.elements), 6))
+    loads = np.empty((moments, len(spec.elements), len(LOADS)))
     model = simulation.model
     data = mujoco.MjData(model)
     states = np.empty((moments, mujoco.mj_stateSize(model, _STATE)))
     for k in range(moments):
-        loads[k] = simulation.advance(samples).mean(axis=0)
+        loads[k, :, :6] = simulation.advance(samples).mean(axis=0)
+        loads[k, :, 6:] = simulation.turns().mean(axis=0)
         simulation.show(data)
         mujoco.mj_getState(model, data, states[k], _STATE)
         progress((k + 1) / moments)
-    return Footage(model, spec, samples * SAMPLE_MS, loads, states)
+    read = Transducer(sensor, spec.elements).read(loads) if sensor else loads[..., :6]
+    first = [unit == spec.units[0] for unit in spec.units]
+    sizes = np.linalg.norm((read - (read[0] if sensor else 0))[..., first], axis=2)
+    return Footage(model, spec, samples * SAMPLE_MS, loads[..., :6], states, sizes)

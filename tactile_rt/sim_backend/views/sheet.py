@@ -1,7 +1,7 @@
 """The whole picture: the scene, the array as a map of forces beside it, their traces below."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import mujoco
 import numpy as np
@@ -17,6 +17,7 @@ from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from tactile_rt.core.stream import ArraySpec, rotation_matrices
+from tactile_rt.sim_backend.arrays.files import SPECIES
 from tactile_rt.sim_backend.views.footage import Camera, Footage
 
 __all__ = [
@@ -39,7 +40,7 @@ SCENE: Place = (0.0, 0.265, 0.62, 0.62)
 MAP: Place = (0.635, 0.4, 0.35, 0.425)
 INK, QUIET, EMPTY = "#222222", "#6b6b6b", "#f2f2f2"
 REACH = 0.36  # of a cell: half the longest arrow in it
-HARDLY = 0.15  # of a force, along the cheek: less has no direction worth drawing
+HARDLY = 0.15  # of a force, in the plane of the map: less has no direction worth drawing
 NAMED = 6  # strongest traces that get a colour and a name
 RGBA = tuple[float, float, float, float]
 
@@ -60,38 +61,43 @@ def round_number(value: float) -> float:
 
 @dataclass(frozen=True)
 class ForceScale:
-    """Colours and arrow lengths of forces.
+    """Colours and arrow lengths of forces, or of what else is read.
 
     Attributes:
-        top_mn: The force that gets the strongest colour, mN.
-        arrow_mm: The length of that force's arrow, mm in the world.
+        top: The size that gets the strongest colour, in `unit`.
+        arrow_mm: The length of that size's arrow, mm in the world.
+        per_si: The factor from SI to `unit`.
     """
 
-    top_mn: float
+    top: float
     arrow_mm: float
+    unit: str = "mN"
+    per_si: float = 1e3
 
     @classmethod
-    def fitting(cls, forces: NDArray[np.float64], extent_mm: float) -> "ForceScale":
-        """Fit a scale to forces (moment, element), N, in a picture of so much height."""
-        strongest = 1e3 * forces.max(axis=1)
+    def fitting(cls, sizes: NDArray[np.float64], extent_mm: float, unit: str = "N") -> Self:
+        """Fit a scale to sizes (moment, element), SI, in a picture of so much height."""
+        strongest = sizes.max(axis=1)
         touched = strongest[strongest > 0.02 * strongest.max()]
-        top = float(np.percentile(touched, _HEARD_OF)) if len(touched) else 0.0
-        return cls(round_number(top / 1.2), round_number(0.2 * extent_mm))
+        top = float(np.percentile(touched, _HEARD_OF)) / 1.2 if len(touched) else 1e-3
+        power = int(np.clip(np.ceil(-np.log10(10 * top) / 3), 0, 4))
+        unit, per_si = ("", "m", "u", "n", "p")[power] + unit, 1e3**power
+        return cls(round_number(per_si * top), round_number(0.15 * extent_mm), unit, per_si)
 
-    def draws(self, force_mn: float) -> bool:
+    def draws(self, size: float) -> bool:
         """True if a force is large enough to be drawn."""
-        return force_mn >= _FELT * self.top_mn
+        return size >= _FELT * self.top
 
-    def colour(self, force_mn: float) -> RGBA:
+    def colour(self, size: float) -> RGBA:
         """RGBA of a force; grey for none."""
-        if not self.draws(force_mn):
+        if not self.draws(size):
             return _UNTOUCHED
-        r, g, b, a = _COLOURS(0.12 + 0.83 * min(force_mn / self.top_mn, 1.0))
+        r, g, b, a = _COLOURS(0.12 + 0.83 * min(size / self.top, 1.0))
         return r, g, b, a
 
-    def length(self, force_mn: float) -> float:
+    def length(self, size: float) -> float:
         """Length of a force's arrow, mm."""
-        return self.arrow_mm * min(force_mn / self.top_mn, _LONGEST)
+        return self.arrow_mm * min(size / self.top, _LONGEST)
 
 
 class Sheet:
@@ -129,15 +135,18 @@ class Sheet:
         self._legend = _draw_ruler(figure, camera, scale)
 
         middle = MAP[0] + MAP[2] / 2
-        head = "force on each whisker's base"
-        figure.text(middle, 0.862, head, ha="center", fontsize=12, color=INK)
-        how = "colour: size, arrow: direction along the cheek"
+        spec = footage.spec
+        read = [c for c, u in zip(spec.channels, spec.units, strict=True) if u == spec.units[0]]
+        what = "force" if spec.units[0] == "N" else f"size of {', '.join(read)}"
+        figure.text(middle, 0.862, f"{what} at each base", ha="center", fontsize=12, color=INK)
+        how = "colour: size, arrow: direction of the force in y and z"
         figure.text(middle, 0.833, how, ha="center", fontsize=9.5, color=QUIET)
-        self._map = ForceMap(figure, MAP, footage.spec, scale, _mirrored(footage, camera))
+        self._map = ForceMap(figure, MAP, spec, scale, _mirrored(footage, camera))
         draw_scale(figure, (middle - 0.1, 0.345, 0.2, 0.016), scale)
 
         traces = figure.add_axes((0.06, 0.085, 0.925, 0.165))
-        draw_traces(traces, footage.times_ms, 1e3 * footage.forces, footage.spec.elements)
+        draw_traces(traces, footage.times_ms, scale.per_si * footage.sizes, spec.elements)
+        traces.set_ylabel(f"{'force' if what == 'force' else 'size'} at base ({scale.unit})")
         self._cursor = traces.axvline(0, color=INK, lw=1.3)
         self._clock = figure.text(0.985, 0.945, "", color=INK, fontsize=14, family="monospace")
         self._clock.set(ha="right", va="center")
@@ -155,7 +164,7 @@ class Sheet:
         """
         time = float(self._footage.times_ms[moment])
         self._scene.set_data(scene)
-        cells = self._map.show(self._footage.loads[moment])
+        cells = self._map.show(self._footage.loads[moment], self._footage.sizes[moment])
         self._cursor.set_xdata([time, time])
         self._clock.set_text(f"t = {time:5.0f} ms")
         self._canvas.restore_region(self._still)
@@ -178,15 +187,16 @@ def scene_size(pixels: int) -> tuple[int, int]:
 
 def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artist]:
     """A force arrow as long as it is at the point looked at, and what it stands for."""
-    left, y = SCENE[0] + 0.022, SCENE[1] + 0.03
+    right, y = SCENE[0] + SCENE[2] - 0.022, SCENE[1] + 0.03  # bases are often on the left
     long = scale.arrow_mm / camera.extent_mm * SCENE[3] * TALL / WIDE
     head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
-    places, colour = ((left, y), (left + long, y)), scale.colour(scale.top_mn)
+    places, colour = ((right - long, y), (right, y)), scale.colour(scale.top)
     arrow = FancyArrowPatch(*places, transform=figure.transFigure, color=colour, lw=3, **head)
     figure.add_artist(arrow)
     clear = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.7}
-    words = f"{scale.arrow_mm:g} mm · arrow of {scale.top_mn:g} mN"
-    return [arrow, figure.text(left, y + 0.022, words, fontsize=10, color=INK, bbox=clear)]
+    words = f"{scale.arrow_mm:g} mm · arrow of {scale.top:g} {scale.unit}"
+    said = figure.text(right, y + 0.022, words, fontsize=10, color=INK, bbox=clear, ha="right")
+    return [arrow, said]
 
 
 def _mirrored(footage: Footage, camera: Camera) -> bool:
@@ -203,14 +213,14 @@ def _mirrored(footage: Footage, camera: Camera) -> bool:
 
 
 class ForceMap:
-    """The array on its grid: each cell in the colour of |F|, with its direction on the head.
+    """The array on its grid: each cell in the colour of its size, with the force's direction.
 
-    The arrow in a cell is the part of the force along the cheek: rostral (y of the mount frame)
-    and dorsal (z); it is long where all of the force is in that plane.
+    The arrow in a cell is the part of the force along y and z of the mount frame, rostral and
+    dorsal on an animal; it is long where all of the force is in that plane.
 
     Args:
         place: in it: left, bottom, width, height, fractions.
-        mirrored: whether column 0 is on the right, as in a picture with the nose on the left.
+        mirrored: whether column 0 is on the right, as in a picture with +y on the left.
     """
 
     def __init__(
@@ -240,33 +250,35 @@ class ForceMap:
             axes.add_patch(cell)
             axes.add_patch(arrow)
             self._cells.append((cell, arrow, label))
+        nose = "nose" if spec.name.partition("-")[0] in SPECIES else "+y"
         if len(set(self._rostral.tolist())) == 1:
-            nose = "nose →" if self._flip * self._rostral[0] > 0 else "← nose"
+            nose = f"{nose} →" if self._flip * self._rostral[0] > 0 else f"← {nose}"
         else:  # both sides of a face
-            nose = "left      nose      right" if mirrored else "right      nose      left"
+            sides = ("left", "right") if mirrored else ("right", "left")
+            nose = f"      {nose}      ".join(sides)
         axes.text((columns - 1) / 2, rows - 0.1, nose, ha="center", fontsize=10, color=QUIET)
         axes.set_xlim(-0.6, columns - 0.4)
         axes.set_ylim(rows - 0.1, -0.6)
         axes.set_aspect("equal", anchor="N")
         axes.axis("off")
 
-    def show(self, loads: NDArray[np.float64]) -> list[Artist]:
-        """Set the forces: loads (element, 6), N and N m, in the element frames.
+    def show(self, loads: NDArray[np.float64], sizes: NDArray[np.float64]) -> list[Artist]:
+        """Set loads (element, 6), SI, in the element frames, and sizes (element,).
 
         Returns:
             What differs from the map of an untouched array, in the order to draw it.
         """
-        forces = 1e3 * np.einsum("eij,ej->ei", self._turns, loads[:, :3])
+        forces = np.einsum("eij,ej->ei", self._turns, loads[:, :3])
         changed: list[Artist] = []
         for i, (force, (cx, cy)) in enumerate(zip(forces, self._centres, strict=True)):
-            size = float(np.linalg.norm(force))
+            size = self._scale.per_si * float(sizes[i])
             felt = self._scale.draws(size)
             cell, arrow, label = self._cells[i]
-            ink = "white" if size > 0.5 * self._scale.top_mn else INK
+            ink = "white" if size > 0.5 * self._scale.top else INK
             cell.set_facecolor(self._scale.colour(size) if felt else EMPTY)
             label.set_color(ink if felt else "0.6")
             rightward, downward = self._flip * self._rostral[i] * force[1], -force[2]
-            along = np.array([rightward, downward]) / max(size, 1e-12)
+            along = np.array([rightward, downward]) / max(float(np.linalg.norm(force)), 1e-12)
             arrow.set_visible(felt and float(np.linalg.norm(along)) > HARDLY)
             arrow.set_color(ink)
             dx, dy = (REACH * along).tolist()
@@ -290,16 +302,16 @@ def rostral_sign(spec: ArraySpec) -> NDArray[np.float64]:
 
 def draw_scale(figure: Figure, place: Place, scale: ForceScale) -> None:
     """A horizontal colour bar of the forces in these figure fractions."""
-    steps = np.linspace(0.02 * scale.top_mn, scale.top_mn, 64)
+    steps = np.linspace(0.02 * scale.top, scale.top, 64)
     colours = ListedColormap([scale.colour(f) for f in steps])
     bar = figure.colorbar(
-        ScalarMappable(Normalize(0, scale.top_mn), colours),
+        ScalarMappable(Normalize(0, scale.top), colours),
         cax=figure.add_axes(place),
         orientation="horizontal",
         extend="max",
     )
-    bar.set_ticks([0, scale.top_mn / 2, scale.top_mn])
-    bar.set_ticklabels(["0", f"{scale.top_mn / 2:g}", f"{scale.top_mn:g} mN"])
+    bar.set_ticks([0, scale.top / 2, scale.top])
+    bar.set_ticklabels(["0", f"{scale.top / 2:g}", f"{scale.top:g} {scale.unit}"])
     bar.outline.set_visible(False)
     bar.ax.tick_params(labelsize=9.5, length=0, colors=QUIET)
 

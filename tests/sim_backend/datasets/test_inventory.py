@@ -33,7 +33,8 @@ def test_misses_failures_and_skipped_objects_are_counted(folder: Path) -> None:
     counts = tally(folder, ["a", "b", "c"], 2)
     assert counts == Tally(sweeps=4, misses=1, unstable=1, saturated=2, skipped=1)
     assert counts.shortcomings == (
-        "1 miss the array (larger `size_mm`, less `distance_mm`), 2 exceed the sensor's `range`, "
+        "1 miss the array (larger `size_mm`, less `distance_mm`, other `height_mm`), "
+        "2 exceed the sensor's `range` (more `distance_mm`), "
         "1 could not be simulated, 1 objects are left out (skipped.json says why)"
     )
     assert tally(folder, ["b"], 2).misses == 0

@@ -205,6 +205,7 @@ function show() {
     `${elements.length} elements × ${channels.length} channels, ${+rate_hz.toPrecision(4)} Hz, frame ${frame}`;
   element = Math.min(element, elements.length - 1);
   options($("element"), [...elements], elements[element]);
+  $("map-title").textContent = `${quantity(array, groups(array)[0])} at each element`;
   $("arrow-legend").hidden = across(array) === null;
   const cards = groups(array).map((group, k) => {
     const title = make("h3");
@@ -235,7 +236,7 @@ function groups(array) {
 }
 
 function quantity(array, group) {
-  const words = { N: "Force", "N m": "Torque", T: "Field", rad: "Angle", K: "Temperature" };
+  const words = { N: "Force", "N m": "Torque", T: "Field", Pa: "Pressure", rad: "Angle", K: "Temperature" };
   return words[array.units[group[0]]] || "Value";
 }
 
