@@ -47,7 +47,7 @@ class Tally:
             "`height_mm`)": self.misses,
             f"{self.saturated} exceed the sensor's `range` (more `distance_mm`)": self.saturated,
             f"{self.unstable} could not be simulated": self.unstable,
-            f"{self.wedged} leave no room for a whisker": self.wedged,
+            f"{self.wedged} leave no room for a whisker (more `distance_mm`)": self.wedged,
             f"{self.skipped} objects are left out ({SKIPPED} says why)": self.skipped,
         }
         return ", ".join(text for text, count in told.items() if count)

@@ -51,5 +51,6 @@ def write_contact_sheet(
             axes.view_init(elev=24, azim=-154)
             axes.quiver(*solid.bounds[1], 0, -solid.extents[1] / 2, 0, color="tab:red")
             axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+            axes.locator_params(nbins=4)
         axes.set(aspect="equal")
     write_whole(out, lambda file: figure.savefig(file, format="png"))
