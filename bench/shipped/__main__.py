@@ -30,7 +30,7 @@ from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
 
 UPRIGHT = Path(__file__).parent / "recipes" / "upright24.toml"
 SPLITS = ("train", "validation", OUTLIERS)
-GOING_ON = ("--recipe", "sharpen", "--set", "names=0.5", "--set", "identity=0.3")
+GOING_ON = ("--recipe", "sharpen", "--epochs", "20", "--set", "names=0.5", "--set", "identity=0.3")
 
 
 def main() -> int:

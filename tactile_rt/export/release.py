@@ -59,6 +59,7 @@ TEMPERATURES = np.geomspace(0.25, 4.0, 81)
 COVERAGE = 0.9
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
 LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
+ENOUGH = 20  # objects of a class, of which half set a quantile of 90 %
 FEWEST = 50  # objects below which there is no rule: nearly all classes would be in each set
 USUAL = 0.9  # the share of sweeps that are no worse than what is usual at a step
 SMALLEST = 0.05  # what is usual, at least: where nearly all sweeps are right, it would be nothing
@@ -252,16 +253,16 @@ def fit_names(
     With few objects of a class, all of its kinds are in the set.
 
     Args:
-        sets: labelled sweeps that the model has not learnt from, as groups of which each is to
-            have the coverage.
+        sets: labelled sweeps that the model has not learnt from. Each that has `ENOUGH` objects of
+            a class is to have the coverage there; the others have it together.
         run: (samples, offset, sigma) of windows to (batch, step, name) logits.
         kinds: those that it tells apart, by class.
     """
     rules: dict[str, tuple[PredictionSetRule, ...]] = {}
     for bound, ends in NOISE.items():
-        groups: dict[str, list[tuple[Any, ...]]] = {}
-        for one in sets:
-            drawn: dict[str, list[tuple[Floats, Labels, Names]]] = {}
+        groups: dict[str, dict[int, list[Any]]] = {}  # by class and set; 0: those of few objects
+        for number, one in enumerate(sets, start=1):
+            drawn: dict[str, list[Any]] = {}
             for level in ends:
                 windows = cut_windows(one, disturbance=Disturbance(noise=level))
                 logits, found = run_over(windows, run)
@@ -271,10 +272,14 @@ def fit_names(
                         part = posteriors, labels, one.sweeps.objects[at]
                         drawn.setdefault(name, []).append(part)
             for name, parts in drawn.items():
-                together = map(np.concatenate, zip(*parts, strict=True))
-                groups.setdefault(name, []).append(tuple(together))
+                objects = {one for *_, names in parts for one in names.tolist()}
+                group = number if len(objects) >= ENOUGH else 0
+                groups.setdefault(name, {}).setdefault(group, []).extend(parts)
         for name, several in groups.items():
-            rule = fit_prediction_sets(several, bound, fewest=1)
+            joint: list[Any] = [
+                tuple(map(np.concatenate, zip(*parts, strict=True))) for parts in several.values()
+            ]
+            rule = fit_prediction_sets(joint, bound, fewest=1)
             assert rule is not None
             rules[name] = (*rules.get(name, ()), rule)
     return rules
