@@ -17,8 +17,8 @@ from tactile_rt.classifier import trial
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.classifier.trial import TrialLimits, try_model
 from tactile_rt.core.errors import ModelError
-from tests.helpers.hostile_models import BURNERS, GREEDY, UNSOUND, write_burdened
-from tests.helpers.tiny_model import write_model
+from tests.helpers.hostile_models import BURNERS, GREEDY, SHAPED, UNSOUND, write_burdened
+from tests.helpers.tiny_model import GRAPH, write_model
 from tests.helpers.waiting import PATIENCE_S, until
 
 LARGEST_CHILD = 400_000_000  # bytes: onnxruntime, Python, and what a trial may take
@@ -80,6 +80,24 @@ def test_one_that_is_not_sound_is_refused_for_what_it_is(name: str, tmp_path: Pa
     UNSOUND[name](tmp_path / "m.onnx")
     with pytest.raises(ModelError, match="is not a readable ONNX model"):
         try_model(tmp_path / "m.onnx")
+
+
+@pytest.mark.parametrize("name", SHAPED)
+def test_one_that_makes_a_shape_of_what_is_measured_is_refused(name: str, tmp_path: Path) -> None:
+    """A trial cannot make every touch, so what it needs must not follow the touch."""
+    with pytest.raises(ModelError, match=f"operator '{name}' makes a shape of what is measured"):
+        try_model(write_burdened(tmp_path / "m.onnx", SHAPED[name]))
+
+
+@pytest.mark.parametrize(("smallest", "of"), [(0.05, "a touch"), (5.0, "the largest loads")])
+def test_one_whose_answer_is_no_number_is_refused(smallest: float, of: str, tmp_path: Path) -> None:
+    """At rest it answers, so that nobody would notice before the first touch."""
+    sick = "far = Abs(last)\n room = Sub(limit, far)\n zero = Sqrt(room)"
+    graph = GRAPH.replace("zero = Sub(last, last)", sick)
+    graph = graph.replace("float none = {0}", f"float none = {{0}}, float limit = {{{smallest}}}")
+    file = write_model(tmp_path / "m.onnx", graph)
+    with pytest.raises(ModelError, match=f"refused: its answer to {of} is no number$"):
+        try_model(file)
 
 
 def test_a_large_file_may_take_more(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from tests.helpers.tiny_model import write_model
 
-__all__ = ["BURNERS", "GREEDY", "UNSOUND", "write_burdened"]
+__all__ = ["BURNERS", "GREEDY", "SHAPED", "UNSOUND", "write_burdened"]
 
 Burden = Callable[[list[onnx.NodeProto], list[onnx.TensorProto]], str]
 
@@ -96,6 +96,35 @@ def _range(nodes, tensors):  # type: ignore[no-untyped-def]
     return _most(nodes, "long_32")
 
 
+def _non_zero(nodes, tensors):  # type: ignore[no-untyped-def]
+    """What its output is as large as is not known, and then no shape of it is."""
+    nodes.append(helper.make_node("NonZero", ["samples"], ["touched"]))
+    nodes.append(helper.make_node("Shape", ["touched"], ["many"]))
+    nodes.append(helper.make_node("ConstantOfShape", ["many"], ["filled"]))
+    return _most(nodes, "filled")
+
+
+def _slice_in_a_scan(nodes, tensors):  # type: ignore[no-untyped-def]
+    """Hidden in a graph within the graph, which takes it from one turn to the next."""
+    body = helper.make_graph(
+        [helper.make_node("Cast", ["ends"], ["stop"], to=TensorProto.INT64),
+         helper.make_node("Slice", ["row", "first", "stop"], ["some"]),
+         helper.make_node("ReduceMax", ["some"], ["most"], keepdims=0),
+         helper.make_node("ReduceMax", ["samples"], ["ends_next"], keepdims=0)], "body",
+        [helper.make_tensor_value_info("ends", TensorProto.FLOAT, [1]),
+         helper.make_tensor_value_info("row", TensorProto.FLOAT, None)],
+        [helper.make_tensor_value_info("ends_next", TensorProto.FLOAT, [1]),
+         helper.make_tensor_value_info("most", TensorProto.FLOAT, None)],
+    )  # fmt: skip
+    tensors.append(numpy_helper.from_array(np.zeros(1, np.int64), "first"))
+    tensors.append(numpy_helper.from_array(np.zeros(1, np.float32), "none_yet"))
+    tensors.append(numpy_helper.from_array(np.zeros((2, 9), np.float32), "rows"))
+    nodes.append(
+        helper.make_node("Scan", ["none_yet", "rows"], ["", "scan"], body=body, num_scan_inputs=1)
+    )
+    return _most(nodes, "scan")
+
+
 def _doubling(nodes, tensors):  # type: ignore[no-untyped-def]
     """Forty times twice as long."""
     tensors.append(numpy_helper.from_array(np.array([1], np.int64), "single"))
@@ -141,12 +170,17 @@ def _products(count: int, wide: int, live: bool) -> Burden:
 GREEDY: dict[str, Burden] = {
     "outer_product_40_GB": _outer_product(100_000),
     "outer_product_1.3_GB": _outer_product(18_000),
-    "constant_of_shape_160_GB": _constant_of_shape,
-    "expand_160_GB": _expand,
-    "tile_3.6_GB": _tile,
-    "range_80_GB": _range,
     "doubling": _doubling,
     "kept_2_GB": _kept,
+}
+# They ask for as much as what is measured says: of a trial for little, of a touch for all there is.
+SHAPED: dict[str, Burden] = {
+    "ConstantOfShape": _constant_of_shape,
+    "Expand": _expand,
+    "Tile": _tile,
+    "Range": _range,
+    "NonZero": _non_zero,
+    "Slice": _slice_in_a_scan,
 }
 # They take longer than they may.
 BURNERS: dict[str, Burden] = {
