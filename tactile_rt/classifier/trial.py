@@ -76,6 +76,7 @@ class _Task(msgspec.Struct, frozen=True):
     path: str
     every: int  # of windows that slide; 0: none does
     limits: TrialLimits
+    parent: int = 0  # the process that waits for it; 0: whoever it is
 
 
 class _Refusal(msgspec.Struct, frozen=True):
@@ -100,7 +101,7 @@ def try_model(
         ModelError: one line: what is wrong with the file, or which limit it broke.
     """
     limits = limits or TrialLimits()
-    task = _Task(str(path), every, limits)
+    task = _Task(str(path), every, limits, os.getpid())
     child = subprocess.Popen(
         [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL, close_fds=True,
@@ -233,6 +234,8 @@ def _main() -> int:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of who presses Ctrl-C: the parent decides
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=_Task)
+    if task.parent not in (0, os.getppid()):  # it died before it was said whom to die with
+        return 1
     os.nice(5)  # what is under way comes first
     try:
         result: Trial | _Refusal = _run(task)

@@ -30,6 +30,7 @@ __all__ = ["ModelPart"]
 MODEL_BYTES = 64 << 20
 WAKE_S, LOOK_S = 0.25, 0.02
 LONGEST_S = 10.0  # a touch that lasts longer does not keep a new model waiting
+STOP_SHARE = 0.35  # of the time in which all parts are to end
 BEGINNING_NS = 60 * NS_PER_S  # more than waits for a model that is still being loaded
 
 
@@ -54,7 +55,7 @@ class ModelPart(Part):
         self._wanted: deque[ModelConfig] = deque()  # what is to take the place of this one
         self._next: Admission | None = None
         self._ready_at = 0.0
-        self._until = math.inf  # once it is to end: so long a model is waited for
+        self._until = math.inf  # once it is to end: so long it still decides about what waits
         self.refused = ""  # why the newest one that was to do so did not
         self._half_ns = 0  # half the resampler's kernel
         self._deadline_ns = 0
@@ -91,6 +92,7 @@ class ModelPart(Part):
         )  # fmt: skip
 
     def stop(self) -> None:
+        self._until = min(self._until, time.monotonic() + STOP_SHARE * self.limits.stop_s)
         super().stop()
         self.box.close()
 
@@ -118,10 +120,16 @@ class ModelPart(Part):
                 self._look_after(bool(items))
             finally:
                 self._busy_ns = 0
+            if time.monotonic() > self._until:
+                why = "it was to end, and so far behind that it has not decided about all"
+                self._report(self.name, "cut short", why, "warning")
+                return
 
     def _release(self) -> None:
         self.box.taking = False
         self._classifier = None
+        if self._next is not None and self._stop.is_set():
+            self._next.give_up()  # else the process would wait for it
         self._touch(False, time.monotonic_ns())
 
     def _mended(self) -> bool:
@@ -169,9 +177,9 @@ class ModelPart(Part):
             return None
         admission = self._admit(self.config, opened)
         while not admission.finished.wait(LOOK_S):
-            if self._stop.is_set():  # what waits is still to be decided about, if there is time
-                self._until = min(self._until, time.monotonic() + self.limits.stop_s / 4)
-            if time.monotonic() > self._until:
+            # what waits of a recording is still to be decided about
+            live = opened is None or opened.stream.live
+            if time.monotonic() > self._until or (self._stop.is_set() and live):
                 admission.give_up()
                 return None
         if admission.error is not None:
@@ -287,6 +295,8 @@ class ModelPart(Part):
         frame = opened.spec.frame
         for decision in classifier.decide(chunk):
             self._tell(decision, run, opened, offset)
+            if time.monotonic() > self._until:
+                return
         if self._next is not None and self._next.classifier is not None:
             self._prepare(self._next.classifier, classifier, chunk)
         self._last_ns = newest

@@ -29,7 +29,7 @@ __all__ = ["ExitCode", "leave", "note_signals", "run_daemon"]
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
 TURN_S = 0.25  # how often the main loop tells that it goes on
-LOADED_S = 5.0  # for it to end by itself
+LOADED_S = 0.5  # for a model to be loaded, or given up
 SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
 
 Calls = SimpleQueue[int]  # what a signal handler may put into

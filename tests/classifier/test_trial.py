@@ -142,6 +142,13 @@ def test_a_trial_dies_with_whoever_started_it(tmp_path: Path) -> None:
     until(lambda: not Path(f"/proc/{child}").exists())
 
 
+def test_a_child_whose_parent_had_died_before_it_could_say_so_tries_nothing() -> None:
+    task = {"path": "m.onnx", "every": 0, "limits": {}, "parent": 1}
+    child = [sys.executable, "-m", trial.__name__]
+    done = subprocess.run(child, input=json.dumps(task).encode(), stdout=subprocess.PIPE)
+    assert done.returncode == 1 and not done.stdout
+
+
 LIMITED = """
 import os, resource, sys
 import tactile_rt.classifier.model_file as model_file
