@@ -16,7 +16,7 @@ from pathlib import Path
 from bench.daemon.disturbed import DisturbedDaemon
 from bench.daemon.overload import slow_down
 from bench.daemon.process import free_port
-from tests.helpers.hostile_models import GREEDY, write_burdened
+from tests.helpers.hostile_models import GREEDY, no_number, write_burdened
 
 STUCK_AT_S = 0.3
 DISK_MB, SPARE_MB = 96, 24  # of the recordings' file system; that must be free
@@ -358,6 +358,17 @@ def _greedy_model(scene: FaultScene) -> Iterator[float]:
     scene.await_told(since, "model.whiskers", "admitted")
 
 
+def _model_without_numbers(scene: FaultScene) -> Iterator[float]:
+    since, file, good = scene.mark(), scene.folder / "numberless.onnx", scene.folder / "good.onnx"
+    good.write_bytes(scene.good_model)
+    scene.put_model(write_burdened(file, no_number, good).read_bytes())
+    # what it answers is seen when something is touched
+    yield scene.await_told(since, "model.whiskers", "admitted").t_ns / 1e9 + 2.0
+    since = scene.mark()
+    scene.put_model(scene.good_model)
+    scene.await_told(since, "model.whiskers", "admitted")
+
+
 def _slow_model(scene: FaultScene) -> Iterator[float]:
     slow = scene.folder / "slow.onnx"
     if not slow.exists():
@@ -464,6 +475,9 @@ KINDS: dict[str, FaultKind] = {
     ),
     "model_is_garbage": FaultKind(_garbage_model, (("daemon", "old configuration"),)),
     "model_is_greedy": FaultKind(_greedy_model, (("model.whiskers", "old model"),)),
+    "model_without_numbers": FaultKind(
+        _model_without_numbers, (("model.whiskers", "no decisions"),)
+    ),
     "model_is_slow": FaultKind(
         _slow_model, (("model.whiskers", "missing decisions"),),
         (("model.whiskers", "late decisions"),),

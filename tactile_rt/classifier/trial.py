@@ -183,14 +183,15 @@ def _run(task: _Task) -> Trial:
     load_s = time.monotonic() - began
     step_s, random = 0.0, np.random.default_rng(0)
     shape = stepper.samples.shape[1:]
+    floor = np.broadcast_to(card.floor, shape[1:])
     for name, decides, count, load in _list_loads(card):
-        stepper.begin(np.zeros_like(load), np.broadcast_to(card.floor, load.shape))
+        stepper.begin(3 * floor, 2 * floor)  # some offset, and noise above the least
         began, took = time.monotonic(), []
         for k in range(count):
             if len(took) >= STEPS and time.monotonic() - began > TOUCH_S:
                 break
             grows = math.sin(math.pi * (k + 0.5) / count)
-            stepper.samples[:] = grows * load * random.uniform(0.9, 1.0, shape)
+            stepper.samples[:] = 3 * floor + grows * load * random.uniform(0.9, 1.0, shape)
             start = time.monotonic()
             logits = stepper.run()
             took.append(time.monotonic() - start)

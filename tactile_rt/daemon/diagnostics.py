@@ -163,6 +163,9 @@ def _of_model(
         return [Diagnostic(part.name, "missing decisions", why, still)]
     if model.implausible:
         return [Diagnostic(part.name, "implausible loads", IMPLAUSIBLE_LOADS, still)]
+    if model.undecided:
+        why = "its answer to the newest touch is no number: take another model"
+        return [Diagnostic(part.name, "no decisions", why, still)]
     if model.refused:
         why = f"the new one is refused: {model.refused}"
         return [Diagnostic(part.name, "old model", why, "the one before decides")]

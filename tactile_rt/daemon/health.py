@@ -136,6 +136,8 @@ class ModelState:
     refused: str = ""  # why the model that was to take the place of this one does not
     implausible: bool = False  # the newest touch has loads far beyond those that it learnt from
     object: str = ""  # enrolled one that the newest decision's touch is of, or "none of these"
+    bad_steps: int = 0  # whose answer was no number, so that there was no decision
+    undecided: bool = False  # the newest step was one of them
 
 
 @dataclass(frozen=True)

@@ -232,6 +232,7 @@ MODEL: tuple[Row, ...] = (
     ("model_skips_total", "", "Times it was behind and skipped to the newest sample.",
      lambda x, _: x.skipped),
     ("model_late_steps_total", "", "Steps that were late.", lambda x, _: x.late),
+    ("model_bad_steps_total", "", "Steps whose answer was no number.", lambda x, _: x.bad_steps),
     ("model_behind_seconds", "", "How long the oldest samples wait to be classified.",
      lambda x, _: x.behind_s),
     ("model_decision_age_seconds", "",

@@ -73,7 +73,7 @@ class ModelPart(Part):
         self._object = ""  # that the touch of the newest decision is of
         self._touching = False
         self._latency, self._step = LatencyMeter(), LatencyMeter()
-        self._skips, self._age_s = 0, 0.0
+        self._skips, self._age_s, self._bad_steps = 0, 0.0, 0
         self._skipped, self._losses = LossWindow(), LossWindow()
 
     @property
@@ -89,6 +89,7 @@ class ModelPart(Part):
             1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
             self.refused, classifier is not None and classifier.implausible, self._object,
+            self._bad_steps, classifier is not None and classifier.undecided,
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -302,6 +303,7 @@ class ModelPart(Part):
         self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples
+        self._bad_steps += classifier.stats.bad_steps - before.bad_steps
         self._skips += len(classifier.skips.found)
         for skip in classifier.skips.found:
             self._hub.post(

@@ -101,6 +101,7 @@ def test_what_is_no_fault_of_a_source_is_not_told(changes):
         ({"skips": Losses(1, 1)}, "missing decisions: model.a: it cannot keep up"),
         ({"lost": Losses(9, 9)}, "missing decisions: model.a: it was too slow"),
         ({"implausible": True}, "implausible loads: model.a: loads are far beyond those"),
+        ({"undecided": True}, "no decisions: model.a: its answer to the newest touch is no number"),
         ({"part": part("model.a", "waiting", "no file")}, "no decisions: model.a fails: no file"),
         (
             {"part": part("model.a", "starting", "no file", 1)},
