@@ -157,7 +157,8 @@ from tactile_rt.core.errors import ModelError
 
 def load_model(path, *others):
     kinds = resource.RLIMIT_CPU, resource.RLIMIT_CORE, resource.RLIMIT_DATA
-    raise ModelError(f"{[resource.getrlimit(k) for k in kinds]}, {os.nice(0)}")
+    score = open("/proc/self/oom_score_adj").read().strip()
+    raise ModelError(f"{[resource.getrlimit(k) for k in kinds]}, {os.nice(0)}, {score}")
 
 model_file.load_model = load_model
 sys.exit(trial._main())
@@ -165,7 +166,8 @@ sys.exit(trial._main())
 
 
 def limits_of(path: Path) -> list:
-    """What the child of a trial may: processor time, core file, memory; and its niceness."""
+    """What the child of a trial may: processor time, core file, memory; niceness, and its turn to
+    go where memory runs out."""
     task = {"path": str(path), "every": 0, "limits": {"memory_mb": 300.0, "seconds": 7.0}}
     done = subprocess.run(
         [sys.executable, "-c", LIMITED], input=json.dumps(task), capture_output=True, text=True,
@@ -178,8 +180,9 @@ def test_the_child_limits_itself_before_it_loads(tmp_path: Path) -> None:
     small, large = tmp_path / "small.onnx", tmp_path / "large.onnx"
     small.write_bytes(b"x")
     large.write_bytes(bytes(50_000_000))
-    (cpu, core, data), nice = limits_of(small)
-    (_, _, more), _ = limits_of(large)
+    (cpu, core, data), nice, score = limits_of(small)
+    (_, _, more), *_ = limits_of(large)
+    assert score == 1000
     assert cpu == (9, 10) and core == (0, 0) and nice >= 5
     assert data[0] == data[1] > 300e6
     assert more[0] - data[0] == pytest.approx(200e6, abs=20e6)  # four times the file
