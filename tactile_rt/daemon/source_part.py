@@ -70,10 +70,10 @@ class Acquisition:
         """
         lent = _Lent(source, take, wanted)
         with self._lock:
-            self._new.append(lent)
-            if not self._running:
-                self._running = True
+            if not self._running:  # a start that fails is tried again with the source
                 threading.Thread(target=self._run, name="tactile-rt lines", daemon=True).start()
+                self._running = True
+            self._new.append(lent)
         self._reader.wake()
         lent.over.wait()
         if lent.error is not None:
