@@ -338,6 +338,16 @@ def _garbage_configuration(scene: FaultScene) -> Iterator[float]:
     scene.configure()
 
 
+def _pipe_configuration(scene: FaultScene) -> Iterator[float]:
+    since = scene.mark()
+    scene.daemon.path.unlink()
+    os.mkfifo(scene.daemon.path)
+    scene.daemon.reload()
+    yield scene.await_told(since, "daemon", "refused").t_ns / 1e9
+    scene.daemon.path.unlink()
+    scene.configure()
+
+
 def _garbage_model(scene: FaultScene) -> Iterator[float]:
     scene.put_model(b"no model\n" * 1000)
     yield time.monotonic()
@@ -472,6 +482,9 @@ KINDS: dict[str, FaultKind] = {
     "log_cannot_be_written": FaultKind(_log_full, (("log", "no log"),)),
     "configuration_is_garbage": FaultKind(
         _garbage_configuration, (("daemon", "old configuration"),)
+    ),
+    "configuration_is_a_pipe": FaultKind(
+        _pipe_configuration, (("daemon", "old configuration"),)
     ),
     "model_is_garbage": FaultKind(_garbage_model, (("daemon", "old configuration"),)),
     "model_is_greedy": FaultKind(_greedy_model, (("model.whiskers", "old model"),)),
