@@ -47,11 +47,6 @@ def test_the_shipped_model_says_what_it_needs() -> None:
     assert 0 < found.step_s < 0.045 and 0 < found.load_s < PROMPT_S and 0 < found.memory_mb < 256
 
 
-def test_lanes_of_windows_that_slide_are_tried_together() -> None:
-    one, six = try_model(shipped_model()), try_model(shipped_model(), every=4)
-    assert six.memory_mb > 0.5 * one.memory_mb and six.sha256 == one.sha256
-
-
 @pytest.mark.parametrize("name", GREEDY)
 def test_one_that_wants_more_memory_than_it_may_is_refused(name: str, tmp_path: Path) -> None:
     file = write_burdened(tmp_path / "m.onnx", GREEDY[name])
@@ -106,14 +101,6 @@ def test_a_large_file_may_take_more(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"limits\.model_mb = 16 MB"):
         try_model(write_burdened(tmp_path / "m.onnx", GREEDY["kept_2_GB"]), limits)
     assert try_model(write_model(tmp_path / "tiny.onnx"), limits).memory_mb < 16
-
-
-def test_nobody_waits_for_a_trial_that_nobody_wants(tmp_path: Path) -> None:
-    file = write_burdened(tmp_path / "m.onnx", BURNERS["chained_products"])
-    began = time.monotonic()
-    with pytest.raises(ModelError, match="nobody waits"):
-        try_model(file, stopped=lambda: time.monotonic() - began > 0.3)
-    assert time.monotonic() - began < PROMPT_S
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")
@@ -186,28 +173,3 @@ def test_the_child_limits_itself_before_it_loads(tmp_path: Path) -> None:
     assert cpu == (9, 10) and core == (0, 0) and nice >= 5
     assert data[0] == data[1] > 300e6
     assert more[0] - data[0] == pytest.approx(200e6, abs=20e6)  # four times the file
-
-
-TOLD = b'{"sha256": "ab", "load_s": 1.0, "step_s": 0.1, "memory_mb": 2.0}'
-
-
-@pytest.mark.parametrize(
-    "code, said, why",
-    [
-        (-signal.SIGXCPU, b"", r"more than limits.model_s = 60 s of the processor"),
-        (-signal.SIGKILL, b"", "needs more memory than limits.model_mb = 256 MB"),
-        (77, b"", "needs more memory"),
-        (3, TOLD, "its trial ended with exit code 3"),
-        (0, b"{}", "its trial ended with exit code 0"),
-        (0, b"no JSON", "its trial ended with exit code 0"),
-        (0, b'{"refused": "for a reason"}', "for a reason"),
-    ],
-)
-def test_how_a_trial_ended_is_told(code: int, said: bytes, why: str) -> None:
-    with pytest.raises(ModelError, match=why):
-        trial._result(Path("a.onnx"), TrialLimits(), code, said)
-
-
-def test_a_trial_that_went_well() -> None:
-    found = trial._result(Path("a.onnx"), TrialLimits(), 0, TOLD)
-    assert (found.sha256, found.load_s, found.step_s, found.memory_mb) == ("ab", 1.0, 0.1, 2.0)

@@ -41,15 +41,6 @@ def _most(nodes: list[onnx.NodeProto], name: str) -> str:
     return f"{name}_most"
 
 
-def _size(nodes: list[onnx.NodeProto], tensors: list[onnx.TensorProto], *sizes: int) -> str:
-    """A shape that is computed of an input, and so unknown until the graph runs."""
-    tensors.append(numpy_helper.from_array(np.array(sizes, np.float32), "sizes"))
-    nodes.append(helper.make_node("Mul", ["live", "nothing"], ["live_nothing"]))
-    nodes.append(helper.make_node("Add", ["sizes", "live_nothing"], ["sizes_live"]))
-    nodes.append(helper.make_node("Cast", ["sizes_live"], ["shape"], to=TensorProto.INT64))
-    return "shape"
-
-
 def _outer_product(size: int) -> Burden:
     def burden(nodes, tensors):  # type: ignore[no-untyped-def]
         tensors.append(numpy_helper.from_array(np.ones((size, 1), np.float32), "tall"))
@@ -61,39 +52,12 @@ def _outer_product(size: int) -> Burden:
     return burden
 
 
-def _constant_of_shape(nodes, tensors):  # type: ignore[no-untyped-def]
-    nodes.append(
-        helper.make_node("ConstantOfShape", [_size(nodes, tensors, 200_000, 200_000)], ["filled"])
-    )
-    return _most(nodes, "filled")
-
-
 def _expand(nodes, tensors):  # type: ignore[no-untyped-def]
-    nodes.append(
-        helper.make_node("Expand", ["live", _size(nodes, tensors, 200_000, 200_000)], ["wide"])
-    )
+    nodes.append(helper.make_node("Cast", ["live"], ["size"], to=TensorProto.INT64))
+    tensors.append(numpy_helper.from_array(np.array([1], np.int64), "single"))
+    nodes.append(helper.make_node("Reshape", ["size", "single"], ["shape"]))
+    nodes.append(helper.make_node("Expand", ["live", "shape"], ["wide"]))
     return _most(nodes, "wide")
-
-
-def _tile(nodes, tensors):  # type: ignore[no-untyped-def]
-    tensors.append(numpy_helper.from_array(np.array([1, 1], np.int64), "square"))
-    nodes.append(helper.make_node("Reshape", ["live", "square"], ["cell"]))
-    nodes.append(
-        helper.make_node("Tile", ["cell", _size(nodes, tensors, 30_000, 30_000)], ["tiled"])
-    )
-    return _most(nodes, "tiled")
-
-
-def _range(nodes, tensors):  # type: ignore[no-untyped-def]
-    tensors.append(numpy_helper.from_array(np.array(1e10, np.float64), "far"))
-    tensors.append(numpy_helper.from_array(np.array(0, np.int64), "start"))
-    tensors.append(numpy_helper.from_array(np.array(1, np.int64), "by"))
-    nodes.append(helper.make_node("Cast", ["live"], ["live_64"], to=TensorProto.DOUBLE))
-    nodes.append(helper.make_node("Add", ["far", "live_64"], ["far_live"]))
-    nodes.append(helper.make_node("Cast", ["far_live"], ["stop"], to=TensorProto.INT64))
-    nodes.append(helper.make_node("Range", ["start", "stop", "by"], ["long"]))
-    nodes.append(helper.make_node("Cast", ["long"], ["long_32"], to=TensorProto.FLOAT))
-    return _most(nodes, "long_32")
 
 
 def _non_zero(nodes, tensors):  # type: ignore[no-untyped-def]
@@ -191,10 +155,7 @@ GREEDY: dict[str, Burden] = {
 }
 # They ask for as much as what is measured says: of a trial for little, of a touch for all there is.
 SHAPED: dict[str, Burden] = {
-    "ConstantOfShape": _constant_of_shape,
     "Expand": _expand,
-    "Tile": _tile,
-    "Range": _range,
     "NonZero": _non_zero,
     "Slice": _slice_in_a_scan,
 }
