@@ -187,7 +187,8 @@ def _run(task: _Task) -> Trial:
     floor = np.broadcast_to(card.floor, shape[1:])
     for name, decides, count, load in _list_loads(card):
         stepper.begin(3 * floor, 2 * floor)  # some offset, and noise above the least
-        began, took = time.monotonic(), []
+        began = time.monotonic()
+        took: list[float] = []
         for k in range(count):
             if len(took) >= STEPS and time.monotonic() - began > TOUCH_S:
                 break
