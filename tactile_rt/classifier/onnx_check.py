@@ -208,9 +208,10 @@ class _Walk:
         return self.found
 
     def check_shapes(self) -> None:
-        """Refuse shapes that follow the values of the graph's inputs: no trial could try them all.
+        """Refuse shapes that follow the values of the graph's inputs.
 
-        Nodes may stand in any order, and names of a graph within a graph count as everybody's."""
+        No trial could try them all. Nodes may stand in any order, and names of a graph within a
+        graph count as everybody's."""
         readers: dict[str, list[int]] = {}
         for i, (operator, inputs, _) in enumerate(self.nodes):
             if operator not in ("Shape", "Size"):  # what they read is the same whatever is touched

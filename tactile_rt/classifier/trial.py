@@ -204,8 +204,10 @@ def _run(task: _Task) -> Trial:
 
 
 def _list_loads(card: "ModelCard") -> list[tuple[str, bool, int, "NDArray[np.float64]"]]:
-    """List what a model is tried on: a name, whether it must decide on it, steps, and the load
-    (element, channel), SI. The touch is made up from the card's loads."""
+    """List what a model is tried on.
+
+    Each is a name, whether it must decide on it, steps, and the load (element, channel), SI. The
+    touch is made up from the card's loads."""
     import numpy as np
 
     from tactile_rt.classifier.classifier import ABSURD, IMPLAUSIBLE

@@ -151,8 +151,9 @@ def _serve(
 
 
 class _Reload(threading.Thread):
-    """Reads the configuration again, in a thread of its own: whatever it takes, signals are obeyed
-    meanwhile, and another one may take its place."""
+    """Reads the configuration again, in a thread of its own.
+
+    Whatever it takes, signals are obeyed meanwhile; another one may take its place."""
 
     def __init__(self, daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
         super().__init__(name="tactile-rt reload", daemon=True)
@@ -163,7 +164,7 @@ class _Reload(threading.Thread):
         self.late = False
 
     def hangs(self) -> bool:
-        """Whether it takes too long to read; once."""
+        """Tell, once, that it takes too long to read."""
         before, self.late = self.late, not self._read and time.monotonic() > self._read_by
         return self.late and not before
 
