@@ -131,6 +131,7 @@ class LoopedSource(Source):
     """
 
     live = False
+    every = 1  # of so many samples one is measured
 
     def __init__(
         self, spec: ArraySpec, signal: NDArray[np.float32], samples: int | None = None
@@ -148,6 +149,7 @@ class LoopedSource(Source):
         seq = self._sent + np.arange(n, dtype=np.int64)
         self._sent, self._left = self._sent + n, self._left - n
         t_ns = np.round(seq * (NS_PER_S / self.spec.rate_hz)).astype(np.int64)
+        seq, t_ns = seq[:: self.every], t_ns[:: self.every]
         values = self._loop[seq % len(self._loop)]
         return Chunk(seq, t_ns, values, np.ones(values.shape[:2], np.bool_))
 
@@ -201,7 +203,8 @@ class EmulatedArray(EmulatedDevice):
 
     Attributes:
         mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
-            same values again and again; ``no_number``: NaN; ``gaps``, ``corrupt``: every twentieth
+            same values again and again; ``no_number``: NaN; ``slow``: at half its rate;
+            ``gaps``, ``corrupt``: every twentieth
             sample is missing, or damaged.
     """
 
@@ -244,6 +247,7 @@ class EmulatedArray(EmulatedDevice):
     def _felt(self, chunk: Chunk) -> Chunk:
         """What the array's mood makes of what it feels."""
         values = chunk.values
+        self._source.every = 2 if self.mood == "slow" else 1
         if self.mood == "stuck":
             values = np.broadcast_to(self._last, values.shape).copy()
         elif self.mood == "no_number":

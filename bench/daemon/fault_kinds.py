@@ -418,6 +418,10 @@ KINDS: dict[str, FaultKind] = {
         _mood("whiskers", "stuck", STUCK_AT_S + 0.064), (("source.whiskers", "stuck-at fault"),)
     ),
     "coarse_sensor_at_rest": FaultKind(_mood("finger", "stuck")),
+    "device_slow": FaultKind(  # two seconds are given to see it
+        _mood("whiskers", "slow", 1.0 + 0.064), (("source.whiskers", "slow"),)
+    ),
+    "can_device_slow": FaultKind(_mood("finger", "slow", 1.0 + 0.5), (("source.finger", "slow"),)),
     "no_numbers": FaultKind(
         _mood("whiskers", "no_number", 0.064), (("source.whiskers", "bad samples"),)
     ),

@@ -212,6 +212,8 @@ SOURCE: tuple[Row, ...] = (
     ("source_duplicate_samples_total", "", "Samples that came twice, taken once.",
      lambda x, _: x.stats.duplicates),
     ("source_rate_hertz", "", "Nominal sample rate.", lambda x, _: x.rate_hz),
+    ("source_measured_rate_hertz", "", "Rate of the newest second, with what was lost.",
+     lambda x, _: x.measured_hz or None),
     ("source_newest_sample_age_seconds", "", "Since the newest sample was taken.",
      lambda x, now: _since(x.newest_ns, now)),
     ("source_bad_samples_total", "", "Samples of an element that were no number.",

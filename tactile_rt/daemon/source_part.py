@@ -26,6 +26,7 @@ from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.rate_meter import RateMeter
 from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
@@ -128,6 +129,7 @@ class SourcePart(Part):
         self._samples = self._newest_ns = self._read_ns = self._flowing_ns = self._bad = 0
         self._stuck_at = StuckAtDetector()
         self._losses, self._bads = LossWindow(), LossWindow()
+        self._rate = RateMeter()
         self._offset_ns = 0
         self._look_ns = self._pause_ns = 0
         self._told: tuple[Any, ...] = ()
@@ -150,10 +152,13 @@ class SourcePart(Part):
         )  # fmt: skip
         if spec is None:
             return about
+        silent_s = (time.monotonic_ns() - self._read_ns) / NS_PER_S
+        measured_hz, slow = self._rate.judge(spec.rate_hz, silent_s)
         return dataclasses.replace(
             about, array=spec.name, frame=spec.frame, rate_hz=spec.rate_hz,
             elements=spec.elements, channels=spec.channels, units=spec.units,
             stuck=tuple(spec.elements[k] for k in self._stuck_at.elements),
+            measured_hz=measured_hz, slow=slow,
         )  # fmt: skip
 
     @property
@@ -234,6 +239,8 @@ class SourcePart(Part):
         useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
         self._stuck_at.add(good)
+        if self._device is not None:
+            self._rate.add(*self._device.measured)
         self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
         if not stream.live:
             self._await_room()
@@ -247,6 +254,7 @@ class SourcePart(Part):
         finally:
             self._before = _sum(self._before, stream.stats)
             self._told = ()
+            self._rate = RateMeter()
             self._tell_closed()
 
     def _tell_closed(self) -> None:

@@ -67,6 +67,11 @@ class Sequencer:
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
 
+    @property
+    def numbered(self) -> int:
+        """How many numbers have been given, those of gaps too."""
+        return self._next
+
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """((n,) sequence numbers, (n,) which samples to keep); the others came before.
 

@@ -73,6 +73,8 @@ class Stamper:
         clock: The clock that dates the samples; None for a device that sends neither time nor
             count.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
+        elapsed_ns: Time that the device's clock told until the newest sample, ns; of a device that
+            sends no time, host time of its arrival.
         status: Status bits of the newest sample.
     """
 
@@ -80,7 +82,8 @@ class Stamper:
         self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats, steady: bool = True
     ) -> None:
         self.spec, self._shape = spec, spec.shape
-        self.newest_ns = self.status = 0
+        self.newest_ns = self.elapsed_ns = self.status = 0
+        self._tick_ns, self._tick_wrap, self._tick = codec.tick_ns, 1 << codec.tick_bits, 0
         self._period_ns = round(NS_PER_S / spec.rate_hz)
         ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
         self.sequencer = Sequencer(codec.count_bits, stats, ticks, codec.tick_bits)
@@ -116,6 +119,11 @@ class Stamper:
         else:
             t_ns = self._steady.to_host(arrived)
         self.newest_ns = int(arrived[-1])
+        if self._tick_ns is None or ticks is None:
+            self.elapsed_ns = self.newest_ns
+        else:
+            passed, self._tick = (int(ticks[-1]) - self._tick) % self._tick_wrap, int(ticks[-1])
+            self.elapsed_ns += round(passed * self._tick_ns)
         if samples.status is not None:
             self.status = int(samples.status[-1])
         if valid.shape != values.shape[:2]:

@@ -175,6 +175,19 @@ class DeviceSource(Source):
             self.codec.stats,
         )  # fmt: skip
 
+    @property
+    def measured(self) -> tuple[int, int]:
+        """How many samples the device has measured, lost or not, and by when, ns.
+
+        Its counter counts also what did not come; without one, what came damaged counts. The time
+        is that of its own clock, so that it matters not when somebody reads; without one, the
+        host's.
+        """
+        stamper = self._stamper
+        assert stamper is not None
+        damaged = self.stats.corrupt if self.codec.count_bits is None else 0
+        return stamper.sequencer.numbered + damaged, stamper.elapsed_ns
+
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
         """Move the whiskers of an active array: protraction = offset + amplitude sin(2 pi f t).
 

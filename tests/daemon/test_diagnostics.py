@@ -67,6 +67,8 @@ def test_who_does_what_it_should_is_not_named():
          "no samples: source.a: the device is lost"),
         ({"part": part("source.a", "waiting", "no such port")},
          "no samples: source.a fails: no such port"),
+        ({"slow": True, "measured_hz": 500.0},
+         "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
         ({"stuck_at_s": 0.4}, "stuck-at fault: source.a: the values do not change at all, as no "
          "sensor's do: the device hangs"),
         ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),

@@ -95,6 +95,7 @@ def test_every_sample_is_accounted_for(kind):
         seq = np.concatenate([c.seq for c in chunks])
         lost = np.isin(fate, (Fate.DROPPED, Fate.CORRUPTED, Fate.TRUNCATED))
         assert np.array_equal(seq, np.flatnonzero(~lost))
+        assert source.measured[0] == seq[-1] + 1  # what was lost was measured
         assert np.array_equal(np.concatenate([c.values for c in chunks]), values[seq])
 
 

@@ -314,7 +314,9 @@ function figures(s, now) {
     const { corrupt, missing, dropped, delivered, duplicates } = here.stats;
     const gone = corrupt + missing + dropped;
     const rate = then ? (here.samples - then.samples) / ((s.t_ns - before.t_ns) / 1e9) : NaN;
-    tiles.push(["Samples per second", Number.isFinite(rate) ? rate.toFixed(0) : "–"]);
+    const of = here.measured_hz ? `${+here.measured_hz.toPrecision(3)} Hz measured of ` : "";
+    tiles.push(["Samples per second", Number.isFinite(rate) ? rate.toFixed(0) : "–", here.slow,
+      `${of}${+here.rate_hz.toPrecision(4)} Hz nominal`]);
     const late = here.losses.minute ? `, ${here.losses.minute} in a minute` : "";
     tiles.push(["Lost samples", `${gone} (${percent(gone, gone + delivered)})${late}`, here.losses.minute > 0,
       `missing ${missing}, corrupt ${corrupt}, dropped ${dropped}, duplicates ${duplicates}`]);
