@@ -204,7 +204,7 @@ class EmulatedArray(EmulatedDevice):
     Attributes:
         mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
             same values again and again; ``no_number``: NaN; ``slow``: at half its rate;
-            ``gaps``, ``corrupt``: every twentieth
+            ``fails``: its status says that a sensor fails; ``gaps``, ``corrupt``: every twentieth
             sample is missing, or damaged.
     """
 
@@ -248,6 +248,7 @@ class EmulatedArray(EmulatedDevice):
         """What the array's mood makes of what it feels."""
         values = chunk.values
         self._source.every = 2 if self.mood == "slow" else 1
+        self.codec.status = 2 if self.mood == "fails" else 0
         if self.mood == "stuck":
             values = np.broadcast_to(self._last, values.shape).copy()
         elif self.mood == "no_number":

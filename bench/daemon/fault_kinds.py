@@ -422,6 +422,12 @@ KINDS: dict[str, FaultKind] = {
         _mood("whiskers", "slow", 1.0 + 0.064), (("source.whiskers", "slow"),)
     ),
     "can_device_slow": FaultKind(_mood("finger", "slow", 1.0 + 0.5), (("source.finger", "slow"),)),
+    "device_fails": FaultKind(
+        _mood("whiskers", "fails", 0.064), (("source.whiskers", "device fault"),)
+    ),
+    "can_device_fails": FaultKind(
+        _mood("finger", "fails", 0.2), (("source.finger", "device fault"),)
+    ),
     "no_numbers": FaultKind(
         _mood("whiskers", "no_number", 0.064), (("source.whiskers", "bad samples"),)
     ),

@@ -140,9 +140,12 @@ def _of_source(
     if source.slow and read_s <= most and not starved:
         why = f"it measures less often than nine tenths of the {source.rate_hz:g} Hz that it has"
         found.append(Diagnostic(name, "slow", why))
+    faults = device.faults if device is not None else ()
+    if faults:
+        found.append(Diagnostic(name, "device fault", f"it says: {', '.join(faults)}"))
     if source.losses.second:
         found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))
-    if source.bad.second:
+    if source.bad.second and not faults:  # what a device says invalid as it fails is none
         why = "some values are no numbers, or absurd, or none is valid"
         found.append(Diagnostic(name, "bad samples", why))
     return found

@@ -305,11 +305,12 @@ class SourcePart(Part):
             return
         health = self._device.health
         told = (health.state, health.connections, health.clock_steps, health.counter_resets,
-                health.status)  # fmt: skip
+                health.status, health.faults)  # fmt: skip
         if told == self._told:
             return
         before, self._told = self._told, told
-        level = "info" if health.state in (State.STREAMING, State.CONNECTING) else "warning"
+        well = health.state in (State.STREAMING, State.CONNECTING) and not health.faults
+        level = "info" if well else "warning"
         self._report(self.name, f"device:{health.state}", _told(health, before), level)
 
     def _await_room(self) -> None:
@@ -333,8 +334,8 @@ def _told(health: Health, before: tuple[Any, ...]) -> str:
         said.append("its clock jumped")
     if before and health.counter_resets != before[3]:
         said.append("its counter began anew")
-    if health.status:
-        said.append(f"it says: {', '.join(health.status)}")
+    if words := tuple(dict.fromkeys((*health.faults, *health.status))):
+        said.append(f"it says: {', '.join(words)}")
     return "; ".join(said)
 
 

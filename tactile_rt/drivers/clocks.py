@@ -76,6 +76,7 @@ class Stamper:
         elapsed_ns: Time that the device's clock told until the newest sample, ns; of a device that
             sends no time, host time of its arrival.
         status: Status bits of the newest sample.
+        told_ns: When the newest sample arrived that had a bit of the status set, ns, by bit.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class Stamper:
         self.spec, self._shape = spec, spec.shape
         self.newest_ns = self.elapsed_ns = self.status = 0
         self._tick_ns, self._tick_wrap, self._tick = codec.tick_ns, 1 << codec.tick_bits, 0
+        self.told_ns: dict[int, int] = {}
         self._period_ns = round(NS_PER_S / spec.rate_hz)
         ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
         self.sequencer = Sequencer(codec.count_bits, stats, ticks, codec.tick_bits)
@@ -126,6 +128,9 @@ class Stamper:
             self.elapsed_ns += round(passed * self._tick_ns)
         if samples.status is not None:
             self.status = int(samples.status[-1])
+            if said := int(np.bitwise_or.reduce(samples.status)):
+                told = {bit: self.newest_ns for bit in range(said.bit_length()) if said >> bit & 1}
+                self.told_ns = {**self.told_ns, **told}
         if valid.shape != values.shape[:2]:
             valid = np.broadcast_to(valid, values.shape[:2])
         return Chunk(seq, t_ns, values, valid)

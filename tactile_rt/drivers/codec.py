@@ -142,6 +142,7 @@ class Codec(abc.ABC, Generic[Packet]):
         tick_ns: Length of a tick of the device's clock, ns; None for a device that sends no time.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
         status_bits: What each bit of the status means when set, by the number of the bit.
+        harmless_bits: The bits of the status that are no fault of the device: an overload, a state.
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
@@ -164,6 +165,7 @@ class Codec(abc.ABC, Generic[Packet]):
     tick_ns: float | None = None
     tick_bits: int = 32
     status_bits: ClassVar[dict[int, str]] = {}
+    harmless_bits: ClassVar[frozenset[int]] = frozenset()
     cannot_detect: ClassVar[str] = ""
     complaint = ""
     full_scale: ClassVar[tuple[float, ...] | None] = None
@@ -213,6 +215,7 @@ class Codec(abc.ABC, Generic[Packet]):
         return packet[:0]
 
     streaming = True  # the device's side: whether it sends without being asked, now
+    status = 0  # the device's side: status bits of what it sends, where the codec sends them
     polled = 0  # the device's side: samples asked for and not yet sent
     polls = False  # the host's side: whether each sample must be asked for (`Command.POLL`)
 

@@ -164,7 +164,9 @@ class DeviceSource(Source):
         if state == State.STREAMING and silent > self._stale_ns:
             state, since = State.STALE, newest + self._stale_ns
             reason = f"no sample for {silent / 1e9:.1f} s"
-        bits = self.codec.status_bits.items()
+        bits, told = self.codec.status_bits.items(), stamper.told_ns
+        recent = {bit for bit, at in told.items() if newest - at < NS_PER_S}
+        faults = recent - self.codec.harmless_bits
         return Health(
             state, since, reason, self._connections, newest,
             clock.drift_ppm if clock and self.codec.tick_ns else 0.0,
@@ -173,6 +175,7 @@ class DeviceSource(Source):
             tuple(meaning for bit, meaning in bits if status >> bit & 1),
             self._can_errors + (link.can_errors if link else 0),
             self.codec.stats,
+            tuple(meaning for bit, meaning in bits if bit in faults),
         )  # fmt: skip
 
     @property

@@ -29,6 +29,8 @@ class Health:
             device that tells no time.
         clock_steps: Number of times that the device's clock jumped or began anew.
         counter_resets: Number of times that the device's sample counter began anew.
+        status: What the device says of itself in its newest sample.
+        faults: What it said within the second before that, and is a fault.
     """
 
     state: State
@@ -42,3 +44,4 @@ class Health:
     status: tuple[str, ...] = ()
     can_errors: int = 0
     wire: WireStats = field(default_factory=WireStats)
+    faults: tuple[str, ...] = ()

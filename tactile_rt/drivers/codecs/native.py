@@ -25,6 +25,7 @@ from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_common import (
     FORMATS,
+    HARMLESS,
     IMPOSSIBLE,
     RANGE_N,
     RANGE_NM,
@@ -80,13 +81,14 @@ def frame(
     payload: bytes = b"",
     *,
     format: int = 0,
+    status: int = 0,
     seq: int = 0,
     time_us: int = 0,
     shape: tuple[int, int] = (0, 0),
 ) -> bytes:
     """One frame of the serial form."""
     head = HEADER.pack(
-        SYNC, VERSION << 4 | kind, format, len(payload), 0, seq & 0xFFFFFFFF,
+        SYNC, VERSION << 4 | kind, format, len(payload), status, seq & 0xFFFFFFFF,
         time_us & 0xFFFFFFFF, *shape, 0,
     )[:-2]  # fmt: skip
     whole = head + crc16_xmodem(head[2:]).to_bytes(2, "little") + payload
@@ -102,6 +104,7 @@ class NativeSerial(SerialCodec):
     count_bits = 32
     tick_ns = 1000.0
     status_bits = STATUS
+    harmless_bits = HARMLESS
     cannot_detect = ""
 
     def __init__(self, options: NativeOptions) -> None:
@@ -235,6 +238,7 @@ class NativeSerial(SerialCodec):
                     MessageType.SAMPLE,
                     pack_valid(valid) + body,
                     format=self._format,
+                    status=self.status,
                     seq=seq,
                     time_us=t_ns // 1000,
                     shape=shape,

@@ -36,6 +36,7 @@ from tactile_rt.drivers.codecs.native_can_parts import (
 )
 from tactile_rt.drivers.codecs.native_common import (
     FORMATS,
+    HARMLESS,
     IMPOSSIBLE,
     RANGE_N,
     RANGE_NM,
@@ -103,6 +104,7 @@ class NativeCan(CanCodec):
     count_bits = 16
     tick_ns = 1000.0
     status_bits = STATUS
+    harmless_bits = HARMLESS
     cannot_detect = "65,536 samples lost in succession (over CAN)"
 
     @classmethod
@@ -208,7 +210,7 @@ class NativeCan(CanCodec):
             else:
                 body = quantise(values, described.scale).astype("<i2").tobytes()
                 valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
-            head = head_of(seq, t_ns // 1000, flags)
+            head = head_of(seq, t_ns // 1000, flags, self.status)
             parts = sample_parts(head, pack_valid(valid) + body)
             if parts is None:
                 elements, channels = described.spec.shape

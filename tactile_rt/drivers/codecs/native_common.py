@@ -12,6 +12,7 @@ from tactile_rt.core.stream import ArraySpec
 
 __all__ = [
     "FORMATS",
+    "HARMLESS",
     "IMPOSSIBLE",
     "RANGE_N",
     "RANGE_NM",
@@ -44,6 +45,7 @@ STATUS: Final = {
     2: "the device lost samples before this one",
     3: "the whisking drive fails",
 }
+HARMLESS: Final = frozenset((0, 2))  # no faults: a firm touch, and what the counter shows
 
 
 class MessageType:

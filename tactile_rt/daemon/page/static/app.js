@@ -353,8 +353,9 @@ function parts(s) {
   const lines = [];
   const base = (path) => path.split("/").at(-1) || "the shipped model";
   for (const p of s.sources) {
-    const device = p.device ? `, device ${p.device.state} ${p.device.reason}` : "";
-    lines.push([p.part, `${p.url}${device}`, p.device && p.device.state !== "streaming"]);
+    const said = p.device ? [p.device.reason, ...new Set([...p.device.faults, ...p.device.status])].filter(Boolean) : [];
+    const device = p.device ? `, device ${p.device.state} ${said.join(", ")}` : "";
+    lines.push([p.part, `${p.url}${device}`, p.device && (p.device.state !== "streaming" || p.device.faults.length)]);
   }
   for (const m of s.models) lines.push([m.part, `${base(m.file)} on ${m.source}, ${m.labels.length} labels`]);
   for (const c of s.consumers) {
