@@ -282,8 +282,8 @@ def play(pipe: Connection, script: ArrayScript) -> None:
     """Be an array in a process of its own, for `Helper`: say the URL, then obey until it hangs up.
 
     The words: ``mood NAME`` (say when), ``unplug`` (say when it began), ``replug`` (say when it was
-    done), ``end`` (of what is measured; say when), ``done`` (say whether), ``where`` (in words),
-    ``played`` (a `Played`).
+    done), ``number TEXT`` (be the array of that serial number), ``end`` (of what is measured; say
+    when), ``done`` (say whether), ``where`` (in words), ``played`` (a `Played`).
     """
     with suppress(OSError):  # a device has a processor of its own; where that is allowed
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
@@ -298,6 +298,8 @@ def play(pipe: Connection, script: ArrayScript) -> None:
             answer: Any = began
             if word.startswith("mood "):
                 device.mood = word.removeprefix("mood ")
+            elif word.startswith("number "):
+                device.codec.serial_number = word.removeprefix("number ")
             elif word == "unplug":
                 device.unplug()
             elif word == "replug":

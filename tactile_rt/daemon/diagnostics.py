@@ -124,6 +124,9 @@ def _of_source(
     if device is not None and device.state in away:
         return [Diagnostic(name, "no samples", f"the device is {device.state}")]
     found = []
+    if source.another:
+        why = f"{source.another}; nothing is decided of it until a reload (SIGHUP) accepts it"
+        found.append(Diagnostic(name, "another array", why))
     if source.live and source.newest_ns:
         if read_s > most:
             why = f"none has come for {oldest_s(limits, source.rate_hz):g} s"

@@ -220,6 +220,8 @@ SOURCE: tuple[Row, ...] = (
      lambda x, _: x.bad_samples),
     ("device_state", "state", "1 for the state a device's stream is in.",
      lambda x, _: x.device and {str(y): y == x.device.state for y in State}),
+    ("device_info", "identity", "1 for its serial number, or that of its USB port.",
+     lambda x, _: x.device and {x.device.identity: 1}),
     ("device_status", "status", "1 for what a device says of itself.",
      lambda x, _: x.device and dict.fromkeys((*x.device.faults, *x.device.status), 1)),
     ("device_connections_total", "", "Times a device was connected since it was opened.",

@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any
 
 from tactile_rt.classifier.classifier import without_bad_samples
+from tactile_rt.core.errors import SourceError, SpecMismatch
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.clock import Clock
@@ -28,8 +29,8 @@ from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.rate_meter import RateMeter
 from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
-from tactile_rt.drivers.device_source import DeviceSource, device_of
-from tactile_rt.drivers.health import Health, State
+from tactile_rt.drivers.device_source import ArrayChanged, DeviceSource, device_of
+from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
 
@@ -130,6 +131,8 @@ class SourcePart(Part):
         self._stuck_at = StuckAtDetector()
         self._losses, self._bads = LossWindow(), LossWindow()
         self._rate = RateMeter()
+        self._accepted: Identity | None = None  # the array that it began with
+        self.another = ""  # why the one that is there now is not that one
         self._offset_ns = 0
         self._look_ns = self._pause_ns = 0
         self._told: tuple[Any, ...] = ()
@@ -149,6 +152,7 @@ class SourcePart(Part):
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
             bad_samples=self._bad, bad=self._bads.add(self._bad), stuck_at_s=self._stuck_at.seconds,
+            another=self.another,
         )  # fmt: skip
         if spec is None:
             return about
@@ -201,8 +205,30 @@ class SourcePart(Part):
         )
 
     def _work(self) -> None:
-        stream = self._open()
+        while self._wanted():
+            try:
+                self._serve()
+            except ArrayChanged as error:
+                self._report(self.name, "another array", str(error), "warning")
+                self._release()
+            else:
+                return
+
+    def _serve(self) -> None:
+        """Open the source, and read it until it is over."""
+        try:
+            stream = self._open()
+        except SpecMismatch as error:
+            if self._accepted is None:
+                raise
+            raise SourceError(str(error)) from None  # the array may be exchanged again
         self._stream, self._spec, self._device = stream, stream.spec, device_of(stream)
+        if self._device is not None:
+            found = self._device.identity
+            self._accepted = self._accepted or found
+            self.another = found.difference(self._accepted)
+            if found.serial_number and not self.another:
+                self._accepted = found
         if self._stop.is_set():
             return
         self._announced = True
@@ -241,7 +267,9 @@ class SourcePart(Part):
         self._stuck_at.add(good)
         if self._device is not None:
             self._rate.add(*self._device.measured)
-        self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
+        spec, accepted = stream.spec, not self.another
+        item = SourceChunk(self.config.name, spec, chunk, now, self._offset_ns, accepted)
+        self._hub.post(item)
         if not stream.live:
             self._await_room()
 
@@ -285,7 +313,7 @@ class SourcePart(Part):
         self._hub.post(
             Opened(
                 self.config.name, stream.spec, self.config.url, stream, now, self._offset_ns,
-                tuple(prelude),
+                tuple(prelude), not self.another,
             )
         )  # fmt: skip
         if self._device is not None:

@@ -44,6 +44,9 @@ class Sequencer:
         period_ticks: Nominal time between samples, in ticks of the device's clock; None for a
             device without a clock.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
+
+    Attributes:
+        numbered: How many numbers have been given, those of gaps too.
     """
 
     def __init__(
@@ -61,16 +64,11 @@ class Sequencer:
         self._tick = 0
         self._run = self._longest_run = 0  # steps of the counter within one reading of the clock
         self._damaged = 0  # frames since the newest sample
-        self._next = 0
+        self.numbered = 0
         self._seen: dict[int, None] = {}  # of the last samples, oldest first: what was in it
         # Without a clock, a sample of an earlier turn can look like this one.
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
-
-    @property
-    def numbered(self) -> int:
-        """How many numbers have been given, those of gaps too."""
-        return self._next
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """((n,) sequence numbers, (n,) which samples to keep); the others came before.
@@ -81,8 +79,8 @@ class Sequencer:
         damaged = samples.damaged.tolist()
         if self._wrap is None or samples.count is None:
             self._stats.corrupt += sum(damaged)
-            self._next += n
-            return self._next - n + np.arange(n), np.ones(n, np.bool_)
+            self.numbered += n
+            return self.numbered - n + np.arange(n), np.ones(n, np.bool_)
         ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
         counts = samples.count.tolist()
         seq = [
@@ -114,8 +112,8 @@ class Sequencer:
             corrupt = min(self._damaged, gap)
             self._stats.corrupt += corrupt
             self._stats.missing += gap - corrupt
-        number = self._next + gap
-        self._next = number + 1
+        number = self.numbered + gap
+        self.numbered = number + 1
         self._count, self._tick, self._damaged = count, tick, 0
         self._seen[content] = None
         if len(self._seen) > self._remembered:

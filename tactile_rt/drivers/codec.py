@@ -148,6 +148,8 @@ class Codec(abc.ABC, Generic[Packet]):
             beforehand sets it, and the device is then not asked.
         measures: Whether the device measures although no host has asked for samples. The device's
             side.
+        describes: Whether a device that is started says what it is: `spec` is another object then.
+        serial_number: Serial number that the device has told of itself; empty for none.
         newest: The newest sample of a device that measures and does not send, None if there is
             none. The device's side.
         commanded_hz: Rate at which hosts have told the device to send, Hz; None for none. The
@@ -168,6 +170,8 @@ class Codec(abc.ABC, Generic[Packet]):
     harmless_bits: ClassVar[frozenset[int]] = frozenset()
     cannot_detect: ClassVar[str] = ""
     complaint = ""
+    describes = False
+    serial_number = ""
     full_scale: ClassVar[tuple[float, ...] | None] = None
     greeting: ClassVar[Any] = None
     commanded_hz: float | None = None

@@ -63,12 +63,14 @@ class NativeOptions:
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
         range_si: The largest reading of channels of other units that it can tell.
+        serial_number: The serial number that an emulated device tells; empty for none.
     """
 
     format: str = "float32"
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
     range_si: float = RANGE_SI
+    serial_number: str = ""
 
     def __post_init__(self) -> None:
         check_ranges(self.range_n, self.range_nm, self.range_si)
@@ -105,12 +107,14 @@ class NativeSerial(SerialCodec):
     tick_ns = 1000.0
     status_bits = STATUS
     harmless_bits = HARMLESS
+    describes = True
     cannot_detect = ""
 
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(None)
         self._format = FORMATS[options.format]
         self._ranges = options.range_n, options.range_nm, options.range_si
+        self.serial_number = options.serial_number
         self._described: DeviceDescription | None = None
         self._rest = b""  # of a frame that is not complete
         self._synchronised = True
@@ -184,6 +188,7 @@ class NativeSerial(SerialCodec):
                     del rows[:], parts[:]  # of what it was before: another device
                     flags = b""
                 self._described, self.spec = found, found.spec
+                self.serial_number = found.serial_number
         if not rows:
             return None
         self._usual = AROUND + head[3]
@@ -253,6 +258,7 @@ class NativeSerial(SerialCodec):
             if kind in MessageType.FROM_DEVICE:
                 continue  # an echo of our own; answering answers would never end
             if kind == MessageType.DESCRIBE:
+                self._described = None  # its serial number may be another
                 answer += frame(MessageType.DESCRIPTION, self._description().to_json())
                 continue
             if kind in (MessageType.START, MessageType.STOP):
@@ -273,7 +279,7 @@ class NativeSerial(SerialCodec):
     def _description(self) -> DeviceDescription:
         if self._described is None:
             assert self.spec is not None
-            self._described = DeviceDescription.of(self.spec, *self._ranges)
+            self._described = DeviceDescription.of(self.spec, *self._ranges, self.serial_number)
         return self._described
 
     def _valid_of(self, flags: bytes, n: int) -> NDArray[np.bool_]:

@@ -353,7 +353,7 @@ function parts(s) {
   const lines = [];
   const base = (path) => path.split("/").at(-1) || "the shipped model";
   for (const p of s.sources) {
-    const said = p.device ? [p.device.reason, ...new Set([...p.device.faults, ...p.device.status])].filter(Boolean) : [];
+    const said = p.device ? [`identity: ${p.device.identity}`, p.device.reason, ...new Set([...p.device.faults, ...p.device.status])].filter(Boolean) : [];
     const device = p.device ? `, device ${p.device.state} ${said.join(", ")}` : "";
     lines.push([p.part, `${p.url}${device}`, p.device && (p.device.state !== "streaming" || p.device.faults.length)]);
   }
