@@ -204,8 +204,8 @@ class EmulatedArray(EmulatedDevice):
     Attributes:
         mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
             same values again and again; ``no_number``: NaN; ``slow``: at half its rate;
-            ``fails``: its status says that a sensor fails; ``gaps``, ``corrupt``: every twentieth
-            sample is missing, or damaged.
+            ``fails``: its status says that a sensor fails; ``uncounted``: its counter stands;
+            ``gaps``, ``corrupt``: every twentieth sample is missing, or damaged.
     """
 
     def __init__(self, script: ArrayScript, signal: NDArray[np.float32] | None = None) -> None:
@@ -254,7 +254,8 @@ class EmulatedArray(EmulatedDevice):
         elif self.mood == "no_number":
             values = np.full_like(values, np.nan)
         self._last = values[-1]
-        return Chunk(chunk.seq, chunk.t_ns, values, chunk.valid)
+        seq = np.zeros_like(chunk.seq) if self.mood == "uncounted" else chunk.seq
+        return Chunk(seq, chunk.t_ns, values, chunk.valid)
 
     def end(self) -> None:
         """Measure nothing more; what is measured still goes out."""

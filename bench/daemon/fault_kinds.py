@@ -434,6 +434,9 @@ KINDS: dict[str, FaultKind] = {
         _mood("whiskers", "slow", 1.0 + 0.064), (("source.whiskers", "slow"),)
     ),
     "can_device_slow": FaultKind(_mood("finger", "slow", 1.0 + 0.5), (("source.finger", "slow"),)),
+    "counter_stuck": FaultKind(
+        _mood("whiskers", "uncounted", 0.064), (("source.whiskers", "no counter"),)
+    ),
     "array_exchanged": FaultKind(
         _exchanged("whiskers"), (("source.whiskers", "another array"),),
         (("source.whiskers", "lost samples"), ("source.whiskers", "no samples")),

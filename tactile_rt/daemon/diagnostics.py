@@ -143,6 +143,9 @@ def _of_source(
     if source.slow and read_s <= most and not starved:
         why = f"it measures less often than nine tenths of the {source.rate_hz:g} Hz that it has"
         found.append(Diagnostic(name, "slow", why))
+    if device is not None and not device.counts:
+        why = "its counter does not go on: what is lost cannot be seen"
+        found.append(Diagnostic(name, "no counter", why))
     faults = device.faults if device is not None else ()
     if faults:
         found.append(Diagnostic(name, "device fault", f"it says: {', '.join(faults)}"))

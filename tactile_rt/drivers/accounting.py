@@ -33,6 +33,7 @@ __all__ = ["Sequencer"]
 REMEMBERED = 1024  # samples back that a repeated one is looked for
 HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
 RATE_TOLERANCE = 0.02  # of the nominal rate, when the clock is to tell how many samples passed
+STANDING = 5  # samples in a row that have the count of the one before: it counts nothing
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
@@ -56,7 +57,7 @@ class Sequencer:
         period_ticks: float | None = None,
         tick_bits: int = 32,
     ) -> None:
-        self.resets = 0
+        self.resets = self._standing = 0  # samples in a row whose counter has not gone on
         self._wrap = None if bits is None else 1 << bits
         self._stats = stats
         self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
@@ -69,6 +70,11 @@ class Sequencer:
         # Without a clock, a sample of an earlier turn can look like this one.
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
+
+    @property
+    def useless(self) -> bool:
+        """Whether the counter has not gone on for some samples, so that it shows no loss."""
+        return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """((n,) sequence numbers, (n,) which samples to keep); the others came before.
@@ -101,8 +107,9 @@ class Sequencer:
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
+        self._standing = self._standing + 1 if count == self._count and gap < 0 else 0
         if gap < 0:
-            self.resets += 1
+            self.resets += not self.useless
             self._seen.clear()
             self._run = gap = 0
         elif self._count is not None:

@@ -187,6 +187,7 @@ class DeviceSource(Source):
             self.codec.stats,
             tuple(meaning for bit, meaning in bits if bit in faults),
             self._identity.serial_number or self._identity.usb_number or "unknown",
+            not stamper.sequencer.useless,
         )  # fmt: skip
 
     @property

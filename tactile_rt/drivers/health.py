@@ -68,3 +68,4 @@ class Health:
     wire: WireStats = field(default_factory=WireStats)
     faults: tuple[str, ...] = ()
     identity: str = "unknown"
+    counts: bool = True  # whether its counter goes on, if it should have one

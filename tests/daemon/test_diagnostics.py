@@ -71,6 +71,8 @@ def test_who_does_what_it_should_is_not_named():
          "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
         ({"device": Health(State.STREAMING, 1, faults=("a sensor fails",)), "bad": Losses(1, 1)},
          "device fault: source.a: it says: a sensor fails"),
+        ({"device": Health(State.STREAMING, 1, counts=False)},
+         "no counter: source.a: its counter does not go on: what is lost cannot be seen"),
         ({"stuck_at_s": 0.4}, "stuck-at fault: source.a: the values do not change at all, as no "
          "sensor's do: the device hangs"),
         ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),
