@@ -146,8 +146,7 @@ def _of_source(
     if device is not None and not device.counts:
         why = "its counter does not go on: what is lost cannot be seen"
         found.append(Diagnostic(name, "no counter", why))
-    faults = device.faults if device is not None else ()
-    if faults:
+    if faults := device.faults if device is not None else ():
         found.append(Diagnostic(name, "device fault", f"it says: {', '.join(faults)}"))
     if source.losses.second:
         found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))

@@ -19,16 +19,11 @@ SLOW = 0.9  # of the nominal rate: a cheap oscillator is within a twentieth of i
 
 
 class RateMeter:
-    """Measures a rate from a count that grows with what was measured.
-
-    Attributes:
-        hz: The rate over the newest second, and no less than five stretches, Hz; 0: unknown.
-        typical_hz: The median of the rates of its stretches, Hz; 0: unknown.
-    """
+    """Measures a rate from a count that grows with what was measured."""
 
     def __init__(self) -> None:
         self._marks: deque[tuple[int, int]] = deque()  # where stretches begin: time, count
-        self.hz = self.typical_hz = 0.0
+        self.hz = self.typical_hz = 0.0  # over all stretches, and their median; 0: unknown
 
     def add(self, count: int, t_ns: int) -> None:
         """Take the count at a time, ns."""
@@ -47,12 +42,7 @@ class RateMeter:
             self.hz = NS_PER_S * (count - marks[0][1]) / (t_ns - marks[0][0])
 
     def judge(self, nominal_hz: float, silent_s: float) -> tuple[float, bool]:
-        """Return the rate, Hz, and whether it is slow: less than nine tenths of this one.
-
-        Args:
-            silent_s: The time since the newest sample; after a second, and three periods, the rate
-                is unknown.
-        """
+        """Return the rate, Hz, and whether it is slow; 0 after a silence, s."""
         if silent_s > max(1.0, 3 / max(self.hz, 1e-9)):
             return 0.0, False
         return self.hz, 0 < max(self.hz, self.typical_hz) < SLOW * nominal_hz

@@ -73,7 +73,7 @@ class Sequencer:
 
     @property
     def useless(self) -> bool:
-        """Whether the counter has not gone on for some samples, so that it shows no loss."""
+        """Whether the counter stands, and shows no loss."""
         return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

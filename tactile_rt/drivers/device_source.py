@@ -13,7 +13,7 @@ from typing import Any
 
 from tactile_rt.calibration import CalibratedSource
 from tactile_rt.core.errors import ConfigError, SourceError
-from tactile_rt.core.stream import NS_PER_S, Chunk, EndOfStream, Source
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.health import Health, Identity, State
@@ -113,7 +113,7 @@ class DeviceSource(Source):
             raise
         assert codec.spec is not None
         super().__init__(codec.spec)
-        self._described = codec.spec  # another object with every description
+        self._described: ArraySpec | None = codec.spec  # another object with every description
         self._identity = self._known = self.identity  # now, and the last one that was known
         self._stamper = Stamper(codec, self.spec, self.stats)
         if options.clock == "device" and codec.tick_ns is not None:
@@ -199,8 +199,10 @@ class DeviceSource(Source):
 
     @property
     def measured(self) -> tuple[int, int]:
-        """How many samples the device has measured, as far as it counts them, and by when, ns: by
-        its own clock, so that it matters not when somebody reads; without one by the host's."""
+        """How many samples the device has measured, and by when, ns.
+
+        By its own counter and clock if it has them, so that neither a loss nor the host matters.
+        """
         stamper = self._stamper
         assert stamper is not None
         damaged = self.stats.corrupt if self.codec.count_bits is None else 0
@@ -291,14 +293,9 @@ class DeviceSource(Source):
     # identity
 
     def _compare(self) -> None:
-        """Go on if what has been connected, or has described itself, can be the same array.
-
-        Raises:
-            ArrayChanged: it is another one; the stream is over.
-        """
+        """Go on if this can be the same array; else raise an `ArrayChanged`."""
         self._described, found = self.codec.spec, self.identity
-        why = found.difference(self._known)
-        if why:
+        if why := found.difference(self._known):
             self._closed = True
             self._drop()
             raise ArrayChanged(f"{self.name}: another array is at the port: {why}")
@@ -307,13 +304,12 @@ class DeviceSource(Source):
             self._known = found
 
     def _ask_again(self, now_ns: int) -> None:
-        """Let a device that is silent, or counts anew, say what it is: it may be another."""
+        """Ask a device that is silent, or counts anew, what it is."""
         assert self._stamper is not None
         resets = self._stamper.sequencer.resets
         silent_ns = now_ns - self._stamper.newest_ns
-        if silent_ns < max(ASK_NS, self._stale_ns) and resets == self._resets:
-            return
-        if now_ns - self._asked_ns < ASK_NS or self._link is None:
+        well = silent_ns < max(ASK_NS, self._stale_ns) and resets == self._resets
+        if well or now_ns - self._asked_ns < ASK_NS or self._link is None:
             return
         self._asked_ns, self._resets = now_ns, resets
         if silent_ns > ASK_NS:
