@@ -158,6 +158,18 @@ def _unplugged(array: str) -> Callable[[FaultScene], Iterator[float]]:
     return cause
 
 
+def _exchanged(array: str) -> Callable[[FaultScene], Iterator[float]]:
+    def cause(scene: FaultScene) -> Iterator[float]:
+        line = scene.arrays[array]
+        for word in ("unplug", "number B", "replug"):
+            line.ask(word)
+        yield time.monotonic() + 0.5  # until it has described itself
+        for word in ("unplug", "number A", "replug"):
+            line.ask(word)
+
+    return cause
+
+
 def _folder_deleted(scene: FaultScene) -> Iterator[float]:
     shutil.rmtree(scene.disk / "recordings")
     yield time.monotonic()
@@ -439,6 +451,23 @@ KINDS: dict[str, FaultKind] = {
         _mood("whiskers", "stuck", STUCK_AT_S + 0.064), (("source.whiskers", "stuck-at fault"),)
     ),
     "coarse_sensor_at_rest": FaultKind(_mood("finger", "stuck")),
+    "device_slow": FaultKind(  # two seconds are given to see it
+        _mood("whiskers", "slow", 1.0 + 0.064), (("source.whiskers", "slow"),)
+    ),
+    "can_device_slow": FaultKind(_mood("finger", "slow", 1.0 + 0.5), (("source.finger", "slow"),)),
+    "counter_stuck": FaultKind(
+        _mood("whiskers", "uncounted", 0.064), (("source.whiskers", "no counter"),)
+    ),
+    "array_exchanged": FaultKind(
+        _exchanged("whiskers"), (("source.whiskers", "another array"),),
+        (("source.whiskers", "lost samples"), ("source.whiskers", "no samples")),
+    ),
+    "device_fails": FaultKind(
+        _mood("whiskers", "fails", 0.064), (("source.whiskers", "device fault"),)
+    ),
+    "can_device_fails": FaultKind(
+        _mood("finger", "fails", 0.2), (("source.finger", "device fault"),)
+    ),
     "no_numbers": FaultKind(
         _mood("whiskers", "no_number", 0.064), (("source.whiskers", "bad samples"),)
     ),

@@ -246,8 +246,8 @@ class Daemon:
         old += [
             self._sources.pop(name)
             for name, part in list(self._sources.items())
-            # a file that one has failed of may be another by now
-            if sources.get(name) != part.config or part.state.state == "failed"
+            # a file that one has failed of may be another by now; another array is accepted
+            if sources.get(name) != part.config or part.state.state == "failed" or part.another
         ]
         self._end(old)
         for name, (key, model) in models.items():

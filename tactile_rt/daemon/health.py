@@ -107,6 +107,10 @@ class SourceState:
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some
     stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
+    another: str = ""  # why the array is another one than the source began with
+    # what the device measured within the newest second, lost or not; 0: unknown
+    measured_hz: float = 0.0
+    slow: bool = False  # that is, most of the time, less than nine tenths of `rate_hz`
 
 
 @dataclass(frozen=True)

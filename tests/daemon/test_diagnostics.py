@@ -67,6 +67,12 @@ def test_who_does_what_it_should_is_not_named():
          "no samples: source.a: the device is lost"),
         ({"part": part("source.a", "waiting", "no such port")},
          "no samples: source.a fails: no such port"),
+        ({"slow": True, "measured_hz": 500.0},
+         "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
+        ({"device": Health(State.STREAMING, 1, faults=("a sensor fails",)), "bad": Losses(1, 1)},
+         "device fault: source.a: it says: a sensor fails"),
+        ({"device": Health(State.STREAMING, 1, counts=False)},
+         "no counter: source.a: its counter does not go on: what is lost cannot be seen"),
         ({"stuck_at_s": 0.4}, "stuck-at fault: source.a: the values do not change at all, as no "
          "sensor's do: the device hangs"),
         ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),
@@ -88,6 +94,7 @@ def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
         {"live": False, "newest_ns": 1, "read_ns": 1},  # a recording waits for its reader
         {"newest_ns": 0, "read_ns": 0},  # none has come yet: the device says how it is
         {"rate_hz": 0.5, "newest_ns": NOW - 5 * S, "read_ns": NOW - 5 * S},  # three periods are 6 s
+        {"device": Health(State.STREAMING, 1, status=("a channel is at the end of its range",))},
     ],
 )
 def test_what_is_no_fault_of_a_source_is_not_told(changes):
