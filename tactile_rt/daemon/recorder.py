@@ -358,8 +358,8 @@ class Recorder(Consumer):
         file, track.file = track.file, None
         if file is None:
             return
-        if file.whereabouts() == "deleted":
-            why = f"{file.path} was deleted while it was written"
+        if (where := file.whereabouts()) in ("deleted", "emptied"):
+            why = f"{file.path} was {where} while it was written"
             samples, packets = file.disown(Extent())
             self._count_lost(track, samples, packets, why)
             self._warn(f"{why}: {samples} samples are lost")

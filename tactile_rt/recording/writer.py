@@ -15,6 +15,7 @@ daemon's recorder.
 
 import errno
 import fcntl
+import io
 import os
 import secrets
 import time
@@ -255,13 +256,16 @@ class RecordingWriter:
         stats.samples, stats.packets, self.flushed = since.samples, since.packets, since
         return samples, packets
 
-    def whereabouts(self) -> Literal["there", "moved", "deleted"]:
-        """What others did with the file: ``moved`` means that another or none has its name."""
+    def whereabouts(self) -> Literal["there", "moved", "deleted", "emptied"]:
+        """What others did with the file: ``moved`` means that another or none has its name,
+        ``emptied`` that it is shorter than what was written, as a log rotator leaves it."""
         if self._special:
             return "there"
         mine = os.fstat(self._raw.fileno())
         if mine.st_nlink == 0:
             return "deleted"
+        if isinstance(self._raw.raw, _Growing) and mine.st_size < self._raw.raw.written:
+            return "emptied"
         try:
             named = os.lstat(self._target)
         except (FileNotFoundError, NotADirectoryError):
@@ -375,8 +379,26 @@ def _hidden(path: Path, force: bool) -> Path:
     return path.with_name(f".{path.stem[:50]}.{secrets.token_hex(4)}{PART}")
 
 
-def _create(path: Path, force: bool) -> BinaryIO:
-    return path.open("wb" if force else "xb")
+class _Growing(io.FileIO):
+    """A new file that counts what was written, always at its end: what others cut off stays
+    missing."""
+
+    written = 0
+
+    def write(self, data: Any) -> int:
+        size = super().write(data)
+        self.written += size
+        return size
+
+
+def _create(path: Path, special: bool) -> io.BufferedWriter:
+    if special:
+        return path.open("wb")
+    return io.BufferedWriter(_Growing(path, "ab", opener=_open_new))
+
+
+def _open_new(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_EXCL, 0o666)
 
 
 def _reveal(hidden: Path, path: Path, force: bool) -> None:

@@ -269,6 +269,25 @@ def test_one_file_that_is_deleted_is_not_written_on(daemon, tmp_path):
     assert on_disk(made, "right").lost_samples == 0
 
 
+@pytest.mark.parametrize("size", [0, 300])  # as `copytruncate` leaves it, and cut short
+def test_a_file_that_is_emptied_is_not_written_on(size, daemon, tmp_path):
+    made = begun(daemon, tmp_path, min_free_mb=0)
+    made.handle([opened(), *(samples(c) for c in CHUNKS[:10])])
+    look(made)
+    (path,) = files(tmp_path)
+    os.truncate(path, size)
+    made._tracks["whiskers"].file.flush()  # a chunk that was full meanwhile
+    made.handle([samples(c) for c in CHUNKS[10:20]])
+    made._tracks["whiskers"].file.flush()
+    look(made)
+    made.handle([samples(c) for c in CHUNKS[20:]])
+    made.close()
+    kept = [p for p in files(tmp_path) if p != path]
+    assert [int(n) for c in Recording(kept[0]) for n in c.seq] == list(range(200, 400))
+    assert (on_disk(made).samples, on_disk(made).lost_samples) == (200, 200)
+    assert "was emptied" in on_disk(made).lost_why and "200 samples are lost" in daemon.told[0][1]
+
+
 def test_what_was_moved_is_whole_where_it_is_and_nothing_is_lost(daemon, tmp_path):
     folder, other = tmp_path / "rec", tmp_path / "other"
     made = begun(daemon, folder, min_free_mb=0)
