@@ -272,6 +272,41 @@ def test_the_level_is_the_least_that_is_written(tmp_path):
     assert len(logged(tmp_path / "log", events, level="warning")) == 2
 
 
+def test_a_log_that_is_moved_or_deleted_is_begun_anew_as_soon_as_it_can_be(tmp_path):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    log = Log("log", LogConfig(file=str(folder / "log")))
+    log.open(None)
+    log.handle([event("one")])
+    (folder / "log").rename(folder / "log.1")
+    log.handle([event("two")])
+    (folder / "log").unlink()
+    log.handle([event("three")])
+    assert [(folder / name).read_text()[-5:] for name in ("log.1", "log")] == [" one\n", "hree\n"]
+    folder.rename(tmp_path / "away")
+    log.handle([event("four"), event("five")])
+    assert "No such file" in log.diagnose() and log.details()["dropped"] == 2
+    folder.mkdir()
+    log.handle([])
+    log.close()
+    assert "log dropped: 2 lines: " in (folder / "log").read_text() and not log.diagnose()
+    assert log.details()["lines"] == 3
+
+
+def test_what_nobody_reads_any_more_is_dropped_and_counted(tmp_path):
+    reader, writer = os.pipe()
+    log = Log("log", LogConfig(file=f"/proc/self/fd/{writer}"))
+    log.open(None)
+    log.handle([event("one")])
+    os.close(reader)
+    for n in range(3):
+        log.handle([event(f"more {n}")])
+    assert log.details() == {**log.details(), "lines": 1, "dropped": 3}
+    assert log.diagnose().endswith("Broken pipe")
+    log.close()
+    os.close(writer)
+
+
 @contextmanager
 def held_by_another(key, user=None):
     """A process, of another user if one is given, that holds a lock."""
