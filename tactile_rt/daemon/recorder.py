@@ -52,6 +52,7 @@ __all__ = ["Recorder"]
 
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
+PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # after a failure, and another; then all is well
 SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
 RING_BYTES = 64 << 20  # of each source, before a trigger
 EVER_NS = 1 << 62
@@ -75,6 +76,8 @@ class _Track:
         self.closed_ns = 0  # when its source ended; 0: it has not
         self.lost = (0, 0)  # samples and packets since the last file was begun
         self.diagnostic = ""  # why there is no file, or was none before this one
+        self.failures = 0  # files that failed soon after they were begun, running
+        self.retry_ns = 0  # no file is begun before
 
     def keep(self, message: Raw, before_ns: int) -> list[Raw]:
         """Into the ring, from which the oldest goes: these."""
@@ -320,6 +323,8 @@ class Recorder(Consumer):
     def _start_file(self, track: _Track) -> None:
         if track.file is not None or not track.came or track.closed_ns:
             return
+        if time.monotonic_ns() < track.retry_ns:
+            return
         if not self._folder.has_room():
             return
         opened, snapshot = track.opened, self._view.snapshot()
@@ -370,7 +375,8 @@ class Recorder(Consumer):
             if not told:
                 why = f"{file.path}: not finished ({error.strerror or error})"
                 self._warn(f"{why}; {KEEPS}")
-            self._count_lost(track, *file.disown(file.flushed), words(file.path, error))
+            why = words(self._folder.path, error)
+            self._count_lost(track, *file.disown(file.flushed), why)
         self._bytes += file.stats.bytes
 
     def _rotate(self, track: _Track) -> None:
@@ -443,11 +449,21 @@ class Recorder(Consumer):
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
     def _no_room(self, track: _Track, error: OSError) -> None:
-        """The file cannot be written: it is left as it is, and tried anew at the next look."""
-        file = track.file
-        why = words(file.path if file is not None else self._folder.path, error)
-        if file is not None or why != track.diagnostic:
-            self._warn(f"{why}: not recording" if file is None else f"{why}; {KEEPS}")
+        """The file cannot be written: it is left as it is, and tried anew at a next look, with
+        pauses where one file after another fails. The reason names no file, and so stays the same.
+        """
+        file, why = track.file, words(self._folder.path, error)
+        if file is None:
+            if why != track.diagnostic:
+                self._warn(f"{why}: not recording")
+        else:
+            now = time.monotonic_ns()
+            again = now - file.begun_ns < STEADY_S * NS and bool(track.failures)
+            if not again:
+                track.failures = 0
+                self._warn(f"{words(file.path, error)}; {KEEPS}")
+            track.retry_ns = now + round(min(track.failures, PAUSES) * PAUSE_S * NS)
+            track.failures += 1
         track.diagnostic = why
         if file is not None:
             kept = file.flushed if file.failed is None else file.synced

@@ -184,7 +184,10 @@ class RecordingWriter:
         if not special:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._handle = -1
         try:
+            # Beforehand: by the time of a sync descriptors may be out.
+            self._handle = os.dup(self._raw.fileno())
             self._file = McapFile(self._raw, about)
             for packet, t_ns in prelude if about.wire else ():
                 self.add(WIRE, encode_packet(packet, about.wire), t_ns)
@@ -193,6 +196,8 @@ class RecordingWriter:
             if not special:
                 _reveal(hidden, target, force)
         except BaseException:
+            with suppress(OSError):
+                os.close(self._handle)
             with suppress(OSError):
                 self._raw.close()
             if not special:
@@ -294,7 +299,7 @@ class RecordingWriter:
             try:
                 self._sync_soon(last=True)
             finally:
-                with suppress(OSError):  # the syncer may hold a duplicate for some time yet
+                with suppress(OSError):  # the syncer holds its duplicate for some time yet
                     fcntl.flock(self._raw, fcntl.LOCK_UN)
                 self._raw.close()
         if self._syncer is None and self.failed is not None:
@@ -307,20 +312,20 @@ class RecordingWriter:
         self.flushed = extent
 
     def _sync_soon(self, last: bool = False) -> None:
-        job = partial(self._sync, os.dup(self._raw.fileno()), last)
+        job = partial(self._sync, last)
         if self._syncer is None:
             job()
         else:
             self._waiting = True
             self._syncer.add(job)
 
-    def _sync(self, handle: int, last: bool) -> None:
-        """In the syncer's thread; the handle stays open when the file is closed meanwhile."""
+    def _sync(self, last: bool) -> None:
+        """In the syncer's thread; its handle stays open when the file is closed meanwhile."""
         self._waiting = False
         extent, began_ns = self.flushed, time.monotonic_ns()
         try:
             if not self._special:
-                os.fdatasync(handle)
+                os.fdatasync(self._handle)
                 if not self._name_synced:
                     with suppress(FileNotFoundError, NotADirectoryError):  # see `whereabouts`
                         sync_folder(self._target.parent)
@@ -328,10 +333,13 @@ class RecordingWriter:
             self._synced = extent
             self.unsynced_ns = began_ns if self.flushed != extent else 0
         except OSError as error:
-            # The system has given up what it could not write; a later sync would not tell.
-            self.failed = self.failed or error
+            # The system has given up what it could not write; a later sync would not tell. But
+            # for want of a descriptor the name alone is not synced: the next one does that.
+            if last or error.errno not in (errno.EMFILE, errno.ENFILE):
+                self.failed = self.failed or error
         finally:
-            os.close(handle)
+            if last:
+                os.close(self._handle)
             self.done = last
 
 

@@ -208,6 +208,44 @@ def test_what_no_file_could_grow_by_is_counted(daemon, tmp_path):
     assert seqs(tmp_path) == [*range(100), *range(300, 400)]
 
 
+def test_no_descriptor_left_ends_no_file(daemon, tmp_path):
+    made = begun(daemon, tmp_path, min_free_mb=0, sync_s=1e-6)
+    made.handle([opened(), samples(CHUNKS[0])])
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        for chunk in CHUNKS[1:]:
+            made.handle([samples(chunk)])
+            look(made)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    until(lambda: (look(made), on_disk(made).waits_ns == 0)[1])
+    made.close()
+    assert (len(files(tmp_path)), daemon.told) == (1, [])
+    assert (on_disk(made).samples, on_disk(made).lost_samples) == (400, 0)
+
+
+def test_files_that_fail_one_after_the_other_are_told_once_and_begun_with_pauses(daemon, tmp_path):
+    made = begun(daemon, tmp_path, min_free_mb=0)
+    made.handle([opened(), *(samples(c) for c in CHUNKS[:10])])
+    look(made)
+    (path,) = files(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, hard))
+    try:
+        whys = []
+        for _ in range(20):
+            made.handle([samples(c) for c in CHUNKS])
+            look(made)
+            whys.append(on_disk(made).lost_why)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (len(daemon.told), set(whys)) == (1, {f"{tmp_path}: File too large"})
+    assert len(files(tmp_path)) <= 3
+    until(lambda: (look(made), on_disk(made).open)[1])
+    made.close()
+
+
 def test_who_is_stopped_or_waits_for_a_trigger_is_not_meant_to_record(daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger")
     made.handle([opened(), samples(CHUNKS[0])])
