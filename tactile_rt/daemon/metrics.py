@@ -2,7 +2,7 @@
 
 The text is Prometheus' exposition format 0.0.4; names and units are as its conventions ask for:
 base units, ``_total`` for what only grows. Only GET; at most 8 KiB a request, in two seconds, 16
-at a time.
+at a time, of which the newest are answered.
 """
 
 import os
@@ -16,7 +16,7 @@ import msgspec
 
 from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
-from tactile_rt.daemon.consumer import TAKEN, Consumer, View
+from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
@@ -27,7 +27,7 @@ __all__ = ["ALERTS", "Metrics", "exposition"]
 
 ALERTS = Path(__file__).parents[1] / "assets" / "alerts.yml"
 
-LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0)
+LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0, newest_first=True)
 HEADERS = {"cache-control": "no-store", "x-content-type-options": "nosniff"}
 EXPOSITION, JSON = "text/plain; version=0.0.4; charset=utf-8", "application/json"
 STATES = ("starting", "running", "degraded", "stopping")
@@ -67,10 +67,6 @@ class Metrics(Consumer):
     def close(self) -> None:
         if self._server is not None:
             self._server.close()
-
-    def diagnose(self) -> str:
-        server = self._server
-        return TAKEN if server is not None and server.full else ""
 
     def details(self) -> dict[str, str | int | float]:
         server = self._server

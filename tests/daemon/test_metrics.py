@@ -5,6 +5,7 @@ import http.client
 import json
 import socket
 import urllib.request
+from contextlib import ExitStack
 
 import msgspec
 import pytest
@@ -151,6 +152,17 @@ def test_whatever_is_asked_gets_an_answer_of_its_own(served, method, path, host,
     port, _, _ = served
     assert get(port, path, method, host=host)[0] == status
     assert get(port, "/state")[0] == 200  # and it goes on
+
+
+def test_slow_connections_keep_nobody_away(served):
+    port, _, consumer = served
+    with ExitStack() as stack:
+        for _ in range(100):
+            line = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            line.sendall(b"GET /heal")
+        assert get(port, "/health")[0] == 503 and get(port, "/metrics")[0] == 200
+        assert consumer._server.connections <= module.LIMITS.connections
+    assert consumer._server.answered == 1 and not consumer.diagnose()
 
 
 def test_closing_waits_for_nobody_and_frees_the_port(monkeypatch):
