@@ -13,6 +13,7 @@ from tactile_rt.cli.options import STDOUT, Json, Seconds, Url
 from tactile_rt.cli.tables import show_table, told_as_json
 
 WINDOW_S = 1.0
+LOG_BYTES = 1 << 16  # of its end, in which the newest warning is looked for
 
 
 @app.command("list", epilog="tactile-rt list")
@@ -33,12 +34,15 @@ def list_devices(json: Json = None) -> None:
     show_table(found, {"device": "device", "likely": "likely", "url": "url"}, json)
 
 
-@app.command(epilog="tactile-rt doctor --udev 99-tactile.rules")
+@app.command(epilog="tactile-rt doctor --daemon http://127.0.0.1:9464")
 def doctor(
+    daemon: Annotated[
+        str, typer.Option(help="Look at a running daemon instead: the URL of its [metrics].")
+    ] = "",
     udev: Annotated[Path | None, typer.Option(help="Write udev rules for the devices.")] = None,
     json: Json = None,
 ) -> None:
-    """Find what keeps devices from working, and say how to fix it.
+    """Find what keeps devices, or a daemon, from working, and say how to fix it.
 
     Exit code 1 if there is anything to fix.
     """
@@ -50,7 +54,10 @@ def doctor(
 
     check_output(udev)
     ports = serial_ports()
-    findings = [*diagnose(ports, can_buses()), *_look_at_simulator()]
+    if daemon:
+        findings = _look_at_daemon(daemon)
+    else:
+        findings = [*diagnose(ports, can_buses()), *_look_at_simulator()]
     alone = told_as_json(findings, json)
     console = Console(stderr=alone, soft_wrap=True, highlight=False)
     for finding in () if alone else findings:
@@ -65,6 +72,45 @@ def doctor(
         )
     if not all(f.good for f in findings):
         raise typer.Exit(1)
+
+
+def _look_at_daemon(url: str) -> list[Any]:
+    """Say what a running daemon says of itself, and what its log said last."""
+    from tactile_rt.cli.top import snapshot_at
+    from tactile_rt.core.errors import SourceError
+    from tactile_rt.drivers.discovery import Finding
+
+    try:
+        now = snapshot_at(url)
+    except SourceError as error:
+        return [Finding("daemon", False, str(error), "`systemctl status tactile-rt`, or start it")]
+    up = f"{(now.t_ns - now.started_ns) / 3.6e12:.1f} h"
+    says = f"{now.state}, version {now.version}, pid {now.pid}, up {up}, {now.config}"
+    found = [Finding("daemon", not now.diagnostics, says)]
+    found += [Finding(one.part, False, one.says, one.do) for one in now.diagnostics]
+    for source in now.sources:
+        lost, broke = source.stats, source.part.failures
+        gone = lost.corrupt + lost.missing + lost.dropped
+        says = f"{source.samples} samples, {gone} lost, broke {broke} times since the start"
+        found.append(Finding(source.part.name, True, says))
+    for log in (c for c in now.consumers if c.kind == "log"):
+        file = str(log.details.get("file", ""))
+        says = _read_last_warning(Path(file)) if file else "on stderr: `journalctl -u tactile-rt`"
+        found.append(Finding("log", True, says))
+    return found
+
+
+def _read_last_warning(log: Path) -> str:
+    """Return the newest warning or error of a log."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - LOG_BYTES))
+            lines = file.read(LOG_BYTES).decode(errors="replace").splitlines()
+    except OSError as error:
+        return f"{log} cannot be read: {error.strerror}"
+    words = (" warning ", " error ", '"level":"warning"', '"level":"error"')
+    last = next((line for line in reversed(lines) if any(w in line for w in words)), "")
+    return f"{log}: {last or 'no warning of late'}"
 
 
 def _look_at_simulator() -> list[Any]:

@@ -180,12 +180,18 @@ class Diagnostic:
         what: What is missing, in a few words.
         why: The reason in words; of a part that breaks what it does, such as ``fails: no port``.
         still: What goes on all the same; may be empty.
+        since_ns: The time at which it was first found, host CLOCK_MONOTONIC, ns.
+        says: All of it in a sentence, with the time in UTC; empty before it is explained.
+        do: What to do.
     """
 
     part: str
     what: str
     why: str
     still: str = ""
+    since_ns: int = 0
+    says: str = ""
+    do: str = ""
 
     @property
     def line(self) -> str:

@@ -53,7 +53,7 @@ class Log(Consumer):
             last, count = self._unwritten
             why = f"{count} lines: {self._why}"
             told = Event("log", "dropped", why, "warning", last.t_ns, last.utc_offset_ns)
-            if self._put(self._form(told, 0)):
+            if self._pass_on(self._form(told, 0)):
                 self._unwritten, self._why = None, ""
         for item in items:
             if isinstance(item, Event) and _rank(item.level) >= _rank(self._config.level):
@@ -113,13 +113,13 @@ class Log(Consumer):
             self._write(seen.event, seen.again)
 
     def _write(self, event: Event, repeated: int) -> None:
-        if self._unwritten is None and self._put(self._form(event, repeated)):
+        if self._unwritten is None and self._pass_on(self._form(event, repeated)):
             self._lines += 1
         else:
             self._dropped += 1
             self._unwritten = event, self._unwritten[1] + 1 if self._unwritten else 1
 
-    def _put(self, line: str) -> bool:
+    def _pass_on(self, line: str) -> bool:
         """Write a line; whether it was taken whole."""
         data = (line.replace("\n", " ") + "\n").encode(errors="backslashreplace")
         try:

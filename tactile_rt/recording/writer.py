@@ -262,8 +262,11 @@ class RecordingWriter:
         return samples, packets
 
     def whereabouts(self) -> Literal["there", "moved", "deleted", "emptied"]:
-        """What others did with the file: ``moved`` means that another or none has its name,
-        ``emptied`` that it is shorter than what was written, as a log rotator leaves it."""
+        """Look at what others did with the file.
+
+        ``moved`` means that another or none has its name, ``emptied`` that it is shorter than what
+        was written, as a log rotator leaves it.
+        """
         if self._special:
             return "there"
         mine = os.fstat(self._raw.fileno())
@@ -388,8 +391,7 @@ def _hidden(path: Path, force: bool) -> Path:
 
 
 class _Growing(io.FileIO):
-    """A new file that counts what was written, always at its end: what others cut off stays
-    missing."""
+    """A new file that counts what was written, always at its end."""
 
     written = 0
 

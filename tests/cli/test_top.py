@@ -5,6 +5,7 @@ import io
 import socket
 import sys
 import threading
+from contextlib import ExitStack
 
 import pytest
 from rich.console import Console
@@ -13,9 +14,10 @@ from bench.daemon.process import free_port
 from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.config import MetricsConfig
+from tactile_rt.daemon.health import ConsumerState, Diagnostic
 from tactile_rt.daemon.messages import encode, message_of, state_message
 from tactile_rt.daemon.metrics import Metrics
-from tests.helpers.published import View, busy_snapshot, decision, event, running
+from tests.helpers.published import View, busy_snapshot, decision, event, part, running
 
 SHOWN = """\
 tactile_rt 1.2.3 degraded  up 0:00:10  pid 77  reloaded 1x  clock stepped 2x  /etc/robot.toml
@@ -42,11 +44,23 @@ def text(renderable, width=118):
 
 
 @pytest.fixture
-def daemon():
+def daemon_of():
+    """Make the URL of one that is so."""
+    with ExitStack() as stack:
+
+        def serve(snapshot):
+            port = free_port()
+            metrics = Metrics("metrics", MetricsConfig(port=port))
+            stack.enter_context(running(metrics, View(snapshot=snapshot)))
+            return f"http://127.0.0.1:{port}"
+
+        yield serve
+
+
+@pytest.fixture
+def daemon(daemon_of):
     """URL of one that is being watched."""
-    port = free_port()
-    with running(Metrics("metrics", MetricsConfig(port=port)), View(snapshot=busy_snapshot())):
-        yield f"http://127.0.0.1:{port}"
+    return daemon_of(busy_snapshot())
 
 
 @pytest.fixture
@@ -88,6 +102,19 @@ def test_it_looks_at_a_running_daemon(daemon, top):
     assert "mug 93% touching" in out and "No space left on device" in out
     code, out, err = top(daemon.removeprefix("http://"), "--once")
     assert code == 0, err
+
+
+def test_doctor_says_what_a_daemon_suffers_from_and_what_its_log_said(daemon_of, call, tmp_path):
+    (tmp_path / "log").write_text("a warning b: old\na warning c: new\na info d: fine\n")
+    log = ConsumerState(part("log"), "log", details={"file": str(tmp_path / "log")})
+    found = Diagnostic("source.a", "no samples", "lost", says="a gives none.", do="Look at it.")
+    sick = dataclasses.replace(busy_snapshot(), diagnostics=(found,), consumers=(log,))
+    code, out, _ = call("doctor", "--daemon", daemon_of(sick))
+    assert code == 1 and "bad source.a: a gives none.\n    -> Look at it.\n" in out
+    assert "a warning c: new" in out and "5000 samples, 9 lost" in out
+    well = dataclasses.replace(sick, diagnostics=(), state="running")
+    assert call("doctor", "--daemon", daemon_of(well))[0] == 0
+    assert call("doctor", "--daemon", f"http://127.0.0.1:{free_port()}")[0] == 1
 
 
 def test_it_reads_what_the_jsonl_publisher_says(top, monkeypatch):
