@@ -88,6 +88,7 @@ def _look_at_daemon(url: str) -> list[Any]:
     says = f"{now.state}, version {now.version}, pid {now.pid}, up {up}, {now.config}"
     found = [Finding("daemon", not now.diagnostics, says)]
     found += [Finding(one.part, False, one.says, one.do) for one in now.diagnostics]
+    found += [Finding(one.part, True, f"soon: {one.says}", one.do) for one in now.soon]
     for source in now.sources:
         lost, broke = source.stats, source.part.failures
         gone = lost.corrupt + lost.missing + lost.dropped

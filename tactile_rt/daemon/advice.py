@@ -89,8 +89,11 @@ ADVICE: dict[str, tuple[str, str]] = {
         "Make room, and look at the file's folder; of stderr, at the program that reads it.",
     ),
     "no systemd": ("systemd is not told how the daemon is", "Look at NOTIFY_SOCKET and the unit."),
-    "disk": ("the disk is soon full", "Move or delete recordings, or record less (`[recorder]`)."),
-    "memory": (
+    "disk full soon": (
+        "the disk fills up",
+        "Move or delete recordings, or record less (see [recorder]).",
+    ),
+    "memory grows": (
         "the daemon needs more and more memory",
         "Restart it when that does no harm, and report it with `tactile-rt top --once`.",
     ),

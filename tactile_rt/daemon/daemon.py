@@ -16,7 +16,7 @@ from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.diagnostics import diagnose
-from tactile_rt.daemon.health import Snapshot
+from tactile_rt.daemon.health import Diagnostic, Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.mailbox import Hub
@@ -24,10 +24,11 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
+from tactile_rt.daemon.trends import Trends
 
 __all__ = ["Daemon"]
 
-WATCH_S = 0.25
+WATCH_S, LOOK_AHEAD_S = 0.25, 5.0
 STARTED_S = 5.0  # what has not started by then is told as degraded instead
 LATELY_NS = 1_000_000_000  # how long it is told that the wall clock has jumped
 
@@ -70,7 +71,8 @@ class Daemon:
         self._degraded: tuple[str, ...] = ()
         self._reloads = self._clock_steps = 0
         self._turns = Turns()
-        self._onsets = Onsets()
+        self._onsets, self._foreseen = Onsets(), Onsets()
+        self._trends, self._soon, self._look_at = Trends(), tuple[Diagnostic, ...](), 0.0
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -183,7 +185,7 @@ class Daemon:
             VERSION, os.getpid(), str(self._loaded.path), now,
             utc, self._started_ns, self._reloads, state,
             tuple(one.line for one in found), self._clock_steps, sources, models, consumers,
-            found,
+            found, self._soon,
         )  # fmt: skip
 
     def streams(self) -> Mapping[str, Opened]:
@@ -294,6 +296,7 @@ class Daemon:
                 source.judge(next((p.sensor for p in on_it if p.sensor is not None), None))
             for part in self._parts():
                 part.watch()
+            self._look_ahead()
             step = self._clock.stepped_ns()
             if step:
                 self._clock_steps += 1
@@ -315,6 +318,17 @@ class Daemon:
                 done, self._on_over = self._on_over, None
                 if done is not None:
                     done()
+
+    def _look_ahead(self) -> None:
+        if time.monotonic() < self._look_at:
+            return
+        self._look_at = time.monotonic() + LOOK_AHEAD_S
+        soon = self._trends.look([p.consumer_state for _, p in self._consumers.copy().values()])
+        now, utc = self._clock.monotonic_ns(), self._clock.utc_ns()
+        before, self._soon = self._soon, self._foreseen.explain(soon, now, utc)
+        for one in self._soon:
+            if (one.part, one.what) not in {(x.part, x.what) for x in before}:
+                self.report("daemon", "soon", one.line, "warning")
 
     def _hold_devices(self) -> None:
         """A link to a device that was plugged in again leads to another one: that is held now, and

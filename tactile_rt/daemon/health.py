@@ -218,6 +218,7 @@ class Snapshot:
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
+    soon: tuple[Diagnostic, ...] = ()  # what will not work if it goes on so; no fault yet
 
 
 class LatencyMeter:

@@ -5,7 +5,6 @@ base units, ``_total`` for what only grows. Only GET; at most 8 KiB a request, i
 at a time, of which the newest are answered.
 """
 
-import os
 import resource
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message
+from tactile_rt.daemon.trends import read_resident_bytes
 from tactile_rt.drivers.health import State
 
 __all__ = ["ALERTS", "Metrics", "exposition"]
@@ -93,6 +93,7 @@ class Metrics(Consumer):
                 "state": snapshot.state,
                 "degraded": snapshot.degraded,
                 "diagnostics": snapshot.diagnostics,
+                "soon": [one.line for one in snapshot.soon],
                 "version": snapshot.version,
                 "uptime_s": (snapshot.t_ns - snapshot.started_ns) / 1e9,
             }
@@ -139,6 +140,7 @@ def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labe
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]
     yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
+    yield SOON, [({"part": t.part, "what": t.what}, t) for t in s.soon]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
     yield SOURCE, [({"source": _short(x)}, x) for x in s.sources]
     yield MODEL, [({"model": _short(x), "source": x.source}, x) for x in s.models]
@@ -158,13 +160,6 @@ def _since(t_ns: int, now_ns: int) -> float | None:
 def _read_cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
-
-
-def _read_resident_bytes() -> int | None:
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return None  # not Linux
 
 
 def _list_queue_rows(name: str) -> tuple[Row, ...]:
@@ -190,10 +185,13 @@ DAEMON: tuple[Row, ...] = (
     ("config_reloads_total", "", "Times it was reloaded.", lambda s, _: s.reloads),
     ("clock_steps_total", "", "Jumps of the wall clock.", lambda s, _: s.clock_steps),
     ("cpu_seconds_total", "", "Processor time of the daemon.", lambda s, _: _read_cpu_s()),
-    ("resident_memory_bytes", "", "Memory of the daemon.", lambda s, _: _read_resident_bytes()),
+    ("resident_memory_bytes", "", "Memory of the daemon.", lambda s, _: read_resident_bytes()),
 )  # fmt: skip
 DIAGNOSTIC: tuple[Row, ...] = (
     ("diagnostic", "", "1 for each thing that does not work.", lambda t, _: 1),
+)
+SOON: tuple[Row, ...] = (
+    ("soon", "", "1 for each thing that will not work soon if it goes on so.", lambda t, _: 1),
 )
 PART: tuple[Row, ...] = (
     ("part_state", "state", "1 for the state a part is in.",

@@ -185,6 +185,7 @@ class Recorder(Consumer):
             "files": self._files,
             "megabytes": round(size / MB, 1),
             "lost_samples": self._lost_samples,
+            "room_mb": round(self._folder.room_mb),
             "newest": self._newest,
         }
 

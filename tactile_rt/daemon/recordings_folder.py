@@ -29,6 +29,7 @@ class RecordingsFolder:
     Attributes:
         state: What can be said of it: ``on``, ``no folder`` or ``disk full``.
         why: Why nothing can be recorded, with the figures of now; empty if it can.
+        room_mb: The room for recordings at the newest look, MB.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class RecordingsFolder:
     ) -> None:
         self.path, self._min_free_mb = path, min_free_mb
         self._later, self._tell = later, tell
-        self.state, self.why = "on", ""
+        self.state, self.why, self.room_mb = "on", "", 0.0
 
     @property
     def full(self) -> bool:
@@ -75,6 +76,7 @@ class RecordingsFolder:
         except OSError as error:
             state, why = "no folder", words(self.path, error)
         else:
+            self.room_mb = max(0.0, free - self._min_free_mb)
             if free < self._min_free_mb:
                 least = f"min_free_mb = {self._min_free_mb:g}"
                 state = "disk full"

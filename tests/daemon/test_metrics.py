@@ -128,6 +128,7 @@ def test_health_is_the_status_and_state_is_everything(served):
     found = json.loads(body)
     assert (status, found["state"], found["uptime_s"]) == (503, "degraded", 8.0)
     assert found["degraded"] == ["no samples: source.finger: the device is lost"]
+    assert found["soon"] == ["disk full soon: recorder: it is full within 3 h"]
     view.shown = busy_snapshot(state="running")
     status, headers, body = get(port, "/health?x=1")
     assert (status, headers["Content-Type"]) == (200, "application/json")

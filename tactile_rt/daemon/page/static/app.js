@@ -115,7 +115,7 @@ const stream = new Stream({
   link(state, reason) {
     if (state === "locked") {
       $("login").hidden = false;
-      $("main").hidden = $("degraded").hidden = true;
+      $("main").hidden = $("degraded").hidden = $("soon").hidden = true;
       say("", 0);
       $("token").focus();
     } else if (state === "full") {
@@ -284,6 +284,7 @@ function states() {
   $("daemon").textContent = "daemon " + s.state;
   $("daemon").className = "chip " + ({ running: "good", degraded: "warn" }[s.state] || "warn");
   tell("degraded", s.diagnostics);
+  tell("soon", s.soon);
   const now = s.models.find((m) => m.part.name === "model." + model);
   touching = Boolean(now && now.touching);
   figures(s, now);
