@@ -1,6 +1,7 @@
 """`tactile-rt list`, `doctor`, `codecs`, `describe`, `echo`, `hz`, `dump`: looking at devices."""
 
 import math
+import re
 import time
 from contextlib import closing
 from pathlib import Path
@@ -42,7 +43,7 @@ def doctor(
     udev: Annotated[Path | None, typer.Option(help="Write udev rules for the devices.")] = None,
     json: Json = None,
 ) -> None:
-    """Find what keeps devices, or a daemon, from working, and say how to fix it.
+    """Find what keeps devices or a daemon from working, and how to fix it.
 
     Exit code 1 if there is anything to fix.
     """
@@ -83,35 +84,31 @@ def _look_at_daemon(url: str) -> list[Any]:
     try:
         now = snapshot_at(url)
     except SourceError as error:
-        return [Finding("daemon", False, str(error), "`systemctl status tactile-rt`, or start it")]
-    up = f"{(now.t_ns - now.started_ns) / 3.6e12:.1f} h"
-    says = f"{now.state}, version {now.version}, pid {now.pid}, up {up}, {now.config}"
+        return [Finding("daemon", False, str(error), "Start it, or see `systemctl status`.")]
+    says = f"{now.state}, version {now.version}, pid {now.pid}, {now.config}"
     found = [Finding("daemon", not now.diagnostics, says)]
     found += [Finding(one.part, False, one.says, one.do) for one in now.diagnostics]
-    found += [Finding(one.part, True, f"soon: {one.says}", one.do) for one in now.soon]
+    found += [Finding(one.part, True, one.says, one.do) for one in now.soon]
     for source in now.sources:
-        lost, broke = source.stats, source.part.failures
-        gone = lost.corrupt + lost.missing + lost.dropped
-        says = f"{source.samples} samples, {gone} lost, broke {broke} times since the start"
+        gone = source.stats.corrupt + source.stats.missing + source.stats.dropped
+        says = f"{source.samples} samples, {gone} lost, {source.part.failures} times broken so far"
         found.append(Finding(source.part.name, True, says))
-    for log in (c for c in now.consumers if c.kind == "log"):
-        file = str(log.details.get("file", ""))
-        says = _read_last_warning(Path(file)) if file else "on stderr: `journalctl -u tactile-rt`"
-        found.append(Finding("log", True, says))
-    return found
+    logs = (str(c.details.get("file", "")) for c in now.consumers if c.kind == "log")
+    return [*found, *(Finding("log", True, _quote_log(file)) for file in logs)]
 
 
-def _read_last_warning(log: Path) -> str:
+def _quote_log(name: str) -> str:
     """Return the newest warning or error of a log."""
+    if not name:
+        return "on stderr, which systemd keeps: `journalctl -u tactile-rt`"
     try:
-        with log.open("rb") as file:
-            file.seek(max(0, log.stat().st_size - LOG_BYTES))
-            lines = file.read(LOG_BYTES).decode(errors="replace").splitlines()
+        with open(name, "rb") as file:
+            file.seek(max(0, file.seek(0, 2) - LOG_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
     except OSError as error:
-        return f"{log} cannot be read: {error.strerror}"
-    words = (" warning ", " error ", '"level":"warning"', '"level":"error"')
-    last = next((line for line in reversed(lines) if any(w in line for w in words)), "")
-    return f"{log}: {last or 'no warning of late'}"
+        return f"{name}: {error.strerror}"
+    bad = re.compile(r' (warning|error) |"level":"(warning|error)"')
+    return f"{name}: {next(filter(bad.search, reversed(lines)), 'no warning of late')}"
 
 
 def _look_at_simulator() -> list[Any]:

@@ -1,7 +1,7 @@
 """Say of each diagnostic in a sentence what is wrong, since when, and what to do.
 
-The page and `tactile-rt doctor --daemon` show these sentences, `/health` and the ``state`` message
-carry them. A sentence stays the same as long as its diagnostic does.
+The page and `tactile-rt doctor --daemon` show it, `/health` and the ``state`` message carry it. A
+sentence stays the same as long as its diagnostic does.
 """
 
 import threading
@@ -13,90 +13,34 @@ from tactile_rt.daemon.health import BREAKS, Diagnostic
 
 __all__ = ["ADVICE", "Onsets"]
 
-RESOURCES = "Stop other programs, or give it a faster machine; `tactile-rt top` shows what is late."
-# Of each kind what it means, of which part, and what to do.
-ADVICE: dict[str, tuple[str, str]] = {
-    "late": ("the daemon had no turn on the processor", RESOURCES),
-    "UTC has jumped": (
-        "the wall clock jumped",
-        "Let NTP or PTP set it before the daemon starts; times of samples do not depend on it.",
-    ),
-    "old configuration": (
-        "the daemon goes on with its old configuration",
-        "Mend the file (`tactile-rt config check FILE`), then send SIGHUP.",
-    ),
-    "no samples": (
-        "{part} gives no samples",
-        "Look at power and cable, and at the port (`tactile-rt doctor`, `tactile-rt sniff`). It "
-        "is tried again by itself; one that has failed when the configuration changes.",
-    ),
-    "late samples": (
-        "{part} gives its samples late",
-        "Lower the latency timer of the USB adapter (`tactile-rt doctor`), or the load of the bus.",
-    ),
-    "lost samples": (
-        "{part} loses samples",
-        "Look at cable, connectors, baud rate and bus load; `tactile-rt hz URL` counts the losses.",
-    ),
-    "bad samples": (
-        "{part} gives values that are no measurements",
-        "Look at the element's wiring, and at the scale and codec in the source's URL.",
-    ),
-    "stuck-at fault": (
-        "{part} is stuck",
-        "Touch it. If still nothing changes, turn the device off and on, or exchange it.",
-    ),
-    "slow": (
-        "{part} is slower than it should be",
-        "Compare the device's rate with the one in its URL or description; look at its load.",
-    ),
-    "sensor fails": ("{part} says that a sensor fails", "Exchange it; touches of it are not felt."),
-    "another array": (
-        "another array is at {part}",
-        "Plug in the one that was there, or accept the new one by SIGHUP.",
-    ),
-    "no counter": (
-        "losses of {part} cannot be seen",
-        "Let the device count its samples: its counter does not move.",
-    ),
-    "no decisions": (
-        "{part} decides nothing",
-        "Look at the model's file (`tactile-rt model verify FILE`) and its source.",
-    ),
-    "late decisions": ("{part} decides late", RESOURCES),
-    "missing decisions": ("{part} misses decisions", RESOURCES),
-    "implausible loads": (
-        "{part} is given implausible loads",
-        "Compare units, gain and sensor with what the model learnt from; tare again.",
-    ),
-    "old model": (
-        "{part} goes on with its old model",
-        "Look at the new file: `tactile-rt model verify FILE`; then send SIGHUP.",
-    ),
-    "no recording": (
-        "not all is recorded",
-        "Make room on the disk, and look at it and at the folder's permissions. It goes on by "
-        "itself.",
-    ),
-    "not published": (
-        "{part} does not hand on all",
-        "Look at the one who reads it, and at its address or file. It goes on by itself.",
-    ),
-    "no page": ("not all see the page", "Close browsers that nobody looks at, or free its port."),
-    "no metrics": ("not all can read the metrics", "Free its port, or name another."),
-    "no log": (
-        "not all is logged",
-        "Make room, and look at the file's folder; of stderr, at the program that reads it.",
-    ),
-    "no systemd": ("systemd is not told how the daemon is", "Look at NOTIFY_SOCKET and the unit."),
-    "disk full soon": (
-        "the disk fills up",
-        "Move or delete recordings, or record less (see [recorder]).",
-    ),
-    "memory grows": (
-        "the daemon needs more and more memory",
-        "Restart it when that does no harm, and report it with `tactile-rt top --once`.",
-    ),
+LOAD = "Stop other programs, or take a faster machine or a smaller model; see `tactile-rt top`."
+VERIFY = "Look at the model's file: `tactile-rt model verify FILE`; then send SIGHUP."
+# What to do, by what is missing.
+ADVICE = {
+    "late": LOAD,
+    "UTC has jumped": "Let NTP or PTP set the clock before; times of samples do not depend on it.",
+    "old configuration": "Mend the file (`tactile-rt config check FILE`), then send SIGHUP.",
+    "no samples": "Look at power, cable and port: `tactile-rt doctor`. It is tried again.",
+    "late samples": "Lower the latency timer of the USB adapter (`tactile-rt doctor`) or the load.",
+    "lost samples": "Look at cable, connectors, baud rate and bus load: `tactile-rt hz URL`.",
+    "bad samples": "Look at the wiring, and at the scale and codec in the source's URL.",
+    "stuck-at fault": "Touch it. If still nothing changes, turn the device off and on.",
+    "slow": "Compare the device's rate with the one that it is described by; look at its load.",
+    "sensor fails": "Exchange the sensor; what touches it is not felt.",
+    "another array": "Plug in the one that was there, or accept the new one by SIGHUP.",
+    "no counter": "Mend the device's program: its counter does not move.",
+    "no decisions": VERIFY,
+    "late decisions": LOAD,
+    "missing decisions": LOAD,
+    "implausible loads": "Compare unit, gain and sensor with what the model learnt from; tare.",
+    "old model": VERIFY,
+    "no recording": "Look at disk, folder and permissions. It goes on by itself.",
+    "not published": "Look at who reads it, and at its address or file. It goes on by itself.",
+    "no page": "Close browsers that nobody looks at, or free its port.",
+    "no metrics": "Free its port, or name another one.",
+    "no log": "Look at the file's folder and disk; of stderr, at the program that reads it.",
+    "no systemd": "Look at the unit: NotifyAccess and WatchdogSec.",
+    "disk full soon": "Move or delete recordings, or record less (see [recorder]).",
 }
 
 
@@ -110,23 +54,16 @@ class Onsets:
     def explain(
         self, found: Sequence[Diagnostic], now_ns: int, utc_ns: int
     ) -> tuple[Diagnostic, ...]:
-        """Return the diagnostics of now with their beginnings and sentences.
-
-        Args:
-            now_ns: The time at which they are true, host CLOCK_MONOTONIC, ns; `utc_ns` in UTC.
-        """
+        """Return those of now, host CLOCK_MONOTONIC and UTC in ns, with onset and advice."""
         when = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         with self._lock:
-            known = self._begun
             keys = [(one.part, one.what) for one in found]
-            self._begun = {key: known.get(key, (now_ns, when)) for key in keys}
-            begun = [self._begun[key] for key in keys]
-        return tuple(map(_explain, found, begun))
+            begun = self._begun = {key: self._begun.get(key, (now_ns, when)) for key in keys}
+        return tuple(_explain(one, *begun[one.part, one.what]) for one in found)
 
 
-def _explain(one: Diagnostic, begun: tuple[int, str]) -> Diagnostic:
-    what, do = ADVICE.get(one.what, (f"{{part}}: {one.what}", ""))
+def _explain(one: Diagnostic, since_ns: int, when: str) -> Diagnostic:
     it = "it " if one.why.startswith(BREAKS) else ""
-    says = f"{what.format(part=one.part)} since {begun[1]}: {it}{one.why}"
-    says += f"; {one.still}." if one.still else "."
-    return replace(one, since_ns=begun[0], says=says, do=do)
+    still = f"; {one.still}" if one.still else ""
+    says = f"{one.part}: {one.what} since {when}: {it}{one.why}{still}."
+    return replace(one, since_ns=since_ns, says=says, do=ADVICE.get(one.what, ""))

@@ -24,11 +24,10 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
-from tactile_rt.daemon.trends import Trends
 
 __all__ = ["Daemon"]
 
-WATCH_S, LOOK_AHEAD_S = 0.25, 5.0
+WATCH_S = 0.25
 STARTED_S = 5.0  # what has not started by then is told as degraded instead
 LATELY_NS = 1_000_000_000  # how long it is told that the wall clock has jumped
 
@@ -72,7 +71,6 @@ class Daemon:
         self._reloads = self._clock_steps = 0
         self._turns = Turns()
         self._onsets, self._foreseen = Onsets(), Onsets()
-        self._trends, self._soon, self._look_at = Trends(), tuple[Diagnostic, ...](), 0.0
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -179,13 +177,14 @@ class Daemon:
         )  # fmt: skip
         utc = self._clock.utc_ns()
         found = self._onsets.explain(found, now, utc)
+        soon = [Diagnostic(c.part.name, "disk full soon", c.soon) for c in consumers if c.soon]
         state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(
             VERSION, os.getpid(), str(self._loaded.path), now,
             utc, self._started_ns, self._reloads, state,
             tuple(one.line for one in found), self._clock_steps, sources, models, consumers,
-            found, self._soon,
+            found, self._foreseen.explain(soon, now, utc),
         )  # fmt: skip
 
     def streams(self) -> Mapping[str, Opened]:
@@ -296,7 +295,6 @@ class Daemon:
                 source.judge(next((p.sensor for p in on_it if p.sensor is not None), None))
             for part in self._parts():
                 part.watch()
-            self._look_ahead()
             step = self._clock.stepped_ns()
             if step:
                 self._clock_steps += 1
@@ -318,17 +316,6 @@ class Daemon:
                 done, self._on_over = self._on_over, None
                 if done is not None:
                     done()
-
-    def _look_ahead(self) -> None:
-        if time.monotonic() < self._look_at:
-            return
-        self._look_at = time.monotonic() + LOOK_AHEAD_S
-        soon = self._trends.look([p.consumer_state for _, p in self._consumers.copy().values()])
-        now, utc = self._clock.monotonic_ns(), self._clock.utc_ns()
-        before, self._soon = self._soon, self._foreseen.explain(soon, now, utc)
-        for one in self._soon:
-            if (one.part, one.what) not in {(x.part, x.what) for x in before}:
-                self.report("daemon", "soon", one.line, "warning")
 
     def _hold_devices(self) -> None:
         """A link to a device that was plugged in again leads to another one: that is held now, and

@@ -168,6 +168,7 @@ class ConsumerState:
     losses: Losses = field(default_factory=Losses)  # items dropped from its mailbox, or by itself
     diagnostic: str = ""  # what keeps it from its work now, in words
     on_disk: dict[str, OnDisk] = field(default_factory=dict)  # of the recorder alone, by source
+    soon: str = ""  # what will keep it from its work if it goes on so, in words
 
 
 @dataclass(frozen=True)

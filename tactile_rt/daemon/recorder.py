@@ -125,7 +125,7 @@ class Recorder(Consumer):
         self._on = True
         self._files = self._bytes = 0
         self._lost_samples = 0
-        self._newest = ""
+        self._newest = self._soon = ""
         self._flush_at = self._sync_at = 0.0
 
     def open(self, view: View) -> None:
@@ -177,17 +177,22 @@ class Recorder(Consumer):
     def details(self) -> dict[str, str | int | float]:
         tracks = list(self._tracks.values())
         recording = sum(track.file is not None for track in tracks)
-        size = self._bytes + sum(t.file.stats.bytes for t in tracks if t.file is not None)
         return {
             "state": self._folder.state if self._folder.why else "on" if self._on else "off",
             "mode": self._config.mode,
             "recording": recording,
             "files": self._files,
-            "megabytes": round(size / MB, 1),
+            "megabytes": round(self._written_mb(), 1),
             "lost_samples": self._lost_samples,
-            "room_mb": round(self._folder.room_mb),
             "newest": self._newest,
         }
+
+    def _written_mb(self) -> float:
+        files = [track.file for track in list(self._tracks.values())]
+        return (self._bytes + sum(f.stats.bytes for f in files if f is not None)) / MB
+
+    def foresee(self) -> str:
+        return self._soon
 
     def diagnose(self) -> str:
         folder = self._folder
@@ -388,6 +393,7 @@ class Recorder(Consumer):
     def _look_after(self, sync: bool) -> None:
         """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
         self._folder.has_room()
+        self._soon = self._folder.foresee(self._written_mb())
         self._settle()
         now = time.monotonic_ns()
         closed = [
@@ -457,16 +463,15 @@ class Recorder(Consumer):
         if file is None:
             if why != track.diagnostic:
                 self._warn(f"{why}: not recording")
-        else:
-            now = time.monotonic_ns()
-            again = now - file.begun_ns < STEADY_S * NS and bool(track.failures)
-            if not again:
-                track.failures = 0
-                self._warn(f"{words(file.path, error)}; {KEEPS}")
-            track.retry_ns = now + round(min(track.failures, PAUSES) * PAUSE_S * NS)
-            track.failures += 1
+            track.diagnostic = why
+            return
+        now = time.monotonic_ns()
+        if not track.failures or now - file.begun_ns > STEADY_S * NS:
+            track.failures = 0
+            self._warn(f"{words(file.path, error)}; {KEEPS}")
+        track.retry_ns = now + round(min(track.failures, PAUSES) * PAUSE_S * NS)
+        track.failures += 1
         track.diagnostic = why
-        if file is not None:
-            kept = file.flushed if file.failed is None else file.synced
-            self._count_lost(track, *file.disown(kept), why)
-            self._finish_file(track, finish=file.failed is None, told=True)
+        kept = file.flushed if file.failed is None else file.synced
+        self._count_lost(track, *file.disown(kept), why)
+        self._finish_file(track, finish=file.failed is None, told=True)

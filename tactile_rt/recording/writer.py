@@ -404,11 +404,8 @@ class _Growing(io.FileIO):
 def _create(path: Path, special: bool) -> io.BufferedWriter:
     if special:
         return path.open("wb")
-    return io.BufferedWriter(_Growing(path, "ab", opener=_open_new))
-
-
-def _open_new(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_EXCL, 0o666)
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
+    return io.BufferedWriter(_Growing(handle, "ab"))
 
 
 def _reveal(hidden: Path, path: Path, force: bool) -> None:

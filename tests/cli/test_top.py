@@ -5,7 +5,6 @@ import io
 import socket
 import sys
 import threading
-from contextlib import ExitStack
 
 import pytest
 from rich.console import Console
@@ -44,23 +43,11 @@ def text(renderable, width=118):
 
 
 @pytest.fixture
-def daemon_of():
-    """Make the URL of one that is so."""
-    with ExitStack() as stack:
-
-        def serve(snapshot):
-            port = free_port()
-            metrics = Metrics("metrics", MetricsConfig(port=port))
-            stack.enter_context(running(metrics, View(snapshot=snapshot)))
-            return f"http://127.0.0.1:{port}"
-
-        yield serve
-
-
-@pytest.fixture
-def daemon(daemon_of):
+def daemon():
     """URL of one that is being watched."""
-    return daemon_of(busy_snapshot())
+    port = free_port()
+    with running(Metrics("metrics", MetricsConfig(port=port)), View(snapshot=busy_snapshot())):
+        yield f"http://127.0.0.1:{port}"
 
 
 @pytest.fixture
@@ -104,17 +91,16 @@ def test_it_looks_at_a_running_daemon(daemon, top):
     assert code == 0, err
 
 
-def test_doctor_says_what_a_daemon_suffers_from_and_what_its_log_said(daemon_of, call, tmp_path):
+def test_doctor_says_what_a_daemon_suffers_from_and_what_its_log_said(call, tmp_path, monkeypatch):
     (tmp_path / "log").write_text("a warning b: old\na warning c: new\na info d: fine\n")
     log = ConsumerState(part("log"), "log", details={"file": str(tmp_path / "log")})
     found = Diagnostic("source.a", "no samples", "lost", says="a gives none.", do="Look at it.")
     sick = dataclasses.replace(busy_snapshot(), diagnostics=(found,), consumers=(log,))
-    code, out, _ = call("doctor", "--daemon", daemon_of(sick))
-    assert code == 1 and "bad source.a: a gives none.\n    -> Look at it.\n" in out
-    assert "a warning c: new" in out and "5000 samples, 9 lost" in out
-    well = dataclasses.replace(sick, diagnostics=(), state="running")
-    assert call("doctor", "--daemon", daemon_of(well))[0] == 0
-    assert call("doctor", "--daemon", f"http://127.0.0.1:{free_port()}")[0] == 1
+    for shown, ends in ((sick, 1), (dataclasses.replace(sick, diagnostics=()), 0)):
+        monkeypatch.setattr("tactile_rt.cli.top.snapshot_at", lambda url, shown=shown: shown)
+        code, out, _ = call("doctor", "--daemon", "http://robot:9464")
+        assert code == ends and "a warning c: new" in out and "5000 samples, 9 lost" in out
+        assert ("bad source.a: a gives none.\n    -> Look at it.\n" in out) == bool(ends)
 
 
 def test_it_reads_what_the_jsonl_publisher_says(top, monkeypatch):
