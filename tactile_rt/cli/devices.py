@@ -38,7 +38,7 @@ def list_devices(json: Json = None) -> None:
 @app.command(epilog="tactile-rt doctor --daemon http://127.0.0.1:9464")
 def doctor(
     daemon: Annotated[
-        str, typer.Option(help="Look at a running daemon instead: the URL of its [metrics].")
+        str, typer.Option(help="Look at a running daemon instead: the URL of its metrics.")
     ] = "",
     udev: Annotated[Path | None, typer.Option(help="Write udev rules for the devices.")] = None,
     json: Json = None,
