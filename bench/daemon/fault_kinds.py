@@ -175,6 +175,14 @@ def _folder_deleted(scene: FaultScene) -> Iterator[float]:
     yield time.monotonic()
 
 
+def _recordings_emptied(scene: FaultScene) -> Iterator[float]:
+    """As a log rotator that copies a file and then cuts it short does with the newest ones."""
+    files = (scene.disk / "recordings").glob("*.mcap")
+    for file in sorted(files, key=lambda f: f.stat().st_mtime)[-2:]:
+        os.truncate(file, 0)
+    yield time.monotonic()
+
+
 def _folder_is_a_file(scene: FaultScene) -> Iterator[float]:
     folder, aside = scene.disk / "recordings", scene.disk / "aside"
     folder.rename(aside)
@@ -481,6 +489,7 @@ KINDS: dict[str, FaultKind] = {
         _mood("finger", "gaps", 0.2), (("source.finger", "lost samples"),)
     ),
     "recordings_deleted": FaultKind(_folder_deleted, (RECORDER,), lasts=False),
+    "recordings_emptied": FaultKind(_recordings_emptied, (RECORDER,), lasts=False),
     "folder_is_a_file": FaultKind(_folder_is_a_file, (RECORDER,)),
     "folder_read_only": FaultKind(_folder_read_only, (RECORDER,), root=True),
     "disk_hangs": FaultKind(_disk_hangs, (RECORDER,), root=True),

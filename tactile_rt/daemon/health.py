@@ -174,6 +174,7 @@ class ConsumerState:
     losses: Losses = field(default_factory=Losses)  # items dropped from its mailbox, or by itself
     diagnostic: str = ""  # what keeps it from its work now, in words
     on_disk: dict[str, OnDisk] = field(default_factory=dict)  # of the recorder alone, by source
+    soon: str = ""  # what will keep it from its work if it goes on so, in words
 
 
 @dataclass(frozen=True)
@@ -186,12 +187,18 @@ class Diagnostic:
         what: What is missing, in a few words.
         why: The reason in words; of a part that breaks what it does, such as ``fails: no port``.
         still: What goes on all the same; may be empty.
+        since_ns: The time at which it was first found, host CLOCK_MONOTONIC, ns.
+        says: All of it in a sentence, with the time in UTC; empty before it is explained.
+        do: What to do.
     """
 
     part: str
     what: str
     why: str
     still: str = ""
+    since_ns: int = 0
+    says: str = ""
+    do: str = ""
 
     @property
     def line(self) -> str:
@@ -218,6 +225,7 @@ class Snapshot:
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
+    soon: tuple[Diagnostic, ...] = ()  # what will not work if it goes on so; no fault yet
 
 
 class LatencyMeter:

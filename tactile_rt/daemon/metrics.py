@@ -2,7 +2,7 @@
 
 The text is Prometheus' exposition format 0.0.4; names and units are as its conventions ask for:
 base units, ``_total`` for what only grows. Only GET; at most 8 KiB a request, in two seconds, 16
-at a time.
+at a time, of which the newest are answered.
 """
 
 import os
@@ -16,7 +16,7 @@ import msgspec
 
 from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
-from tactile_rt.daemon.consumer import TAKEN, Consumer, View
+from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
@@ -27,7 +27,7 @@ __all__ = ["ALERTS", "Metrics", "exposition"]
 
 ALERTS = Path(__file__).parents[1] / "assets" / "alerts.yml"
 
-LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0)
+LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0, newest_first=True)
 HEADERS = {"cache-control": "no-store", "x-content-type-options": "nosniff"}
 EXPOSITION, JSON = "text/plain; version=0.0.4; charset=utf-8", "application/json"
 STATES = ("starting", "running", "degraded", "stopping")
@@ -68,10 +68,6 @@ class Metrics(Consumer):
         if self._server is not None:
             self._server.close()
 
-    def diagnose(self) -> str:
-        server = self._server
-        return TAKEN if server is not None and server.full else ""
-
     def details(self) -> dict[str, str | int | float]:
         server = self._server
         return {
@@ -97,6 +93,7 @@ class Metrics(Consumer):
                 "state": snapshot.state,
                 "degraded": snapshot.degraded,
                 "diagnostics": snapshot.diagnostics,
+                "soon": [one.line for one in snapshot.soon],
                 "version": snapshot.version,
                 "uptime_s": (snapshot.t_ns - snapshot.started_ns) / 1e9,
             }
@@ -143,6 +140,7 @@ def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labe
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]
     yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
+    yield SOON, [({"part": t.part, "what": t.what}, t) for t in s.soon]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
     yield SOURCE, [({"source": _short(x)}, x) for x in s.sources]
     yield MODEL, [({"model": _short(x), "source": x.source}, x) for x in s.models]
@@ -198,6 +196,9 @@ DAEMON: tuple[Row, ...] = (
 )  # fmt: skip
 DIAGNOSTIC: tuple[Row, ...] = (
     ("diagnostic", "", "1 for each thing that does not work.", lambda t, _: 1),
+)
+SOON: tuple[Row, ...] = (
+    ("soon", "", "1 for each thing that will not work soon if it goes on so.", lambda t, _: 1),
 )
 PART: tuple[Row, ...] = (
     ("part_state", "state", "1 for the state a part is in.",

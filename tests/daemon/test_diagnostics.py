@@ -1,7 +1,9 @@
 """What is told as degraded: facts at the end of each promise, and nothing else."""
 
 import itertools
+import re
 from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -9,13 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.daemon.fault_kinds import KINDS
 from tactile_rt.core.stream import Chunk
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.daemon import diagnostics as module
+from tactile_rt.daemon.advice import ADVICE, Onsets
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.diagnostics import LossWindow, diagnose
 from tactile_rt.daemon.health import (
     ConsumerState,
+    Diagnostic,
     Losses,
     ModelState,
     OnDisk,
@@ -214,6 +219,26 @@ def test_what_is_wrong_with_the_daemon_itself_is_told():
     assert told(clock_stepped=True) == ["UTC has jumped: daemon: the wall clock was set"]
     (line,) = told(refused="no such codec")
     assert line.startswith("old configuration: daemon: ") and "no such codec" in line
+
+
+def test_a_diagnostic_says_since_when_it_lasts_and_what_to_do():
+    onsets, utc = Onsets(), 1_700_000_000 * S
+    lost = Diagnostic("source.a", "no samples", "fails: no port", "recording goes on")
+    (first,) = onsets.explain([lost], 5 * S, utc)
+    (later,) = onsets.explain([replace(lost, why="the device is lost")], 9 * S, utc + 4 * S)
+    assert (first.since_ns, later.since_ns) == (5 * S, 5 * S) and first.do
+    said = (
+        "source.a: no samples since 2023-11-14 22:13:20 UTC: it fails: no port; recording goes on."
+    )
+    assert first.says == said
+    assert onsets.explain([], 10 * S, utc + 5 * S) == ()
+    assert onsets.explain([lost], 11 * S, utc + 6 * S)[0].since_ns == 11 * S
+
+
+def test_there_is_advice_for_every_kind_of_diagnostic():
+    made = re.findall(r'Diagnostic\([^,()]+, "([^"]+)"', Path(module.__file__).read_text())
+    rig = {what for kind in KINDS.values() for _, what in kind.named + kind.also}
+    assert {*made, *rig, "no systemd", "no metrics"} <= ADVICE.keys() and len(made) > 9
 
 
 class Hand:

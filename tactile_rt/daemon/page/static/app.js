@@ -115,7 +115,7 @@ const stream = new Stream({
   link(state, reason) {
     if (state === "locked") {
       $("login").hidden = false;
-      $("main").hidden = $("degraded").hidden = true;
+      $("main").hidden = $("degraded").hidden = $("soon").hidden = true;
       say("", 0);
       $("token").focus();
     } else if (state === "full") {
@@ -283,14 +283,24 @@ function states() {
   $("by-model").hidden = models.length === 0;
   $("daemon").textContent = "daemon " + s.state;
   $("daemon").className = "chip " + ({ running: "good", degraded: "warn" }[s.state] || "warn");
-  $("degraded").replaceChildren(...s.degraded.map((line) => make("li", line)));
-  $("degraded").hidden = s.degraded.length === 0;
+  tell("degraded", s.diagnostics);
+  tell("soon", s.soon);
   const now = s.models.find((m) => m.part.name === "model." + model);
   touching = Boolean(now && now.touching);
   figures(s, now);
   parts(s);
   recording(s.consumers.find((c) => c.kind === "recorder"));
   tellLink();
+}
+
+// Sentences of the daemon, and what to do.
+function tell(where, told) {
+  $(where).replaceChildren(...told.map(({ says, do: advice }) => {
+    const item = make("li", says);
+    if (advice) item.append(make("p", advice));
+    return item;
+  }));
+  $(where).hidden = told.length === 0;
 }
 
 // Without an array there is nothing to draw: say why instead.
