@@ -26,7 +26,7 @@ ADVICE = {
     "bad samples": "Look at the wiring, and at the scale and codec in the source's URL.",
     "stuck-at fault": "Touch it. If still nothing changes, turn the device off and on.",
     "slow": "Compare the device's rate with the one that it is described by; look at its load.",
-    "sensor fails": "Exchange the sensor; what touches it is not felt.",
+    "device fault": "See its manual on what it says; what touches a broken sensor is not felt.",
     "another array": "Plug in the one that was there, or accept the new one by SIGHUP.",
     "no counter": "Mend the device's program: its counter does not move.",
     "no decisions": VERIFY,
