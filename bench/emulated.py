@@ -131,6 +131,7 @@ class LoopedSource(Source):
     """
 
     live = False
+    every = 1  # of so many samples one is measured
 
     def __init__(
         self, spec: ArraySpec, signal: NDArray[np.float32], samples: int | None = None
@@ -148,6 +149,7 @@ class LoopedSource(Source):
         seq = self._sent + np.arange(n, dtype=np.int64)
         self._sent, self._left = self._sent + n, self._left - n
         t_ns = np.round(seq * (NS_PER_S / self.spec.rate_hz)).astype(np.int64)
+        seq, t_ns = seq[:: self.every], t_ns[:: self.every]
         values = self._loop[seq % len(self._loop)]
         return Chunk(seq, t_ns, values, np.ones(values.shape[:2], np.bool_))
 
@@ -201,8 +203,9 @@ class EmulatedArray(EmulatedDevice):
 
     Attributes:
         mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
-            same values again and again; ``no_number``: NaN; ``gaps``, ``corrupt``: every twentieth
-            sample is missing, or damaged.
+            same values again and again; ``no_number``: NaN; ``slow``: at half its rate;
+            ``fails``: its status says that a sensor fails; ``uncounted``: its counter stands;
+            ``gaps``, ``corrupt``: every twentieth sample is missing, or damaged.
     """
 
     def __init__(self, script: ArrayScript, signal: NDArray[np.float32] | None = None) -> None:
@@ -244,12 +247,15 @@ class EmulatedArray(EmulatedDevice):
     def _felt(self, chunk: Chunk) -> Chunk:
         """What the array's mood makes of what it feels."""
         values = chunk.values
+        self._source.every = 2 if self.mood == "slow" else 1
+        self.codec.status = 2 if self.mood == "fails" else 0
         if self.mood == "stuck":
             values = np.broadcast_to(self._last, values.shape).copy()
         elif self.mood == "no_number":
             values = np.full_like(values, np.nan)
         self._last = values[-1]
-        return Chunk(chunk.seq, chunk.t_ns, values, chunk.valid)
+        seq = np.zeros_like(chunk.seq) if self.mood == "uncounted" else chunk.seq
+        return Chunk(seq, chunk.t_ns, values, chunk.valid)
 
     def end(self) -> None:
         """Measure nothing more; what is measured still goes out."""
@@ -277,8 +283,8 @@ def play(pipe: Connection, script: ArrayScript) -> None:
     """Be an array in a process of its own, for `Helper`: say the URL, then obey until it hangs up.
 
     The words: ``mood NAME`` (say when), ``unplug`` (say when it began), ``replug`` (say when it was
-    done), ``end`` (of what is measured; say when), ``done`` (say whether), ``where`` (in words),
-    ``played`` (a `Played`).
+    done), ``number TEXT`` (be the array of that serial number), ``end`` (of what is measured; say
+    when), ``done`` (say whether), ``where`` (in words), ``played`` (a `Played`).
     """
     with suppress(OSError):  # a device has a processor of its own; where that is allowed
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
@@ -293,6 +299,8 @@ def play(pipe: Connection, script: ArrayScript) -> None:
             answer: Any = began
             if word.startswith("mood "):
                 device.mood = word.removeprefix("mood ")
+            elif word.startswith("number "):
+                device.codec.serial_number = word.removeprefix("number ")
             elif word == "unplug":
                 device.unplug()
             elif word == "replug":

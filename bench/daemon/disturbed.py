@@ -116,6 +116,7 @@ class DisturbedDaemon:
                 Helper(play, ArrayScript(
                     "serial" if name == "whiskers" else "slcan", spec,
                     round(LONGEST_S * spec.rate_hz), str(self.folder / name),
+                    options={"serial_number": "A"},
                 ))
             )
             for name, spec in specs.items()

@@ -16,7 +16,7 @@ from pathlib import Path
 from bench.daemon.disturbed import DisturbedDaemon
 from bench.daemon.overload import slow_down
 from bench.daemon.process import free_port
-from tests.helpers.hostile_models import GREEDY, write_burdened
+from tests.helpers.hostile_models import GREEDY, no_number, write_burdened
 
 STUCK_AT_S = 0.3
 DISK_MB, SPARE_MB = 96, 24  # of the recordings' file system; that must be free
@@ -158,8 +158,28 @@ def _unplugged(array: str) -> Callable[[FaultScene], Iterator[float]]:
     return cause
 
 
+def _exchanged(array: str) -> Callable[[FaultScene], Iterator[float]]:
+    def cause(scene: FaultScene) -> Iterator[float]:
+        line = scene.arrays[array]
+        for word in ("unplug", "number B", "replug"):
+            line.ask(word)
+        yield time.monotonic() + 0.5  # until it has described itself
+        for word in ("unplug", "number A", "replug"):
+            line.ask(word)
+
+    return cause
+
+
 def _folder_deleted(scene: FaultScene) -> Iterator[float]:
     shutil.rmtree(scene.disk / "recordings")
+    yield time.monotonic()
+
+
+def _recordings_emptied(scene: FaultScene) -> Iterator[float]:
+    """As a log rotator that copies a file and then cuts it short does with the newest ones."""
+    files = (scene.disk / "recordings").glob("*.mcap")
+    for file in sorted(files, key=lambda f: f.stat().st_mtime)[-2:]:
+        os.truncate(file, 0)
     yield time.monotonic()
 
 
@@ -338,6 +358,16 @@ def _garbage_configuration(scene: FaultScene) -> Iterator[float]:
     scene.configure()
 
 
+def _pipe_configuration(scene: FaultScene) -> Iterator[float]:
+    since = scene.mark()
+    scene.daemon.path.unlink()
+    os.mkfifo(scene.daemon.path)
+    scene.daemon.reload()
+    yield scene.await_told(since, "daemon", "refused").t_ns / 1e9
+    scene.daemon.path.unlink()
+    scene.configure()
+
+
 def _garbage_model(scene: FaultScene) -> Iterator[float]:
     scene.put_model(b"no model\n" * 1000)
     yield time.monotonic()
@@ -353,6 +383,17 @@ def _greedy_model(scene: FaultScene) -> Iterator[float]:
     good.write_bytes(scene.good_model)
     scene.put_model(write_burdened(file, GREEDY["outer_product_1.3_GB"], good).read_bytes())
     yield scene.await_told(since, "model.whiskers", "refused").t_ns / 1e9
+    since = scene.mark()
+    scene.put_model(scene.good_model)
+    scene.await_told(since, "model.whiskers", "admitted")
+
+
+def _model_without_numbers(scene: FaultScene) -> Iterator[float]:
+    since, file, good = scene.mark(), scene.folder / "numberless.onnx", scene.folder / "good.onnx"
+    good.write_bytes(scene.good_model)
+    scene.put_model(write_burdened(file, no_number, good).read_bytes())
+    # what it answers is seen when something is touched
+    yield scene.await_told(since, "model.whiskers", "admitted").t_ns / 1e9 + 2.0
     since = scene.mark()
     scene.put_model(scene.good_model)
     scene.await_told(since, "model.whiskers", "admitted")
@@ -418,6 +459,23 @@ KINDS: dict[str, FaultKind] = {
         _mood("whiskers", "stuck", STUCK_AT_S + 0.064), (("source.whiskers", "stuck-at fault"),)
     ),
     "coarse_sensor_at_rest": FaultKind(_mood("finger", "stuck")),
+    "device_slow": FaultKind(  # two seconds are given to see it
+        _mood("whiskers", "slow", 1.0 + 0.064), (("source.whiskers", "slow"),)
+    ),
+    "can_device_slow": FaultKind(_mood("finger", "slow", 1.0 + 0.5), (("source.finger", "slow"),)),
+    "counter_stuck": FaultKind(
+        _mood("whiskers", "uncounted", 0.064), (("source.whiskers", "no counter"),)
+    ),
+    "array_exchanged": FaultKind(
+        _exchanged("whiskers"), (("source.whiskers", "another array"),),
+        (("source.whiskers", "lost samples"), ("source.whiskers", "no samples")),
+    ),
+    "device_fails": FaultKind(
+        _mood("whiskers", "fails", 0.064), (("source.whiskers", "device fault"),)
+    ),
+    "can_device_fails": FaultKind(
+        _mood("finger", "fails", 0.2), (("source.finger", "device fault"),)
+    ),
     "no_numbers": FaultKind(
         _mood("whiskers", "no_number", 0.064), (("source.whiskers", "bad samples"),)
     ),
@@ -431,6 +489,7 @@ KINDS: dict[str, FaultKind] = {
         _mood("finger", "gaps", 0.2), (("source.finger", "lost samples"),)
     ),
     "recordings_deleted": FaultKind(_folder_deleted, (RECORDER,), lasts=False),
+    "recordings_emptied": FaultKind(_recordings_emptied, (RECORDER,), lasts=False),
     "folder_is_a_file": FaultKind(_folder_is_a_file, (RECORDER,)),
     "folder_read_only": FaultKind(_folder_read_only, (RECORDER,), root=True),
     "disk_hangs": FaultKind(_disk_hangs, (RECORDER,), root=True),
@@ -462,8 +521,14 @@ KINDS: dict[str, FaultKind] = {
     "configuration_is_garbage": FaultKind(
         _garbage_configuration, (("daemon", "old configuration"),)
     ),
+    "configuration_is_a_pipe": FaultKind(
+        _pipe_configuration, (("daemon", "old configuration"),)
+    ),
     "model_is_garbage": FaultKind(_garbage_model, (("daemon", "old configuration"),)),
     "model_is_greedy": FaultKind(_greedy_model, (("model.whiskers", "old model"),)),
+    "model_without_numbers": FaultKind(
+        _model_without_numbers, (("model.whiskers", "no decisions"),)
+    ),
     "model_is_slow": FaultKind(
         _slow_model, (("model.whiskers", "missing decisions"),),
         (("model.whiskers", "late decisions"),),

@@ -7,6 +7,7 @@
 
 extern const char board_description[];
 extern const uint16_t board_description_size;
+extern const char board_serial[];                  /* of this one board: a chip has such a number */
 extern uint32_t board_micros(void);
 extern int board_running(void);                    /* a real device returns 1 for ever */
 extern size_t board_read(uint8_t *data, size_t n); /* what has come, without waiting */
@@ -16,12 +17,15 @@ extern int board_measure(float *values, uint8_t *valid); /* 1 when a new sample 
 int main(void) {
     static uint8_t out[TRN_SAMPLE_SIZE(WHISKERS, CHANNELS, 4)];
     static trn_parser parser;
-    trn_device device = {board_description, board_description_size, 0, 0, {0}};
+    static char described[4096];
+    trn_device device = {described, 0, 0, 0, {0}};
     uint8_t in[64], valid[TRN_MASK_SIZE(WHISKERS)] = {0};
     float values[WHISKERS * CHANNELS];
     trn_sample sample = {WHISKERS, CHANNELS, 0, 0, 0, valid};
     trn_command command;
 
+    device.description_size = trn_describe(described, sizeof described, board_description,
+                                           board_description_size, board_serial);
     while (board_running()) {
         const uint8_t *data = in;
         size_t n = board_read(in, sizeof in);

@@ -297,6 +297,20 @@ static inline int trn_from_device(uint8_t type) {
     return type == TRN_SAMPLE || type == TRN_DESCRIPTION || type == TRN_ACK;
 }
 
+/* Put a device's serial number (letters, digits, ._-) into a description that has none; the new
+ * size, or 0 if there is no room: size + strlen(serial) + 12 bytes. */
+static inline uint16_t trn_describe(char *out, size_t room, const char *text, uint16_t size,
+                                    const char *serial) {
+    static const char key[] = ",\"serial\":\"";
+    size_t n = strlen(serial), k = sizeof key - 1u, all = size + n + k + 1u;
+    if (!size || all > room || all > 65535u) return 0;
+    memcpy(out, text, size - 1u); /* all but the last brace */
+    memcpy(out + size - 1u, key, k);
+    memcpy(out + size - 1u + k, serial, n);
+    memcpy(out + size - 1u + k + n, "\"}", 2u);
+    return (uint16_t)all;
+}
+
 /* Obey a command and answer it. */
 static inline void trn_answer(trn_device *d, const trn_command *c, trn_write write, void *to) {
     uint8_t out[TRN_HEADER_SIZE + 2u + TRN_CRC_SIZE], ack[2];

@@ -188,6 +188,7 @@ class Classifier:
         touches: The newest 256 changes of contact, as stream time (ns) and whether it began;
             whoever reads them takes them out.
         implausible: True if the newest episode has implausible loads, see `ClassifierStats`.
+        undecided: True if the newest answer was no number, and so no decision.
         stats: The counters of steps, late steps and bad samples.
         providers: Names of the execution providers in use, as onnxruntime has them.
 
@@ -259,7 +260,7 @@ class Classifier:
         self._next_seq = 0
         self._rated = rated_noise(self.card)
         self._plausible = IMPLAUSIBLE * np.array(self.card.clip, dtype=np.float32)
-        self.implausible = False
+        self.implausible = self.undecided = False
         self._set_rule: PredictionSetRule | None = None  # of the episode
         self._columns = kind_columns(self.card.kinds)
         self._name_rules: dict[str, PredictionSetRule | None] = {}  # likewise, by class
@@ -395,6 +396,7 @@ class Classifier:
             return None
         lane, step = asked
         probabilities = self._posterior(logits[lane])
+        self.undecided = probabilities is None
         if probabilities is None:
             # The state is no number and would stay none: end the episode, or begin windows anew.
             self.stats.bad_steps += 1

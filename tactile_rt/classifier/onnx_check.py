@@ -32,6 +32,22 @@ MICROSOFT = frozenset(
 )  # fmt: skip
 # Operators whose output is as large as a constant input says: the input's position.
 SIZED_BY = {"ConstantOfShape": 0, "Expand": 1, "OneHot": 1, "Pad": 1, "Range": 1, "Tile": 1}
+# Operators whose output has a shape that is not known from the shapes of the inputs: it follows the
+# values of all inputs, or of those from this position on. Memory and time must not follow a touch.
+SHAPED_BY = {
+    **dict.fromkeys(
+        ("BlackmanWindow", "ConstantOfShape", "HammingWindow", "HannWindow", "If", "ImageDecoder",
+         "MelWeightMatrix", "NonMaxSuppression", "NonZero", "Range", "StringConcat",
+         "StringNormalizer", "StringSplit", "Unique"), 0),
+    **dict.fromkeys(
+        ("AffineGrid", "CenterCropPad", "Col2Im", "Compress", "DFT", "Expand", "OneHot", "Pad",
+         "ReduceL1", "ReduceL2", "ReduceLogSum", "ReduceLogSumExp", "ReduceMax", "ReduceMean",
+         "ReduceMin", "ReduceProd", "ReduceSum", "ReduceSumSquare", "Reshape", "Resize", "STFT",
+         "SequenceAt", "SequenceErase", "Slice", "Split", "SplitToSequence", "Squeeze", "Tile",
+         "TopK", "Unsqueeze", "Upsample"), 1),
+    "MaxUnpool": 2,
+    "SequenceInsert": 2,
+}  # fmt: skip
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 TENSOR_BITS = {1: 32, 2: 8, 3: 8, 4: 16, 5: 16, 6: 32, 7: 64, 9: 8, 10: 16, 11: 64, 12: 32,
                13: 64, 14: 64, 15: 128, 16: 16, 17: 8, 18: 8, 19: 8, 20: 8, 21: 4,
@@ -69,7 +85,7 @@ def read_onnx(data: bytes) -> Contents:
 
     Raises:
         BadModel: damaged, or with external data, foreign operators, functions, training, loops,
-            or anything past this module's limits.
+            shapes that follow the values of an input, or anything past this module's limits.
     """
     return _Walk(data).model()
 
@@ -108,6 +124,7 @@ class _Walk:
         self.found = Contents()
         self.sizes: dict[str, int] = {}  # of constants that may be shapes: elements they ask for
         self.asked: list[tuple[str, str]] = []  # (operator, constant) to look up at the end
+        self.nodes: list[tuple[str, list[str], list[str]]] = []  # operator, inputs, outputs
 
     def fields(self, at: int, end: int) -> Iterator[tuple[int, int, int, int]]:
         """(field number, wire type, start or varint value, end) of every field in a message."""
@@ -187,7 +204,28 @@ class _Walk:
         for operator, name in self.asked:
             if self.sizes.get(name, 0) > MAX_ELEMENTS:
                 raise BadModel(f"{operator} asks for {self.sizes[name]} elements")
+        self.check_shapes()
         return self.found
+
+    def check_shapes(self) -> None:
+        """Refuse shapes that follow the values of the graph's inputs.
+
+        No trial could try them all. Nodes may stand in any order, and names of a graph within a
+        graph count as everybody's."""
+        readers: dict[str, list[int]] = {}
+        for i, (operator, inputs, _) in enumerate(self.nodes):
+            if operator not in ("Shape", "Size"):  # what they read is the same whatever is touched
+                for name in set(inputs):
+                    readers.setdefault(name, []).append(i)
+        live, waiting = set(self.found.inputs), list(self.found.inputs)
+        while waiting:
+            for i in readers.get(waiting.pop(), ()):
+                operator, inputs, outputs = self.nodes[i]
+                if live.intersection(inputs[SHAPED_BY.get(operator, len(inputs)) :]):
+                    raise BadModel(f"operator {operator!r} makes a shape of what is measured")
+                new = set(outputs) - live
+                live |= new
+                waiting += new
 
     def opset(self, at: int, end: int) -> None:
         domain, version = "", 0
@@ -208,7 +246,8 @@ class _Walk:
             raise BadModel(f"metadata {pair['key'][:40]!r} twice")
         self.found.metadata[pair["key"]] = pair["value"]
 
-    def graph(self, at: int, end: int, depth: int) -> None:
+    def graph(self, at: int, end: int, depth: int) -> tuple[list[str], list[str]]:
+        """Returns the names of its inputs and outputs."""
         if depth > MAX_DEPTH:
             raise BadModel(f"more than {MAX_DEPTH} graphs within graphs")
         names: dict[str, list[str]] = {"tensor": [], "input": [], "output": [], "value": []}
@@ -225,6 +264,7 @@ class _Walk:
             stored = set(names["tensor"])
             self.found.inputs = tuple(name for name in names["input"] if name not in stored)
             self.found.outputs = tuple(names["output"])
+        return names["input"], names["output"]
 
     def node(self, at: int, end: int, depth: int) -> None:
         inputs, outputs, operator, domain = [], [], "", ""
@@ -251,23 +291,33 @@ class _Walk:
         if operator == "Loop":
             raise BadModel("operator 'Loop', which may never end")
         self.found.operators[operator] += 1
+        outputs = [name for name in outputs if name]  # those that are left out have none
+        self.nodes.append((operator, inputs, outputs))
         for start, stop in attributes:
-            self.attribute(start, stop, depth, outputs[0] if outputs else "")
+            for inner_inputs, inner_outputs in self.attribute(
+                start, stop, depth, outputs[0] if outputs else ""
+            ):
+                self.nodes.append(("", [*inputs, *inner_outputs], [*inner_inputs, *outputs]))
         position = SIZED_BY.get(operator)
         if position is not None and len(inputs) > position:
             self.asked.append((operator, inputs[position]))
 
-    def attribute(self, at: int, end: int, depth: int, output: str) -> None:
-        """`output`: what a Constant node would call the tensor."""
+    def attribute(
+        self, at: int, end: int, depth: int, output: str
+    ) -> list[tuple[list[str], list[str]]]:
+        """`output`: what a Constant node would call the tensor. Returns what `graph` does of each
+        graph in it."""
+        graphs = []
         for what, start, stop in self.messages(
             at, end, tensor=5, graph=6, tensors=10, graphs=11, sparse=22, sparses=23
         ):
             if what.startswith("graph"):
-                self.graph(start, stop, depth + 1)
+                graphs.append(self.graph(start, stop, depth + 1))
             elif what.startswith("sparse"):
                 self.sparse(start, stop)
             else:
                 self.tensor(start, stop, output)
+        return graphs
 
     def sparse(self, at: int, end: int) -> None:
         for _, start, stop in self.messages(at, end, values=1, indices=2):

@@ -1,4 +1,4 @@
-"""A model file on trial: loaded, warmed and stepped in a process of its own, within limits.
+"""A model file on trial: loaded, warmed and touched in a process of its own, within limits.
 
 `onnx_check` refuses what a file says that it is; what it does when it runs only running it shows.
 Shapes that are computed can ask for any memory, and a graph of a few kilobytes for hours. So before
@@ -10,6 +10,7 @@ on its processor time and on the clock. It dies with whoever started it.
 """
 
 import ctypes
+import math
 import os
 import resource
 import signal
@@ -17,18 +18,28 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from tactile_rt.core.errors import ModelError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from tactile_rt.classifier.model_card import ModelCard
 
 __all__ = ["Trial", "TrialLimits", "try_model"]
 
 MB = 1_000_000
 LOOK_S = 0.02  # how soon it is seen that the child has ended, or that nobody waits for it
 CPU_S = 2  # beyond the limit on the clock: threads of onnxruntime may share the work
-STEPS = 5  # timed, after the warm-up
+STEPS = 5  # at least, of a touch and at rest, after the warm-up
+EXTREME_STEPS = 3  # of each of the loads that no touch makes
+TOUCH_S = 1.0  # how long a touch may take beyond that
 PR_SET_PDEATHSIG = 1
 WANTED_MEMORY = ("bad_alloc", "Failed to allocate", "BFCArena", "bad allocation")
 MESSAGE = 400  # characters
@@ -39,7 +50,7 @@ class TrialLimits(msgspec.Struct, frozen=True):
 
     Attributes:
         memory_mb: The memory beside four times the file's size, in MB.
-        seconds: The time to load and to warm up, s.
+        seconds: The time to load, to warm up and to be touched, s.
     """
 
     memory_mb: float = 256.0
@@ -52,7 +63,7 @@ class Trial(msgspec.Struct, frozen=True):
     Attributes:
         sha256: The hash of the bytes that were tried, hexadecimal.
         load_s: The time that it took to load and to warm up, s.
-        step_s: The median time of a step, s.
+        step_s: The median time of a step, s, of what takes longest: rest, a touch, or extremes.
         memory_mb: The memory that it took, in MB.
     """
 
@@ -66,6 +77,7 @@ class _Task(msgspec.Struct, frozen=True):
     path: str
     every: int  # of windows that slide; 0: none does
     limits: TrialLimits
+    parent: int = 0  # the process that waits for it; 0: whoever it is
 
 
 class _Refusal(msgspec.Struct, frozen=True):
@@ -90,7 +102,7 @@ def try_model(
         ModelError: one line: what is wrong with the file, or which limit it broke.
     """
     limits = limits or TrialLimits()
-    task = _Task(str(path), every, limits)
+    task = _Task(str(path), every, limits, os.getpid())
     child = subprocess.Popen(
         [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL, close_fds=True,
@@ -170,12 +182,48 @@ def _run(task: _Task) -> Trial:
     every = min(task.every, card.steps) or card.steps
     stepper = Stepper(session, card, Lanes(card.steps, every).count)
     load_s = time.monotonic() - began
-    took = []
-    for _ in range(STEPS):
+    step_s, random = 0.0, np.random.default_rng(0)
+    shape = stepper.samples.shape[1:]
+    floor = np.broadcast_to(card.floor, shape[1:])
+    for name, decides, count, load in _list_loads(card):
+        stepper.begin(3 * floor, 2 * floor)  # some offset, and noise above the least
         began = time.monotonic()
-        stepper.run()
-        took.append(time.monotonic() - began)
-    return Trial(sha256, load_s, float(np.median(took)), (_data_bytes() - before) / MB)
+        took: list[float] = []
+        for k in range(count):
+            if len(took) >= STEPS and time.monotonic() - began > TOUCH_S:
+                break
+            grows = math.sin(math.pi * (k + 0.5) / count)
+            stepper.samples[:] = 3 * floor + grows * load * random.uniform(0.9, 1.0, shape)
+            start = time.monotonic()
+            logits = stepper.run()
+            took.append(time.monotonic() - start)
+            if decides and not np.isfinite(logits).all():
+                raise ModelError(f"{path} is refused: its answer to {name} is no number")
+        step_s = max(step_s, float(np.median(took)))
+    return Trial(sha256, load_s, step_s, (_data_bytes() - before) / MB)
+
+
+def _list_loads(card: "ModelCard") -> list[tuple[str, bool, int, "NDArray[np.float64]"]]:
+    """List what a model is tried on.
+
+    Each is a name, whether it must decide on it, steps, and the load (element, channel), SI. The
+    touch is made up from the card's loads."""
+    import numpy as np
+
+    from tactile_rt.classifier.classifier import ABSURD, IMPLAUSIBLE
+
+    random = np.random.default_rng(0)
+    touch = np.array(card.clip) * random.uniform(0.2, 1.0, card.array.shape)
+    signs = random.choice((-1.0, 1.0), card.array.shape)
+    return [
+        ("rest", True, STEPS, 0.0 * signs),
+        ("a touch", True, max(STEPS, card.steps), touch),
+        ("the largest loads", True, EXTREME_STEPS, IMPLAUSIBLE * np.array(card.clip) * signs),
+        ("absurd loads", False, EXTREME_STEPS, ABSURD * signs),
+        ("float32's limits", False, EXTREME_STEPS, float(np.finfo(np.float32).max) * signs),
+        ("no numbers", False, EXTREME_STEPS, np.nan * signs),
+        ("infinite loads", False, EXTREME_STEPS, np.inf * signs),
+    ]
 
 
 def _data_bytes() -> int:
@@ -188,9 +236,13 @@ def _data_bytes() -> int:
 
 def _main() -> int:
     if sys.platform == "linux":
+        with suppress(OSError):  # where memory runs out, this one goes, and not whoever asks
+            Path("/proc/self/oom_score_adj").write_text("1000")
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of who presses Ctrl-C: the parent decides
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=_Task)
+    if task.parent not in (0, os.getppid()):  # it died before it was said whom to die with
+        return 1
     os.nice(5)  # what is under way comes first
     try:
         result: Trial | _Refusal = _run(task)

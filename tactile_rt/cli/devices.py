@@ -1,6 +1,7 @@
 """`tactile-rt list`, `doctor`, `codecs`, `describe`, `echo`, `hz`, `dump`: looking at devices."""
 
 import math
+import re
 import time
 from contextlib import closing
 from pathlib import Path
@@ -13,6 +14,7 @@ from tactile_rt.cli.options import STDOUT, Json, Seconds, Url
 from tactile_rt.cli.tables import show_table, told_as_json
 
 WINDOW_S = 1.0
+LOG_BYTES = 1 << 16  # of its end, in which the newest warning is looked for
 
 
 @app.command("list", epilog="tactile-rt list")
@@ -33,12 +35,15 @@ def list_devices(json: Json = None) -> None:
     show_table(found, {"device": "device", "likely": "likely", "url": "url"}, json)
 
 
-@app.command(epilog="tactile-rt doctor --udev 99-tactile.rules")
+@app.command(epilog="tactile-rt doctor --daemon http://127.0.0.1:9464")
 def doctor(
+    daemon: Annotated[
+        str, typer.Option(help="Look at a running daemon instead: the URL of its metrics.")
+    ] = "",
     udev: Annotated[Path | None, typer.Option(help="Write udev rules for the devices.")] = None,
     json: Json = None,
 ) -> None:
-    """Find what keeps devices from working, and say how to fix it.
+    """Find what keeps devices or a daemon from working, and how to fix it.
 
     Exit code 1 if there is anything to fix.
     """
@@ -50,7 +55,10 @@ def doctor(
 
     check_output(udev)
     ports = serial_ports()
-    findings = [*diagnose(ports, can_buses()), *_look_at_simulator()]
+    if daemon:
+        findings = _look_at_daemon(daemon)
+    else:
+        findings = [*diagnose(ports, can_buses()), *_look_at_simulator()]
     alone = told_as_json(findings, json)
     console = Console(stderr=alone, soft_wrap=True, highlight=False)
     for finding in () if alone else findings:
@@ -65,6 +73,42 @@ def doctor(
         )
     if not all(f.good for f in findings):
         raise typer.Exit(1)
+
+
+def _look_at_daemon(url: str) -> list[Any]:
+    """Say what a running daemon says of itself, and what its log said last."""
+    from tactile_rt.cli.top import snapshot_at
+    from tactile_rt.core.errors import SourceError
+    from tactile_rt.drivers.discovery import Finding
+
+    try:
+        now = snapshot_at(url)
+    except SourceError as error:
+        return [Finding("daemon", False, str(error), "Start it, or see `systemctl status`.")]
+    says = f"{now.state}, version {now.version}, pid {now.pid}, {now.config}"
+    found = [Finding("daemon", not now.diagnostics, says)]
+    found += [Finding(one.part, False, one.says, one.do) for one in now.diagnostics]
+    found += [Finding(one.part, True, one.says, one.do) for one in now.soon]
+    for source in now.sources:
+        gone = source.stats.corrupt + source.stats.missing + source.stats.dropped
+        says = f"{source.samples} samples, {gone} lost, {source.part.failures} times broken so far"
+        found.append(Finding(source.part.name, True, says))
+    logs = (str(c.details.get("file", "")) for c in now.consumers if c.kind == "log")
+    return [*found, *(Finding("log", True, _quote_log(file)) for file in logs)]
+
+
+def _quote_log(name: str) -> str:
+    """Return the newest warning or error of a log."""
+    if not name:
+        return "on stderr, which systemd keeps: `journalctl -u tactile-rt`"
+    try:
+        with open(name, "rb") as file:
+            file.seek(max(0, file.seek(0, 2) - LOG_BYTES))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError as error:
+        return f"{name}: {error.strerror}"
+    bad = re.compile(r' (warning|error) |"level":"(warning|error)"')
+    return f"{name}: {next(filter(bad.search, reversed(lines)), 'no warning of late')}"
 
 
 def _look_at_simulator() -> list[Any]:

@@ -101,6 +101,10 @@ class Consumer(abc.ABC):
         is called from any thread, must be quick."""
         return ""
 
+    def foresee(self) -> str:
+        """Say what will keep it from its work soon, and when; as `diagnose`."""
+        return ""
+
     def on_disk(self) -> Mapping[str, OnDisk]:
         """Of a consumer that records: what is on the disk, by source; as `details`."""
         return {}
@@ -133,15 +137,15 @@ class ConsumerPart(Part):
         """For the snapshot."""
         try:
             details, diagnostic = self.consumer.details(), self.consumer.diagnose()
-            on_disk = self.consumer.on_disk()
+            on_disk, soon = self.consumer.on_disk(), self.consumer.foresee()
         except Exception as error:  # telling of itself must not break the snapshot of all others
             diagnostic, on_disk = f"cannot tell how it is: {type(error).__name__}: {error}", {}
-            details = {}
+            details, soon = {}, ""
         queue = self.box.state
         return ConsumerState(
             self.state, self.kind, queue, self._latency.state, details, 1e3 * self._age_s,
             max(queue.oldest_s, self.silent_s), self._losses.add(sum(queue.dropped.values())),
-            diagnostic, dict(on_disk),
+            diagnostic, dict(on_disk), soon,
         )  # fmt: skip
 
     def stop(self) -> None:

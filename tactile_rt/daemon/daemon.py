@@ -11,11 +11,12 @@ from typing import Any
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.admission import file_stamp, model_path
+from tactile_rt.daemon.advice import Onsets
 from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.diagnostics import diagnose
-from tactile_rt.daemon.health import Snapshot
+from tactile_rt.daemon.health import Diagnostic, Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.mailbox import Hub
@@ -69,6 +70,7 @@ class Daemon:
         self._degraded: tuple[str, ...] = ()
         self._reloads = self._clock_steps = 0
         self._turns = Turns()
+        self._onsets, self._foreseen = Onsets(), Onsets()
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -173,13 +175,16 @@ class Daemon:
             sources, models, consumers, self._loaded.config.limits, now, starved_s,
             bool(self._stepped_ns) and now - self._stepped_ns < LATELY_NS, self._refused,
         )  # fmt: skip
+        utc = self._clock.utc_ns()
+        found = self._onsets.explain(found, now, utc)
+        soon = [Diagnostic(c.part.name, "disk full soon", c.soon) for c in consumers if c.soon]
         state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(
             VERSION, os.getpid(), str(self._loaded.path), now,
-            self._clock.utc_ns(), self._started_ns, self._reloads, state,
+            utc, self._started_ns, self._reloads, state,
             tuple(one.line for one in found), self._clock_steps, sources, models, consumers,
-            found,
+            found, self._foreseen.explain(soon, now, utc),
         )  # fmt: skip
 
     def streams(self) -> Mapping[str, Opened]:
@@ -246,8 +251,8 @@ class Daemon:
         old += [
             self._sources.pop(name)
             for name, part in list(self._sources.items())
-            # a file that one has failed of may be another by now
-            if sources.get(name) != part.config or part.state.state == "failed"
+            # a file that one has failed of may be another by now; another array is accepted
+            if sources.get(name) != part.config or part.state.state == "failed" or part.another
         ]
         self._end(old)
         for name, (key, model) in models.items():

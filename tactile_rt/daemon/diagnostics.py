@@ -116,15 +116,21 @@ def _of_source(
         return [Diagnostic(name, "no samples", _why(part))]
     if part.state != "running":
         return []
-    away = (State.LOST,) if starved else (State.STALE, State.LOST)
+    rate_hz = source.measured_hz if source.slow else source.rate_hz
+    most = oldest_s(limits, rate_hz) if rate_hz else limits.sample_age_s
+    read_s, taken_s = (now_ns - source.read_ns) / NS, (now_ns - source.newest_ns) / NS
+    late = starved or (source.slow and read_s <= most)  # then it is not silent
+    away = (State.LOST,) if late else (State.STALE, State.LOST)
     if device is not None and device.state in away:
         return [Diagnostic(name, "no samples", f"the device is {device.state}")]
     found = []
+    if source.another:
+        why = f"{source.another}; nothing is decided of it until a reload (SIGHUP) accepts it"
+        found.append(Diagnostic(name, "another array", why))
     if source.live and source.newest_ns:
-        most = oldest_s(limits, source.rate_hz)
-        read_s, taken_s = (now_ns - source.read_ns) / NS, (now_ns - source.newest_ns) / NS
         if read_s > most:
-            found.append(Diagnostic(name, "no samples", f"none has come for {most:g} s"))
+            why = f"none has come for {oldest_s(limits, source.rate_hz):g} s"
+            found.append(Diagnostic(name, "no samples", why))
         elif taken_s > most:
             why = f"when they come they are older than {most:g} s"
             found.append(Diagnostic(name, "late samples", why))
@@ -134,9 +140,17 @@ def _of_source(
     elif source.stuck:
         why = f"no value of {name_some(source.stuck)} changes: it hangs, or is out of range"
         found.append(Diagnostic(name, "stuck-at fault", why))
+    if source.slow and read_s <= most and not starved:
+        why = f"it measures less often than nine tenths of the {source.rate_hz:g} Hz that it has"
+        found.append(Diagnostic(name, "slow", why))
+    if device is not None and not device.counts:
+        why = "its counter does not go on: what is lost cannot be seen"
+        found.append(Diagnostic(name, "no counter", why))
+    if faults := device.faults if device is not None else ():
+        found.append(Diagnostic(name, "device fault", f"it says: {', '.join(faults)}"))
     if source.losses.second:
         found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))
-    if source.bad.second:
+    if source.bad.second and not faults:  # what a device says invalid as it fails is none
         why = "some values are no numbers, or absurd, or none is valid"
         found.append(Diagnostic(name, "bad samples", why))
     return found
@@ -163,6 +177,9 @@ def _of_model(
         return [Diagnostic(part.name, "missing decisions", why, still)]
     if model.implausible:
         return [Diagnostic(part.name, "implausible loads", IMPLAUSIBLE_LOADS, still)]
+    if model.undecided:
+        why = "its answer to the newest touch is no number: take another model"
+        return [Diagnostic(part.name, "no decisions", why, still)]
     if model.refused:
         why = f"the new one is refused: {model.refused}"
         return [Diagnostic(part.name, "old model", why, "the one before decides")]

@@ -107,6 +107,10 @@ class SourceState:
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some
     stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
+    another: str = ""  # why the array is another one than the source began with
+    # what the device measured within the newest second, lost or not; 0: unknown
+    measured_hz: float = 0.0
+    slow: bool = False  # that is, most of the time, less than nine tenths of `rate_hz`
 
 
 @dataclass(frozen=True)
@@ -136,6 +140,8 @@ class ModelState:
     refused: str = ""  # why the model that was to take the place of this one does not
     implausible: bool = False  # the newest touch has loads far beyond those that it learnt from
     object: str = ""  # enrolled one that the newest decision's touch is of, or "none of these"
+    bad_steps: int = 0  # whose answer was no number, so that there was no decision
+    undecided: bool = False  # the newest step was one of them
 
 
 @dataclass(frozen=True)
@@ -168,6 +174,7 @@ class ConsumerState:
     losses: Losses = field(default_factory=Losses)  # items dropped from its mailbox, or by itself
     diagnostic: str = ""  # what keeps it from its work now, in words
     on_disk: dict[str, OnDisk] = field(default_factory=dict)  # of the recorder alone, by source
+    soon: str = ""  # what will keep it from its work if it goes on so, in words
 
 
 @dataclass(frozen=True)
@@ -180,12 +187,18 @@ class Diagnostic:
         what: What is missing, in a few words.
         why: The reason in words; of a part that breaks what it does, such as ``fails: no port``.
         still: What goes on all the same; may be empty.
+        since_ns: The time at which it was first found, host CLOCK_MONOTONIC, ns.
+        says: All of it in a sentence, with the time in UTC; empty before it is explained.
+        do: What to do.
     """
 
     part: str
     what: str
     why: str
     still: str = ""
+    since_ns: int = 0
+    says: str = ""
+    do: str = ""
 
     @property
     def line(self) -> str:
@@ -212,6 +225,7 @@ class Snapshot:
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
+    soon: tuple[Diagnostic, ...] = ()  # what will not work if it goes on so; no fault yet
 
 
 class LatencyMeter:

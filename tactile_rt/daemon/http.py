@@ -48,12 +48,15 @@ class HttpLimits:
         head_bytes: The largest head of a request with the empty line that ends it, in bytes.
         head_s: The time from the connection to the end of the head, however it drips in, s.
         send_s: The time that a peer may leave what is sent to it untaken, s.
+        newest_first: Whether one more takes the place of the oldest, which was slow then, instead
+            of being dropped: where all answers are short, nobody can keep others away.
     """
 
     connections: int
     head_bytes: int
     head_s: float
     send_s: float
+    newest_first: bool = False
 
 
 class Refused(Exception):
@@ -158,7 +161,7 @@ class HttpServer:
         self._listening, self._answer, self._failed = listening, answer, failed
         self._limits, self._headers = limits, headers
         self.answered = self.refused = self.dropped = 0
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], asyncio.StreamWriter] = {}  # the oldest first
         self._asking: set[asyncio.Task[None]] = set()  # those whose request is not there yet
         self._over = asyncio.Event()
         self._loop = asyncio.new_event_loop()
@@ -180,7 +183,7 @@ class HttpServer:
     @property
     def full(self) -> bool:
         """Whether whoever comes now is turned away; from any thread."""
-        return self.connections >= self._limits.connections
+        return self.connections >= self._limits.connections and not self._limits.newest_first
 
     def call(self, function: Callable[..., object], *arguments: Any) -> None:
         """Call something in the thread of the server, soon.
@@ -220,12 +223,16 @@ class HttpServer:
     def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._tasks) >= self._limits.connections or self._over.is_set():
             self._drop()
-            writer.transport.abort()
-            return
+            if not self._limits.newest_first or self._over.is_set():
+                writer.transport.abort()
+                return
+            slowest = next(iter(self._tasks))
+            self._tasks.pop(slowest).transport.abort()
+            slowest.cancel()
         task = self._loop.create_task(self._connection(reader, writer))
-        self._tasks.add(task)
+        self._tasks[task] = writer
         self._asking.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(lambda task: self._tasks.pop(task, None))
         task.add_done_callback(self._asking.discard)
         # A task that is cancelled before it has begun does not even come to its end.
         task.add_done_callback(lambda _: writer.transport.abort())

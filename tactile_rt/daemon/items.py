@@ -30,6 +30,7 @@ class Opened:
 
     Attributes:
         stream: The opened source, for `health`, `stats` and what it is; never read or close it.
+        accepted: Whether it is the array that the source began with; models hear of no other.
         prelude: The (packet, arrival in ns) pairs that came of a device while it was started, in
             which it describes itself. The same packets also come as `Packet` items.
     """
@@ -41,6 +42,7 @@ class Opened:
     t_ns: int
     utc_offset_ns: int
     prelude: tuple[tuple[Any, int], ...] = ()
+    accepted: bool = True
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class SourceChunk:
     chunk: Chunk
     arrived_ns: int
     utc_offset_ns: int
+    accepted: bool = True  # see `Opened`
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ valid name.
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -13,6 +14,7 @@ from typing import NoReturn
 import msgspec
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import open_regular
 from tactile_rt.core.settings import SettingNode, convert, read_toml, refusal, set_key
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
 
@@ -49,6 +51,11 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
     Raises:
         ConfigError: one line with file and line.
     """
+    try:
+        with suppress(FileNotFoundError, ValueError):  # `read_toml` tells
+            open_regular(path).close()  # a pipe could keep who reads it for ever
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     nodes = read_toml(path, LARGEST)
     for text in sets:
         nodes = set_key(nodes, text, Config)

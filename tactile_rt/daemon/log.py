@@ -1,12 +1,12 @@
 """One line per event, on stderr or in a file; a storm of the same line is counted instead."""
 
-import sys
+import os
 import time
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import TextIO
+from io import FileIO
 
 import msgspec
 
@@ -29,46 +29,70 @@ class _Seen:
 
 class Log(Consumer):
     """Writes events. Of those that say the same of the same part, the first is written at once,
-    the others are counted and told together when `repeat_s` is over."""
+    the others are counted and told together when `repeat_s` is over. A file that was moved or
+    deleted is begun anew. Lines that nothing takes are dropped and counted, and that is told."""
 
     wants = frozenset({Event})
     tick_s = 1.0
 
     def __init__(self, name: str, config: LogConfig) -> None:
         self._config = config
-        self._out: TextIO | None = None
+        self._out: FileIO | None = None  # has no buffer, which at the end would be tried again
         self._seen: OrderedDict[tuple[str, str, str], _Seen] = OrderedDict()
-        self._lines = self._repeated = 0
+        self._lines = self._repeated = self._dropped = 0
+        self._why = ""  # why lines are dropped now
+        self._unwritten: tuple[Event, int] | None = None  # the newest, and how many
 
     def open(self, view: View) -> None:
-        self._out = Path(self._config.file).open("a") if self._config.file else sys.stderr
+        file = self._config.file
+        self._out = FileIO(file, "ab") if file else FileIO(2, "wb", closefd=False)
 
     def handle(self, items: list[Item]) -> None:
+        self._follow_name()
+        if self._unwritten is not None:
+            last, count = self._unwritten
+            why = f"{count} lines: {self._why}"
+            told = Event("log", "dropped", why, "warning", last.t_ns, last.utc_offset_ns)
+            if self._pass_on(self._form(told, 0)):
+                self._unwritten, self._why = None, ""
         for item in items:
             if isinstance(item, Event) and _rank(item.level) >= _rank(self._config.level):
                 self._note(item)
         now = time.monotonic()
         for key in [k for k, seen in self._seen.items() if seen.until <= now]:
             self._sum_up(key)
-        if self._out is not None:
-            self._out.flush()
 
     def close(self) -> None:
-        out, self._out = self._out, None
-        if out is None:
-            return
-        try:
-            self._out = out
+        if self._out is not None:
             for key in list(self._seen):
                 self._sum_up(key)
-            out.flush()
-        finally:
+            self._out.close()
             self._out = None
-            if out is not sys.stderr:
-                out.close()
 
     def details(self) -> dict[str, str | int | float]:
-        return {"lines": self._lines, "repeated": self._repeated}
+        return {
+            "file": self._config.file, "lines": self._lines, "repeated": self._repeated,
+            "dropped": self._dropped,
+        }  # fmt: skip
+
+    def diagnose(self) -> str:
+        return self._why
+
+    def _follow_name(self) -> None:
+        """Open the file anew if it is no longer the one of that name."""
+        file, out = self._config.file, self._out
+        if not file:
+            return
+        if out is not None:
+            with suppress(OSError):  # there is none of that name, or one may not look
+                if os.path.samestat(os.fstat(out.fileno()), os.stat(file)):
+                    return
+            out.close()
+        try:
+            self._out = FileIO(file, "ab")
+            self._why = self._why if self._unwritten else ""
+        except OSError as error:
+            self._out, self._why = None, f"{file}: {error.strerror or error}"
 
     def _note(self, event: Event) -> None:
         key = (event.part, event.state, event.reason)
@@ -89,6 +113,24 @@ class Log(Consumer):
             self._write(seen.event, seen.again)
 
     def _write(self, event: Event, repeated: int) -> None:
+        if self._unwritten is None and self._pass_on(self._form(event, repeated)):
+            self._lines += 1
+        else:
+            self._dropped += 1
+            self._unwritten = event, self._unwritten[1] + 1 if self._unwritten else 1
+
+    def _pass_on(self, line: str) -> bool:
+        """Write a line; whether it was taken whole."""
+        data = (line.replace("\n", " ") + "\n").encode(errors="backslashreplace")
+        try:
+            if self._out is not None and self._out.write(data) == len(data):
+                return True
+            self._why = self._why or "it takes no more for now"
+        except OSError as error:
+            self._why = f"{self._config.file or 'stderr'}: {error.strerror or error}"
+        return False
+
+    def _form(self, event: Event, repeated: int) -> str:
         utc_ns = event.t_ns + event.utc_offset_ns
         when = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         when += f".{utc_ns // 1_000_000 % 1000:03d}Z"
@@ -97,14 +139,10 @@ class Log(Consumer):
                 "time": when, "level": event.level, "part": event.part, "state": event.state,
                 "reason": event.reason, "repeated": repeated, "t_ns": event.t_ns,
             }  # fmt: skip
-            line = msgspec.json.encode(fields).decode()
-        else:
-            said = f": {event.reason}" if event.reason else ""
-            again = f" (repeated {repeated} times)" if repeated else ""
-            line = f"{when} {event.level} {event.part} {event.state}{said}{again}"
-        if self._out is not None:
-            self._out.write(line.replace("\n", " ") + "\n")
-        self._lines += 1
+            return msgspec.json.encode(fields).decode()
+        said = f": {event.reason}" if event.reason else ""
+        again = f" (repeated {repeated} times)" if repeated else ""
+        return f"{when} {event.level} {event.part} {event.state}{said}{again}"
 
 
 def _rank(level: str) -> int:

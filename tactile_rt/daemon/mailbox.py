@@ -18,7 +18,7 @@ class Mailbox(BoundedQueue[Item]):
     Args:
         wants: classes of items that it takes; the others are left out uncounted.
         gather_s: how long samples and packets may wait for more of them; all else is urgent.
-        source: only items of this source; empty: of all.
+        source: only items of this source, and of the array that it began with; empty: of all.
     """
 
     def __init__(
@@ -41,6 +41,8 @@ class Mailbox(BoundedQueue[Item]):
         if type(item) not in self.wants:
             return None
         if self._source and getattr(item, "source", self._source) != self._source:
+            return None
+        if self._source and not getattr(item, "accepted", True):
             return None
         if isinstance(item, SourceChunk):
             chunk = item.chunk

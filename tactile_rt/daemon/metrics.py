@@ -2,7 +2,7 @@
 
 The text is Prometheus' exposition format 0.0.4; names and units are as its conventions ask for:
 base units, ``_total`` for what only grows. Only GET; at most 8 KiB a request, in two seconds, 16
-at a time.
+at a time, of which the newest are answered.
 """
 
 import os
@@ -16,7 +16,7 @@ import msgspec
 
 from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
-from tactile_rt.daemon.consumer import TAKEN, Consumer, View
+from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
@@ -27,7 +27,7 @@ __all__ = ["ALERTS", "Metrics", "exposition"]
 
 ALERTS = Path(__file__).parents[1] / "assets" / "alerts.yml"
 
-LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0)
+LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0, newest_first=True)
 HEADERS = {"cache-control": "no-store", "x-content-type-options": "nosniff"}
 EXPOSITION, JSON = "text/plain; version=0.0.4; charset=utf-8", "application/json"
 STATES = ("starting", "running", "degraded", "stopping")
@@ -68,10 +68,6 @@ class Metrics(Consumer):
         if self._server is not None:
             self._server.close()
 
-    def diagnose(self) -> str:
-        server = self._server
-        return TAKEN if server is not None and server.full else ""
-
     def details(self) -> dict[str, str | int | float]:
         server = self._server
         return {
@@ -97,6 +93,7 @@ class Metrics(Consumer):
                 "state": snapshot.state,
                 "degraded": snapshot.degraded,
                 "diagnostics": snapshot.diagnostics,
+                "soon": [one.line for one in snapshot.soon],
                 "version": snapshot.version,
                 "uptime_s": (snapshot.t_ns - snapshot.started_ns) / 1e9,
             }
@@ -143,6 +140,7 @@ def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labe
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]
     yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
+    yield SOON, [({"part": t.part, "what": t.what}, t) for t in s.soon]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
     yield SOURCE, [({"source": _short(x)}, x) for x in s.sources]
     yield MODEL, [({"model": _short(x), "source": x.source}, x) for x in s.models]
@@ -199,6 +197,9 @@ DAEMON: tuple[Row, ...] = (
 DIAGNOSTIC: tuple[Row, ...] = (
     ("diagnostic", "", "1 for each thing that does not work.", lambda t, _: 1),
 )
+SOON: tuple[Row, ...] = (
+    ("soon", "", "1 for each thing that will not work soon if it goes on so.", lambda t, _: 1),
+)
 PART: tuple[Row, ...] = (
     ("part_state", "state", "1 for the state a part is in.",
      lambda p, _: {x: x == p.state for x in PART_STATES}),
@@ -212,12 +213,18 @@ SOURCE: tuple[Row, ...] = (
     ("source_duplicate_samples_total", "", "Samples that came twice, taken once.",
      lambda x, _: x.stats.duplicates),
     ("source_rate_hertz", "", "Nominal sample rate.", lambda x, _: x.rate_hz),
+    ("source_measured_rate_hertz", "", "Rate of the newest second, with what was lost.",
+     lambda x, _: x.measured_hz or None),
     ("source_newest_sample_age_seconds", "", "Since the newest sample was taken.",
      lambda x, now: _since(x.newest_ns, now)),
     ("source_bad_samples_total", "", "Samples of an element that were no number.",
      lambda x, _: x.bad_samples),
     ("device_state", "state", "1 for the state a device's stream is in.",
      lambda x, _: x.device and {str(y): y == x.device.state for y in State}),
+    ("device_info", "identity", "1 for its serial number, or that of its USB port.",
+     lambda x, _: x.device and {x.device.identity: 1}),
+    ("device_status", "status", "1 for what a device says of itself.",
+     lambda x, _: x.device and dict.fromkeys((*x.device.faults, *x.device.status), 1)),
     ("device_connections_total", "", "Times a device was connected since it was opened.",
      lambda x, _: x.device and x.device.connections),
     ("device_clock_drift_ratio", "", "How much faster the host's clock runs.",
@@ -232,6 +239,7 @@ MODEL: tuple[Row, ...] = (
     ("model_skips_total", "", "Times it was behind and skipped to the newest sample.",
      lambda x, _: x.skipped),
     ("model_late_steps_total", "", "Steps that were late.", lambda x, _: x.late),
+    ("model_bad_steps_total", "", "Steps whose answer was no number.", lambda x, _: x.bad_steps),
     ("model_behind_seconds", "", "How long the oldest samples wait to be classified.",
      lambda x, _: x.behind_s),
     ("model_decision_age_seconds", "",

@@ -30,6 +30,7 @@ __all__ = ["ModelPart"]
 MODEL_BYTES = 64 << 20
 WAKE_S, LOOK_S = 0.25, 0.02
 LONGEST_S = 10.0  # a touch that lasts longer does not keep a new model waiting
+STOP_SHARE = 0.35  # of the time in which all parts are to end
 BEGINNING_NS = 60 * NS_PER_S  # more than waits for a model that is still being loaded
 
 
@@ -54,7 +55,7 @@ class ModelPart(Part):
         self._wanted: deque[ModelConfig] = deque()  # what is to take the place of this one
         self._next: Admission | None = None
         self._ready_at = 0.0
-        self._until = math.inf  # once it is to end: so long a model is waited for
+        self._until = math.inf  # once it is to end: so long it still decides about what waits
         self.refused = ""  # why the newest one that was to do so did not
         self._half_ns = 0  # half the resampler's kernel
         self._deadline_ns = 0
@@ -72,7 +73,7 @@ class ModelPart(Part):
         self._object = ""  # that the touch of the newest decision is of
         self._touching = False
         self._latency, self._step = LatencyMeter(), LatencyMeter()
-        self._skips, self._age_s = 0, 0.0
+        self._skips, self._age_s, self._bad_steps = 0, 0.0, 0
         self._skipped, self._losses = LossWindow(), LossWindow()
 
     @property
@@ -88,9 +89,11 @@ class ModelPart(Part):
             1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
             self.refused, classifier is not None and classifier.implausible, self._object,
+            self._bad_steps, classifier is not None and classifier.undecided,
         )  # fmt: skip
 
     def stop(self) -> None:
+        self._until = min(self._until, time.monotonic() + STOP_SHARE * self.limits.stop_s)
         super().stop()
         self.box.close()
 
@@ -118,10 +121,16 @@ class ModelPart(Part):
                 self._look_after(bool(items))
             finally:
                 self._busy_ns = 0
+            if time.monotonic() > self._until:
+                why = "it was to end, and so far behind that it has not decided about all"
+                self._report(self.name, "cut short", why, "warning")
+                return
 
     def _release(self) -> None:
         self.box.taking = False
         self._classifier = None
+        if self._next is not None and self._stop.is_set():
+            self._next.give_up()  # else the process would wait for it
         self._touch(False, time.monotonic_ns())
 
     def _mended(self) -> bool:
@@ -169,9 +178,9 @@ class ModelPart(Part):
             return None
         admission = self._admit(self.config, opened)
         while not admission.finished.wait(LOOK_S):
-            if self._stop.is_set():  # what waits is still to be decided about, if there is time
-                self._until = min(self._until, time.monotonic() + self.limits.stop_s / 4)
-            if time.monotonic() > self._until:
+            # what waits of a recording is still to be decided about
+            live = opened is None or opened.stream.live
+            if time.monotonic() > self._until or (self._stop.is_set() and live):
                 admission.give_up()
                 return None
         if admission.error is not None:
@@ -287,11 +296,14 @@ class ModelPart(Part):
         frame = opened.spec.frame
         for decision in classifier.decide(chunk):
             self._tell(decision, run, opened, offset)
+            if time.monotonic() > self._until:
+                return
         if self._next is not None and self._next.classifier is not None:
             self._prepare(self._next.classifier, classifier, chunk)
         self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples
+        self._bad_steps += classifier.stats.bad_steps - before.bad_steps
         self._skips += len(classifier.skips.found)
         for skip in classifier.skips.found:
             self._hub.post(

@@ -29,7 +29,8 @@ __all__ = ["ExitCode", "leave", "note_signals", "run_daemon"]
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
 TURN_S = 0.25  # how often the main loop tells that it goes on
-LOADED_S = 5.0  # for it to end by itself
+READ_S = 2.0  # for a configuration to be read
+LOADED_S = 0.5  # for a model to be loaded, or given up
 SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
 
 Calls = SimpleQueue[int]  # what a signal handler may put into
@@ -124,17 +125,19 @@ def _serve(
     daemon: "Daemon", path: Path, sets: Sequence[str], calls: Calls, seconds: float | None
 ) -> None:
     end = None if seconds is None else time.monotonic() + seconds
-    reloading: threading.Thread | None = None
+    reload: _Reload | None = None
     asked = False
     while True:
         daemon.turned("main")
-        if asked and (reloading is None or not reloading.is_alive()):
+        if reload is not None and reload.hangs():
+            daemon.refuse(f"{path}: {READ_S:g} s do not do to read it: does its disk answer?")
+        if asked and (reload is None or reload.late or not reload.is_alive()):
             asked = False
             daemon.report("daemon", "reloading", "")
-            reloading = threading.Thread(
-                target=_reload, args=(daemon, path, sets), name="tactile-rt reload", daemon=True
-            )
-            reloading.start()
+            if reload is not None:
+                reload.wanted = False
+            reload = _Reload(daemon, path, sets)
+            reload.start()
         left = TURN_S if end is None else min(TURN_S, end - time.monotonic())
         if left < 0:
             return
@@ -147,18 +150,39 @@ def _serve(
         asked = True
 
 
-def _reload(daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
-    """In a thread of its own: whatever it takes, signals are obeyed meanwhile."""
-    from tactile_rt.daemon.checks import check_config
-    from tactile_rt.daemon.loading import load_config
-    from tactile_rt.daemon.part import reason_of
+class _Reload(threading.Thread):
+    """Reads the configuration again, in a thread of its own.
 
-    try:
-        loaded = load_config(path, sets)
-        check_config(loaded)
-        daemon.reload(loaded)
-    except Exception as error:  # else nobody would know that it was not done
-        daemon.refuse(reason_of(error))
+    Whatever it takes, signals are obeyed meanwhile; another one may take its place."""
+
+    def __init__(self, daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
+        super().__init__(name="tactile-rt reload", daemon=True)
+        self._for, self._path, self._sets = daemon, path, sets
+        self._read_by = time.monotonic() + READ_S
+        self._read = False
+        self.wanted = True  # none has taken its place
+        self.late = False
+
+    def hangs(self) -> bool:
+        """Tell, once, that it takes too long to read."""
+        before, self.late = self.late, not self._read and time.monotonic() > self._read_by
+        return self.late and not before
+
+    def run(self) -> None:
+        from tactile_rt.daemon.checks import check_config
+        from tactile_rt.daemon.loading import load_config
+        from tactile_rt.daemon.part import reason_of
+
+        try:
+            loaded = load_config(self._path, self._sets)
+            check_config(loaded)
+            self._read = True
+            if self.wanted:
+                self._for.reload(loaded)
+        except Exception as error:  # else nobody would know that it was not done
+            self._read = True
+            if self.wanted:
+                self._for.refuse(reason_of(error))
 
 
 def leave(code: ExitCode) -> None:

@@ -52,6 +52,7 @@ __all__ = ["Recorder"]
 
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
+PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # after a failure, and another; then all is well
 SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
 RING_BYTES = 64 << 20  # of each source, before a trigger
 EVER_NS = 1 << 62
@@ -75,6 +76,8 @@ class _Track:
         self.closed_ns = 0  # when its source ended; 0: it has not
         self.lost = (0, 0)  # samples and packets since the last file was begun
         self.diagnostic = ""  # why there is no file, or was none before this one
+        self.failures = 0  # files that failed soon after they were begun, running
+        self.retry_ns = 0  # no file is begun before
 
     def keep(self, message: Raw, before_ns: int) -> list[Raw]:
         """Into the ring, from which the oldest goes: these."""
@@ -122,7 +125,7 @@ class Recorder(Consumer):
         self._on = True
         self._files = self._bytes = 0
         self._lost_samples = 0
-        self._newest = ""
+        self._newest = self._soon = ""
         self._flush_at = self._sync_at = 0.0
 
     def open(self, view: View) -> None:
@@ -174,16 +177,22 @@ class Recorder(Consumer):
     def details(self) -> dict[str, str | int | float]:
         tracks = list(self._tracks.values())
         recording = sum(track.file is not None for track in tracks)
-        size = self._bytes + sum(t.file.stats.bytes for t in tracks if t.file is not None)
         return {
             "state": self._folder.state if self._folder.why else "on" if self._on else "off",
             "mode": self._config.mode,
             "recording": recording,
             "files": self._files,
-            "megabytes": round(size / MB, 1),
+            "megabytes": round(self._written_mb(), 1),
             "lost_samples": self._lost_samples,
             "newest": self._newest,
         }
+
+    def _written_mb(self) -> float:
+        files = [track.file for track in list(self._tracks.values())]
+        return (self._bytes + sum(f.stats.bytes for f in files if f is not None)) / MB
+
+    def foresee(self) -> str:
+        return self._soon
 
     def diagnose(self) -> str:
         folder = self._folder
@@ -320,6 +329,8 @@ class Recorder(Consumer):
     def _start_file(self, track: _Track) -> None:
         if track.file is not None or not track.came or track.closed_ns:
             return
+        if time.monotonic_ns() < track.retry_ns:
+            return
         if not self._folder.has_room():
             return
         opened, snapshot = track.opened, self._view.snapshot()
@@ -358,8 +369,8 @@ class Recorder(Consumer):
         file, track.file = track.file, None
         if file is None:
             return
-        if file.whereabouts() == "deleted":
-            why = f"{file.path} was deleted while it was written"
+        if (where := file.whereabouts()) in ("deleted", "emptied"):
+            why = f"{file.path} was {where} while it was written"
             samples, packets = file.disown(Extent())
             self._count_lost(track, samples, packets, why)
             self._warn(f"{why}: {samples} samples are lost")
@@ -370,7 +381,8 @@ class Recorder(Consumer):
             if not told:
                 why = f"{file.path}: not finished ({error.strerror or error})"
                 self._warn(f"{why}; {KEEPS}")
-            self._count_lost(track, *file.disown(file.flushed), words(file.path, error))
+            why = words(self._folder.path, error)
+            self._count_lost(track, *file.disown(file.flushed), why)
         self._bytes += file.stats.bytes
 
     def _rotate(self, track: _Track) -> None:
@@ -381,6 +393,7 @@ class Recorder(Consumer):
     def _look_after(self, sync: bool) -> None:
         """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
         self._folder.has_room()
+        self._soon = self._folder.foresee(self._written_mb())
         self._settle()
         now = time.monotonic_ns()
         closed = [
@@ -443,13 +456,22 @@ class Recorder(Consumer):
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
     def _no_room(self, track: _Track, error: OSError) -> None:
-        """The file cannot be written: it is left as it is, and tried anew at the next look."""
-        file = track.file
-        why = words(file.path if file is not None else self._folder.path, error)
-        if file is not None or why != track.diagnostic:
-            self._warn(f"{why}: not recording" if file is None else f"{why}; {KEEPS}")
+        """The file cannot be written: it is left as it is, and tried anew at a next look, with
+        pauses where one file after another fails. The reason names no file, and so stays the same.
+        """
+        file, why = track.file, words(self._folder.path, error)
+        if file is None:
+            if why != track.diagnostic:
+                self._warn(f"{why}: not recording")
+            track.diagnostic = why
+            return
+        now = time.monotonic_ns()
+        if not track.failures or now - file.begun_ns > STEADY_S * NS:
+            track.failures = 0
+            self._warn(f"{words(file.path, error)}; {KEEPS}")
+        track.retry_ns = now + round(min(track.failures, PAUSES) * PAUSE_S * NS)
+        track.failures += 1
         track.diagnostic = why
-        if file is not None:
-            kept = file.flushed if file.failed is None else file.synced
-            self._count_lost(track, *file.disown(kept), why)
-            self._finish_file(track, finish=file.failed is None, told=True)
+        kept = file.flushed if file.failed is None else file.synced
+        self._count_lost(track, *file.disown(kept), why)
+        self._finish_file(track, finish=file.failed is None, told=True)

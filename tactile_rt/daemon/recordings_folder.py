@@ -3,6 +3,7 @@
 import os
 import shutil
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -16,6 +17,8 @@ __all__ = ["RecordingsFolder", "words"]
 
 STALE_S = 3600.0  # a file that is begun has its name long before
 MB = 1e6
+EVERY_S, POINTS, LEAST_S = 5.0, 120, 60.0  # of the newest ten minutes: how fast it fills
+HOURS = (0.25, 0.5, 1, 2, 3, 6, 12, 24)
 
 
 class RecordingsFolder:
@@ -40,7 +43,8 @@ class RecordingsFolder:
     ) -> None:
         self.path, self._min_free_mb = path, min_free_mb
         self._later, self._tell = later, tell
-        self.state, self.why = "on", ""
+        self.state, self.why, self._room_mb = "on", "", 0.0
+        self._written: deque[tuple[float, float]] = deque(maxlen=POINTS)  # s, MB
 
     @property
     def full(self) -> bool:
@@ -75,6 +79,7 @@ class RecordingsFolder:
         except OSError as error:
             state, why = "no folder", words(self.path, error)
         else:
+            self._room_mb = free - self._min_free_mb
             if free < self._min_free_mb:
                 least = f"min_free_mb = {self._min_free_mb:g}"
                 state = "disk full"
@@ -86,6 +91,23 @@ class RecordingsFolder:
                 self._tell("running", f"{free:.0f} MB free: recording again", "info")
         self.state, self.why = state, why
         return not why
+
+    def foresee(self, written_mb: float) -> str:
+        """Say within how many hours it is full at this rate; empty: not in a day.
+
+        Args:
+            written_mb: All that has been written so far, MB.
+        """
+        now = time.monotonic()
+        if not self._written or now - self._written[-1][0] >= EVERY_S:
+            self._written.append((now, written_mb))
+        first, before = self._written[0]
+        if now - first < LEAST_S or self.why:
+            return ""
+        an_hour = 3600 * (written_mb - before) / (now - first)
+        hours = next((step for step in HOURS if self._room_mb <= step * an_hour), 0)
+        within = f"it is full within {hours:g} h at the rate of now, unless files are deleted"
+        return within if hours else ""
 
     def _make(self, parents: bool) -> None:
         made = [f for f in (self.path, *self.path.parents) if not f.exists()]

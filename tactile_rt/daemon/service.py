@@ -51,6 +51,8 @@ KillMode=mixed
 # Acquisition before all else that is not as urgent.
 Nice=-5
 OOMScoreAdjust=-500
+# Where memory runs out, the trial of a model goes first; the daemon goes on.
+OOMPolicy=continue
 LimitNOFILE=65536
 MemoryMax=2G
 TasksMax=256

@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any
 
 from tactile_rt.classifier.classifier import without_bad_samples
+from tactile_rt.core.errors import SourceError, SpecMismatch
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.clock import Clock
@@ -26,9 +27,10 @@ from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.rate_meter import RateMeter
 from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
-from tactile_rt.drivers.device_source import DeviceSource, device_of
-from tactile_rt.drivers.health import Health, State
+from tactile_rt.drivers.device_source import ArrayChanged, DeviceSource, device_of
+from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
 
@@ -70,10 +72,10 @@ class Acquisition:
         """
         lent = _Lent(source, take, wanted)
         with self._lock:
-            self._new.append(lent)
-            if not self._running:
-                self._running = True
+            if not self._running:  # a start that fails is tried again with the source
                 threading.Thread(target=self._run, name="tactile-rt lines", daemon=True).start()
+                self._running = True
+            self._new.append(lent)
         self._reader.wake()
         lent.over.wait()
         if lent.error is not None:
@@ -128,6 +130,9 @@ class SourcePart(Part):
         self._samples = self._newest_ns = self._read_ns = self._flowing_ns = self._bad = 0
         self._stuck_at = StuckAtDetector()
         self._losses, self._bads = LossWindow(), LossWindow()
+        self._rate = RateMeter()
+        self._accepted: Identity | None = None  # the array that it began with
+        self.another = ""  # why the one that is there now is not that one
         self._offset_ns = 0
         self._look_ns = self._pause_ns = 0
         self._told: tuple[Any, ...] = ()
@@ -147,13 +152,17 @@ class SourcePart(Part):
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
             bad_samples=self._bad, bad=self._bads.add(self._bad), stuck_at_s=self._stuck_at.seconds,
+            another=self.another,
         )  # fmt: skip
         if spec is None:
             return about
+        silent_s = (time.monotonic_ns() - self._read_ns) / NS_PER_S
+        measured_hz, slow = self._rate.judge(spec.rate_hz, silent_s)
         return dataclasses.replace(
             about, array=spec.name, frame=spec.frame, rate_hz=spec.rate_hz,
             elements=spec.elements, channels=spec.channels, units=spec.units,
             stuck=tuple(spec.elements[k] for k in self._stuck_at.elements),
+            measured_hz=measured_hz, slow=slow,
         )  # fmt: skip
 
     @property
@@ -196,8 +205,30 @@ class SourcePart(Part):
         )
 
     def _work(self) -> None:
-        stream = self._open()
+        while self._wanted():
+            try:
+                self._serve()
+            except ArrayChanged as error:
+                self._report(self.name, "another array", str(error), "warning")
+                self._release()
+            else:
+                return
+
+    def _serve(self) -> None:
+        """Open the source, and read it until it is over."""
+        try:
+            stream = self._open()
+        except SpecMismatch as error:
+            if self._accepted is None:
+                raise
+            raise SourceError(str(error)) from None  # the array may be exchanged again
         self._stream, self._spec, self._device = stream, stream.spec, device_of(stream)
+        if self._device is not None:
+            found = self._device.identity
+            self._accepted = self._accepted or found
+            self.another = found.difference(self._accepted)
+            if found.serial_number and not self.another:
+                self._accepted = found
         if self._stop.is_set():
             return
         self._announced = True
@@ -234,7 +265,11 @@ class SourcePart(Part):
         useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
         self._stuck_at.add(good)
-        self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
+        if self._device is not None:
+            self._rate.add(*self._device.measured)
+        spec, accepted = stream.spec, not self.another
+        item = SourceChunk(self.config.name, spec, chunk, now, self._offset_ns, accepted)
+        self._hub.post(item)
         if not stream.live:
             self._await_room()
 
@@ -247,6 +282,7 @@ class SourcePart(Part):
         finally:
             self._before = _sum(self._before, stream.stats)
             self._told = ()
+            self._rate = RateMeter()
             self._tell_closed()
 
     def _tell_closed(self) -> None:
@@ -277,7 +313,7 @@ class SourcePart(Part):
         self._hub.post(
             Opened(
                 self.config.name, stream.spec, self.config.url, stream, now, self._offset_ns,
-                tuple(prelude),
+                tuple(prelude), not self.another,
             )
         )  # fmt: skip
         if self._device is not None:
@@ -297,11 +333,12 @@ class SourcePart(Part):
             return
         health = self._device.health
         told = (health.state, health.connections, health.clock_steps, health.counter_resets,
-                health.status)  # fmt: skip
+                health.status, health.faults)  # fmt: skip
         if told == self._told:
             return
         before, self._told = self._told, told
-        level = "info" if health.state in (State.STREAMING, State.CONNECTING) else "warning"
+        well = health.state in (State.STREAMING, State.CONNECTING) and not health.faults
+        level = "info" if well else "warning"
         self._report(self.name, f"device:{health.state}", _told(health, before), level)
 
     def _await_room(self) -> None:
@@ -325,8 +362,8 @@ def _told(health: Health, before: tuple[Any, ...]) -> str:
         said.append("its clock jumped")
     if before and health.counter_resets != before[3]:
         said.append("its counter began anew")
-    if health.status:
-        said.append(f"it says: {', '.join(health.status)}")
+    if words := tuple(dict.fromkeys((*health.faults, *health.status))):
+        said.append(f"it says: {', '.join(words)}")
     return "; ".join(said)
 
 

@@ -33,6 +33,7 @@ __all__ = ["Sequencer"]
 REMEMBERED = 1024  # samples back that a repeated one is looked for
 HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
 RATE_TOLERANCE = 0.02  # of the nominal rate, when the clock is to tell how many samples passed
+STANDING = 5  # samples in a row that have the count of the one before: it counts nothing
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
@@ -44,6 +45,9 @@ class Sequencer:
         period_ticks: Nominal time between samples, in ticks of the device's clock; None for a
             device without a clock.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
+
+    Attributes:
+        numbered: How many numbers have been given, those of gaps too.
     """
 
     def __init__(
@@ -53,7 +57,7 @@ class Sequencer:
         period_ticks: float | None = None,
         tick_bits: int = 32,
     ) -> None:
-        self.resets = 0
+        self.resets = self._standing = 0  # samples in a row whose counter has not gone on
         self._wrap = None if bits is None else 1 << bits
         self._stats = stats
         self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
@@ -61,11 +65,16 @@ class Sequencer:
         self._tick = 0
         self._run = self._longest_run = 0  # steps of the counter within one reading of the clock
         self._damaged = 0  # frames since the newest sample
-        self._next = 0
+        self.numbered = 0
         self._seen: dict[int, None] = {}  # of the last samples, oldest first: what was in it
         # Without a clock, a sample of an earlier turn can look like this one.
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
+
+    @property
+    def useless(self) -> bool:
+        """Whether the counter stands, and shows no loss."""
+        return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """((n,) sequence numbers, (n,) which samples to keep); the others came before.
@@ -76,8 +85,8 @@ class Sequencer:
         damaged = samples.damaged.tolist()
         if self._wrap is None or samples.count is None:
             self._stats.corrupt += sum(damaged)
-            self._next += n
-            return self._next - n + np.arange(n), np.ones(n, np.bool_)
+            self.numbered += n
+            return self.numbered - n + np.arange(n), np.ones(n, np.bool_)
         ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
         counts = samples.count.tolist()
         seq = [
@@ -98,8 +107,9 @@ class Sequencer:
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
+        self._standing = self._standing + 1 if count == self._count and gap < 0 else 0
         if gap < 0:
-            self.resets += 1
+            self.resets += not self.useless
             self._seen.clear()
             self._run = gap = 0
         elif self._count is not None:
@@ -109,8 +119,8 @@ class Sequencer:
             corrupt = min(self._damaged, gap)
             self._stats.corrupt += corrupt
             self._stats.missing += gap - corrupt
-        number = self._next + gap
-        self._next = number + 1
+        number = self.numbered + gap
+        self.numbered = number + 1
         self._count, self._tick, self._damaged = count, tick, 0
         self._seen[content] = None
         if len(self._seen) > self._remembered:

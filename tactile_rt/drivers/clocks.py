@@ -73,14 +73,19 @@ class Stamper:
         clock: The clock that dates the samples; None for a device that sends neither time nor
             count.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
+        elapsed_ns: Time that the device's clock told until the newest sample, ns; of a device that
+            sends no time, host time of its arrival.
         status: Status bits of the newest sample.
+        told_ns: When the newest sample arrived that had a bit of the status set, ns, by bit.
     """
 
     def __init__(
         self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats, steady: bool = True
     ) -> None:
         self.spec, self._shape = spec, spec.shape
-        self.newest_ns = self.status = 0
+        self.newest_ns = self.elapsed_ns = self.status = 0
+        self._tick_ns, self._tick_wrap, self._tick = codec.tick_ns, 1 << codec.tick_bits, 0
+        self.told_ns: dict[int, int] = {}
         self._period_ns = round(NS_PER_S / spec.rate_hz)
         ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
         self.sequencer = Sequencer(codec.count_bits, stats, ticks, codec.tick_bits)
@@ -116,8 +121,16 @@ class Stamper:
         else:
             t_ns = self._steady.to_host(arrived)
         self.newest_ns = int(arrived[-1])
+        if self._tick_ns is None or ticks is None:
+            self.elapsed_ns = self.newest_ns
+        else:
+            passed, self._tick = (int(ticks[-1]) - self._tick) % self._tick_wrap, int(ticks[-1])
+            self.elapsed_ns += round(passed * self._tick_ns)
         if samples.status is not None:
             self.status = int(samples.status[-1])
+            if said := int(np.bitwise_or.reduce(samples.status)):
+                told = {bit: self.newest_ns for bit in range(said.bit_length()) if said >> bit & 1}
+                self.told_ns = {**self.told_ns, **told}
         if valid.shape != values.shape[:2]:
             valid = np.broadcast_to(valid, values.shape[:2])
         return Chunk(seq, t_ns, values, valid)

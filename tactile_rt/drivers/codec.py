@@ -142,11 +142,14 @@ class Codec(abc.ABC, Generic[Packet]):
         tick_ns: Length of a tick of the device's clock, ns; None for a device that sends no time.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
         status_bits: What each bit of the status means when set, by the number of the bit.
+        harmless_bits: The bits of the status that are no fault of the device: an overload, a state.
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
         measures: Whether the device measures although no host has asked for samples. The device's
             side.
+        describes: Whether a device that is started says what it is: `spec` is another object then.
+        serial_number: Serial number that the device has told of itself; empty for none.
         newest: The newest sample of a device that measures and does not send, None if there is
             none. The device's side.
         commanded_hz: Rate at which hosts have told the device to send, Hz; None for none. The
@@ -164,8 +167,11 @@ class Codec(abc.ABC, Generic[Packet]):
     tick_ns: float | None = None
     tick_bits: int = 32
     status_bits: ClassVar[dict[int, str]] = {}
+    harmless_bits: ClassVar[frozenset[int]] = frozenset()
     cannot_detect: ClassVar[str] = ""
     complaint = ""
+    describes = False
+    serial_number = ""
     full_scale: ClassVar[tuple[float, ...] | None] = None
     greeting: ClassVar[Any] = None
     commanded_hz: float | None = None
@@ -213,6 +219,7 @@ class Codec(abc.ABC, Generic[Packet]):
         return packet[:0]
 
     streaming = True  # the device's side: whether it sends without being asked, now
+    status = 0  # the device's side: status bits of what it sends, where the codec sends them
     polled = 0  # the device's side: samples asked for and not yet sent
     polls = False  # the host's side: whether each sample must be asked for (`Command.POLL`)
 

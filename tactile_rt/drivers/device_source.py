@@ -13,13 +13,13 @@ from typing import Any
 
 from tactile_rt.calibration import CalibratedSource
 from tactile_rt.core.errors import ConfigError, SourceError
-from tactile_rt.core.stream import NS_PER_S, Chunk, EndOfStream, Source
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, Step
-from tactile_rt.drivers.health import Health, State
+from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.links import Link
 
-__all__ = ["DeviceOptions", "DeviceSource", "Tap", "device_of"]
+__all__ = ["ArrayChanged", "DeviceOptions", "DeviceSource", "Tap", "device_of"]
 
 # Called with each packet as it came and its arrival (host time, ns), and with None whenever the
 # line has been opened. It must be quick: the device is not read meanwhile.
@@ -28,6 +28,12 @@ Tap = Callable[[Any, int], None]
 SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
 FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # a path is looked for cheaply and often
 ATTEMPTS = 3  # at a step of the start that gets no answer
+ASK_NS = NS_PER_S  # without a sample, after which a device that describes itself is asked again
+DESCRIBED_S = 0.5  # for a description of which the beginning has come
+
+
+class ArrayChanged(SourceError):
+    """Another array is at the port than the one that the stream is of."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +102,8 @@ class DeviceSource(Source):
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
         self._looked_ns = 0  # when nothing had come
+        self._asked_ns, self._resets = 0, 0  # when it was last asked again; its counter's then
+        self._describes = codec.describes and codec.spec is None
         self._early: list[Samples] = []  # that came while the device was being started
         try:
             self._open()
@@ -105,6 +113,8 @@ class DeviceSource(Source):
             raise
         assert codec.spec is not None
         super().__init__(codec.spec)
+        self._described: ArraySpec | None = codec.spec  # another object with every description
+        self._identity = self._known = self.identity  # now, and the last one that was known
         self._stamper = Stamper(codec, self.spec, self.stats)
         if options.clock == "device" and codec.tick_ns is not None:
             self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
@@ -164,7 +174,9 @@ class DeviceSource(Source):
         if state == State.STREAMING and silent > self._stale_ns:
             state, since = State.STALE, newest + self._stale_ns
             reason = f"no sample for {silent / 1e9:.1f} s"
-        bits = self.codec.status_bits.items()
+        bits, told = self.codec.status_bits.items(), stamper.told_ns
+        recent = {bit for bit, at in told.items() if newest - at < NS_PER_S}
+        faults = recent - self.codec.harmless_bits
         return Health(
             state, since, reason, self._connections, newest,
             clock.drift_ppm if clock and self.codec.tick_ns else 0.0,
@@ -173,7 +185,28 @@ class DeviceSource(Source):
             tuple(meaning for bit, meaning in bits if status >> bit & 1),
             self._can_errors + (link.can_errors if link else 0),
             self.codec.stats,
+            tuple(meaning for bit, meaning in bits if bit in faults),
+            self._identity.serial_number or self._identity.usb_number or "unknown",
+            not stamper.sequencer.useless,
         )  # fmt: skip
+
+    @property
+    def identity(self) -> Identity:
+        """Which array it is, by what it last told."""
+        assert self.codec.spec is not None
+        usb_number = self._link.usb_number if self._link else ""
+        return Identity(self.codec.spec, self.codec.serial_number, usb_number)
+
+    @property
+    def measured(self) -> tuple[int, int]:
+        """How many samples the device has measured, and by when, ns.
+
+        By its own counter and clock if it has them, so that neither a loss nor the host matters.
+        """
+        stamper = self._stamper
+        assert stamper is not None
+        damaged = self.stats.corrupt if self.codec.count_bits is None else 0
+        return stamper.sequencer.numbered + damaged, stamper.elapsed_ns
 
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
         """Move the whiskers of an active array: protraction = offset + amplitude sin(2 pi f t).
@@ -198,6 +231,8 @@ class DeviceSource(Source):
                 return None
             try:
                 self._open()
+            except ArrayChanged:
+                raise
             except SourceError as error:
                 self._lose(str(error))
             return None
@@ -212,11 +247,17 @@ class DeviceSource(Source):
             return None
         if found is None:
             self._looked_ns = time.monotonic_ns()
+            if self._describes:
+                self._ask_again(self._looked_ns)
             return None
         packet, t_ns = found
         if self._tap is not None:
             self._tap(packet, t_ns)
         samples = self.codec.feed(packet, t_ns)
+        if self._describes:
+            self._ask_again(t_ns)
+            if self.codec.spec is not self._described:
+                self._compare()
         return None if samples is None else self._chunk(samples)
 
     def _feed(self, packet: Any, t_ns: int) -> Samples | None:
@@ -249,6 +290,36 @@ class DeviceSource(Source):
             self.stats.delivered += len(chunk)
         return chunk
 
+    # identity
+
+    def _compare(self) -> None:
+        """Go on if this can be the same array; else raise an `ArrayChanged`."""
+        self._described, found = self.codec.spec, self.identity
+        if why := found.difference(self._known):
+            self._closed = True
+            self._drop()
+            raise ArrayChanged(f"{self.name}: another array is at the port: {why}")
+        self._identity = found
+        if found.serial_number:
+            self._known = found
+
+    def _ask_again(self, now_ns: int) -> None:
+        """Ask a device that is silent, or counts anew, what it is."""
+        assert self._stamper is not None
+        resets = self._stamper.sequencer.resets
+        silent_ns = now_ns - self._stamper.newest_ns
+        well = silent_ns < max(ASK_NS, self._stale_ns) and resets == self._resets
+        if well or now_ns - self._asked_ns < ASK_NS or self._link is None:
+            return
+        self._asked_ns, self._resets = now_ns, resets
+        if silent_ns > ASK_NS:
+            self.codec.forget()  # among samples no other array is believed
+        try:
+            for step in self.codec.commands(Command.START):
+                self._link.send(step.send)
+        except SourceError as error:
+            self._lose(str(error))
+
     # connecting
 
     def _open(self) -> None:
@@ -262,6 +333,11 @@ class DeviceSource(Source):
         self._turn(State.CONNECTING, "")
         for step in self.codec.commands(Command.START):
             self._do(step)
+        if self._stamper is not None:  # it was there before
+            end = time.monotonic() + DESCRIBED_S
+            while self._describes and self.codec.spec is self._described and time.monotonic() < end:
+                self._listen(0.01, None)
+            self._compare()
 
     def _do(self, step: Step[Any]) -> None:
         link = self._link

@@ -3,9 +3,30 @@
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import WireStats
 
-__all__ = ["Health", "State"]
+__all__ = ["Health", "Identity", "State"]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which array a device is, as far as it can be known; see `difference`."""
+
+    spec: ArraySpec
+    serial_number: str = ""
+    usb_number: str = ""  # of its port
+
+    def difference(self, other: "Identity") -> str:
+        """Why this cannot be the same array as another; empty: it can, or nobody knows."""
+        if found := other.spec.differences(self.spec):
+            return f"it describes itself otherwise: {found[0]}"
+        for what in ("serial_number", "usb_number"):
+            mine, theirs = getattr(self, what), getattr(other, what)
+            if mine and theirs:  # the device's own counts for more than that of its port
+                name = what.replace("_", " ")
+                return "" if mine == theirs else f"its {name} is {mine}, not {theirs}"
+        return ""
 
 
 class State(StrEnum):
@@ -29,6 +50,9 @@ class Health:
             device that tells no time.
         clock_steps: Number of times that the device's clock jumped or began anew.
         counter_resets: Number of times that the device's sample counter began anew.
+        status: What the device says of itself in its newest sample.
+        identity: Serial number of the device, or of its USB port; ``unknown`` for none.
+        faults: What it said within the second before that, and is a fault.
     """
 
     state: State
@@ -42,3 +66,6 @@ class Health:
     status: tuple[str, ...] = ()
     can_errors: int = 0
     wire: WireStats = field(default_factory=WireStats)
+    faults: tuple[str, ...] = ()
+    identity: str = "unknown"
+    counts: bool = True  # whether its counter goes on, if it should have one

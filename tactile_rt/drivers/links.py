@@ -24,6 +24,7 @@ class Link(abc.ABC, Generic[Packet]):
 
     name: str
     can_errors = 0
+    usb_number = ""  # serial number of the USB device that the line ends in; empty: unknown
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> tuple[Packet, int] | None:
@@ -76,6 +77,7 @@ class SerialLink(Link[bytes]):
             self._port.open()
         except (OSError, ValueError, AttributeError) as error:
             raise SourceError(f"{port}: {_why(port, error)}") from None
+        self.usb_number = _usb_number(os.path.realpath(port))
         try:
             self._fd: int | None = self._port.fileno()
             self._terminal, self._blocks = os.isatty(self._fd), os.get_blocking(self._fd)
@@ -267,6 +269,14 @@ class SlcanLink(Link[Sequence[CanFrame]]):
 
     def fileno(self) -> int:
         return self._serial.fileno()
+
+
+def _usb_number(path: str) -> str:
+    if not path.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
+        return ""
+    from serial.tools import list_ports
+
+    return next((p.serial_number or "" for p in list_ports.comports() if p.device == path), "")
 
 
 def _reason(error: BaseException) -> str:

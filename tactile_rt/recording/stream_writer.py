@@ -275,8 +275,8 @@ class StreamWriter:
 
 
 def _check_there(writer: RecordingWriter) -> None:
-    if writer.whereabouts() == "deleted":
-        raise OSError(errno.ENOENT, "deleted while it was written")
+    if (where := writer.whereabouts()) in ("deleted", "emptied"):
+        raise OSError(errno.ENOENT, f"{where} while it was written")
 
 
 def _measure(entry: Entry) -> tuple[str, int, int]:

@@ -15,6 +15,7 @@ daemon's recorder.
 
 import errno
 import fcntl
+import io
 import os
 import secrets
 import time
@@ -183,7 +184,10 @@ class RecordingWriter:
         if not special:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._handle = -1
         try:
+            # Beforehand: by the time of a sync descriptors may be out.
+            self._handle = os.dup(self._raw.fileno())
             self._file = McapFile(self._raw, about)
             for packet, t_ns in prelude if about.wire else ():
                 self.add(WIRE, encode_packet(packet, about.wire), t_ns)
@@ -192,6 +196,8 @@ class RecordingWriter:
             if not special:
                 _reveal(hidden, target, force)
         except BaseException:
+            with suppress(OSError):
+                os.close(self._handle)
             with suppress(OSError):
                 self._raw.close()
             if not special:
@@ -255,13 +261,19 @@ class RecordingWriter:
         stats.samples, stats.packets, self.flushed = since.samples, since.packets, since
         return samples, packets
 
-    def whereabouts(self) -> Literal["there", "moved", "deleted"]:
-        """What others did with the file: ``moved`` means that another or none has its name."""
+    def whereabouts(self) -> Literal["there", "moved", "deleted", "emptied"]:
+        """Look at what others did with the file.
+
+        ``moved`` means that another or none has its name, ``emptied`` that it is shorter than what
+        was written, as a log rotator leaves it.
+        """
         if self._special:
             return "there"
         mine = os.fstat(self._raw.fileno())
         if mine.st_nlink == 0:
             return "deleted"
+        if isinstance(self._raw.raw, _Growing) and mine.st_size < self._raw.raw.written:
+            return "emptied"
         try:
             named = os.lstat(self._target)
         except (FileNotFoundError, NotADirectoryError):
@@ -290,7 +302,7 @@ class RecordingWriter:
             try:
                 self._sync_soon(last=True)
             finally:
-                with suppress(OSError):  # the syncer may hold a duplicate for some time yet
+                with suppress(OSError):  # the syncer holds its duplicate for some time yet
                     fcntl.flock(self._raw, fcntl.LOCK_UN)
                 self._raw.close()
         if self._syncer is None and self.failed is not None:
@@ -303,20 +315,20 @@ class RecordingWriter:
         self.flushed = extent
 
     def _sync_soon(self, last: bool = False) -> None:
-        job = partial(self._sync, os.dup(self._raw.fileno()), last)
+        job = partial(self._sync, last)
         if self._syncer is None:
             job()
         else:
             self._waiting = True
             self._syncer.add(job)
 
-    def _sync(self, handle: int, last: bool) -> None:
-        """In the syncer's thread; the handle stays open when the file is closed meanwhile."""
+    def _sync(self, last: bool) -> None:
+        """In the syncer's thread; its handle stays open when the file is closed meanwhile."""
         self._waiting = False
         extent, began_ns = self.flushed, time.monotonic_ns()
         try:
             if not self._special:
-                os.fdatasync(handle)
+                os.fdatasync(self._handle)
                 if not self._name_synced:
                     with suppress(FileNotFoundError, NotADirectoryError):  # see `whereabouts`
                         sync_folder(self._target.parent)
@@ -324,10 +336,13 @@ class RecordingWriter:
             self._synced = extent
             self.unsynced_ns = began_ns if self.flushed != extent else 0
         except OSError as error:
-            # The system has given up what it could not write; a later sync would not tell.
-            self.failed = self.failed or error
+            # The system has given up what it could not write; a later sync would not tell. But
+            # for want of a descriptor the name alone is not synced: the next one does that.
+            if last or error.errno not in (errno.EMFILE, errno.ENFILE):
+                self.failed = self.failed or error
         finally:
-            os.close(handle)
+            if last:
+                os.close(self._handle)
             self.done = last
 
 
@@ -375,8 +390,22 @@ def _hidden(path: Path, force: bool) -> Path:
     return path.with_name(f".{path.stem[:50]}.{secrets.token_hex(4)}{PART}")
 
 
-def _create(path: Path, force: bool) -> BinaryIO:
-    return path.open("wb" if force else "xb")
+class _Growing(io.FileIO):
+    """A new file that counts what was written, always at its end."""
+
+    written = 0
+
+    def write(self, data: Any) -> int:
+        size = super().write(data)
+        self.written += size
+        return size
+
+
+def _create(path: Path, special: bool) -> io.BufferedWriter:
+    if special:
+        return path.open("wb")
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
+    return io.BufferedWriter(_Growing(handle, "ab"))
 
 
 def _reveal(hidden: Path, path: Path, force: bool) -> None:

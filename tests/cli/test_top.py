@@ -13,9 +13,10 @@ from bench.daemon.process import free_port
 from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.config import MetricsConfig
+from tactile_rt.daemon.health import ConsumerState, Diagnostic
 from tactile_rt.daemon.messages import encode, message_of, state_message
 from tactile_rt.daemon.metrics import Metrics
-from tests.helpers.published import View, busy_snapshot, decision, event, running
+from tests.helpers.published import View, busy_snapshot, decision, event, part, running
 
 SHOWN = """\
 tactile_rt 1.2.3 degraded  up 0:00:10  pid 77  reloaded 1x  clock stepped 2x  /etc/robot.toml
@@ -88,6 +89,18 @@ def test_it_looks_at_a_running_daemon(daemon, top):
     assert "mug 93% touching" in out and "No space left on device" in out
     code, out, err = top(daemon.removeprefix("http://"), "--once")
     assert code == 0, err
+
+
+def test_doctor_says_what_a_daemon_suffers_from_and_what_its_log_said(call, tmp_path, monkeypatch):
+    (tmp_path / "log").write_text("a warning b: old\na warning c: new\na info d: fine\n")
+    log = ConsumerState(part("log"), "log", details={"file": str(tmp_path / "log")})
+    found = Diagnostic("source.a", "no samples", "lost", says="a gives none.", do="Look at it.")
+    sick = dataclasses.replace(busy_snapshot(), diagnostics=(found,), consumers=(log,))
+    for shown, ends in ((sick, 1), (dataclasses.replace(sick, diagnostics=()), 0)):
+        monkeypatch.setattr("tactile_rt.cli.top.snapshot_at", lambda url, shown=shown: shown)
+        code, out, _ = call("doctor", "--daemon", "http://robot:9464")
+        assert code == ends and "a warning c: new" in out and "5000 samples, 9 lost" in out
+        assert ("bad source.a: a gives none.\n    -> Look at it.\n" in out) == bool(ends)
 
 
 def test_it_reads_what_the_jsonl_publisher_says(top, monkeypatch):

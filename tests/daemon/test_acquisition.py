@@ -2,11 +2,13 @@
 
 import os
 import threading
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from tactile_rt.core.stream import Chunk, SourceStats
+from tactile_rt.daemon import source_part as module
 from tactile_rt.daemon.source_part import Acquisition
 from tactile_rt.testing import small_spec
 from tests.helpers.waiting import PATIENCE_S, until
@@ -122,3 +124,16 @@ def test_what_reading_raises_is_raised_where_it_was_lent_and_the_others_go_on(so
         assert goes_on.over()
     finally:
         other.close()
+
+
+def test_a_thread_that_cannot_be_started_is_started_for_the_next_one(source, monkeypatch):
+    lines = Acquisition()
+    with monkeypatch.context() as short:
+        short.setattr(module.threading, "Thread", mock.Mock(side_effect=RuntimeError("no thread")))
+        with pytest.raises(RuntimeError, match="no thread"):
+            lines.attend(source, lambda chunk: None, lambda: True)
+    os.write(source.write, bytes(42))
+    lent = Lent(lines, source)
+    until(lambda: lent.came == 42)
+    source.hang_up()
+    assert lent.over() and source.samples == 42

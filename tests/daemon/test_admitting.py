@@ -10,7 +10,7 @@ from tactile_rt.classifier.enrolment import EnrolledObject
 from tactile_rt.classifier.trial import Trial, TrialLimits
 from tactile_rt.core.errors import ModelError
 from tactile_rt.daemon import admission as module
-from tactile_rt.daemon.admission import Admission, file_stamp, model_path
+from tactile_rt.daemon.admission import Admission, file_stamp
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
 from tactile_rt.testing import ArraySource, cut
@@ -128,22 +128,3 @@ def test_whatever_goes_wrong_is_the_model_s_fault_and_names_it(model, monkeypatc
     Trials(monkeypatch, during=fail)
     made = admitted(model)
     assert made.words == f"{model}: ZeroDivisionError: by zero"
-
-
-def test_who_is_given_up_loads_nothing(model, monkeypatch):
-    made = Admission(ModelConfig(file=str(model)), LIMITS, opened(), lambda t_ns: 0.0, None)
-    made.give_up()
-    assert made.finished.wait(PATIENCE_S)
-    assert made.classifier is None
-
-
-def test_a_file_s_stamp_is_another_when_it_is(tmp_path):
-    path = tmp_path / "x"
-    assert file_stamp(path) == () == file_stamp(tmp_path / "\0")
-    path.write_bytes(b"a")
-    first = file_stamp(path)
-    assert first and file_stamp(path) == first
-    path.write_bytes(b"ab")
-    assert file_stamp(path) != first
-    assert model_path(ModelConfig(file="y")).name == "y"
-    assert model_path(ModelConfig()).name.endswith(".onnx")

@@ -1,6 +1,7 @@
 """Configurations: what is right is read whole, what is wrong is refused in one golden line."""
 
 import json
+import os
 import string
 from pathlib import Path
 
@@ -101,6 +102,12 @@ def test_paths_are_meant_from_the_folder_of_the_file_that_they_stand_in(tmp_path
 def test_a_calibration_that_is_no_file_is_a_devices_name(tmp_path):
     config = load(tmp_path, SMALL + 'calibration = "cell-3"\n').config
     assert config.source[0].calibration == "cell-3"
+
+
+def test_a_pipe_is_no_configuration(tmp_path):
+    os.mkfifo(tmp_path / "robot.toml")
+    with pytest.raises(ConfigError, match="cannot be read: a pipe"):
+        load_config(tmp_path / "robot.toml")
 
 
 @pytest.mark.parametrize(

@@ -469,6 +469,37 @@ def test_a_source_that_is_still_being_opened_disturbs_no_other_after_a_reload(ro
     assert len(spy.of(Opened)) == len(spy.told("source.a", "stopped")) == 1
 
 
+@pytest.mark.parametrize("other, words", [
+    ({"spec": SPEC, "options": {"serial_number": "B"}}, "its serial number is B, not A"),
+    ({"spec": small_spec(4)}, "it describes itself otherwise: elements: 4 entries, not 3"),
+])  # fmt: skip
+def test_another_array_is_told_and_nothing_is_decided_of_it_until_it_is_accepted(
+    robot, tmp_path, other, words
+):
+    model, link = write_model(tmp_path / "m.onnx"), str(tmp_path / "w")
+    first = {"spec": SPEC, "options": {"serial_number": "A"}, "link": link}
+    recorded = '[recorder]\nfolder = "rec"\nmin_free_mb = 0\n'
+    with FakeSerial(touching(60_000), **first) as array:
+        text = source("w", array.url) + model_of(model, source="w") + recorded
+        daemon, spy = robot(text)
+        until(lambda: spy.of(Decision))
+        assert daemon.snapshot().sources[0].device.identity == "A"
+    values = np.repeat(touching(60_000), 2, axis=1)[:, : len(other["spec"].elements)]
+    with FakeSerial(values, link=link, **other):
+        until(lambda: len(spy.of(Opened)) == 2)
+        until(lambda: len(seqs(spy, "w")) and not spy.of(SourceChunk)[-1].accepted)
+        (line,) = [d for d in daemon.snapshot().diagnostics if d.part != "daemon"]
+        assert (line.part, line.what) == ("source.w", "another array") and words in line.why
+        n, since_ns = len(seqs(spy, "w")), spy.of(Opened)[1].t_ns
+        until(lambda: len(seqs(spy, "w")) > n + 1500)  # a touch
+        assert not [d for d in spy.of(Decision) if d.sample_ns > since_ns]
+        until(lambda: len(list((tmp_path / "rec").glob("*.mcap"))) == 2)
+        daemon.reload(configured(tmp_path, text))
+        until(lambda: not daemon.snapshot().sources[0].another and spy.of(Opened)[-1].accepted)
+        if len(other["spec"].elements) == 3:
+            until(lambda: any(d.sample_ns > since_ns for d in spy.of(Decision)))
+
+
 def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):
     base, port = source("a", "synthetic:"), tmp_path / "tty"
     daemon, _ = robot(base, locks=Locks())

@@ -1,7 +1,9 @@
 """What is told as degraded: facts at the end of each promise, and nothing else."""
 
 import itertools
+import re
 from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -9,13 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.daemon.fault_kinds import KINDS
 from tactile_rt.core.stream import Chunk
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.daemon import diagnostics as module
+from tactile_rt.daemon.advice import ADVICE, Onsets
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.diagnostics import LossWindow, diagnose
 from tactile_rt.daemon.health import (
     ConsumerState,
+    Diagnostic,
     Losses,
     ModelState,
     OnDisk,
@@ -67,6 +72,12 @@ def test_who_does_what_it_should_is_not_named():
          "no samples: source.a: the device is lost"),
         ({"part": part("source.a", "waiting", "no such port")},
          "no samples: source.a fails: no such port"),
+        ({"slow": True, "measured_hz": 500.0},
+         "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
+        ({"device": Health(State.STREAMING, 1, faults=("a sensor fails",)), "bad": Losses(1, 1)},
+         "device fault: source.a: it says: a sensor fails"),
+        ({"device": Health(State.STREAMING, 1, counts=False)},
+         "no counter: source.a: its counter does not go on: what is lost cannot be seen"),
         ({"stuck_at_s": 0.4}, "stuck-at fault: source.a: the values do not change at all, as no "
          "sensor's do: the device hangs"),
         ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),
@@ -88,6 +99,7 @@ def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
         {"live": False, "newest_ns": 1, "read_ns": 1},  # a recording waits for its reader
         {"newest_ns": 0, "read_ns": 0},  # none has come yet: the device says how it is
         {"rate_hz": 0.5, "newest_ns": NOW - 5 * S, "read_ns": NOW - 5 * S},  # three periods are 6 s
+        {"device": Health(State.STREAMING, 1, status=("a channel is at the end of its range",))},
     ],
 )
 def test_what_is_no_fault_of_a_source_is_not_told(changes):
@@ -101,6 +113,7 @@ def test_what_is_no_fault_of_a_source_is_not_told(changes):
         ({"skips": Losses(1, 1)}, "missing decisions: model.a: it cannot keep up"),
         ({"lost": Losses(9, 9)}, "missing decisions: model.a: it was too slow"),
         ({"implausible": True}, "implausible loads: model.a: loads are far beyond those"),
+        ({"undecided": True}, "no decisions: model.a: its answer to the newest touch is no number"),
         ({"part": part("model.a", "waiting", "no file")}, "no decisions: model.a fails: no file"),
         (
             {"part": part("model.a", "starting", "no file", 1)},
@@ -206,6 +219,26 @@ def test_what_is_wrong_with_the_daemon_itself_is_told():
     assert told(clock_stepped=True) == ["UTC has jumped: daemon: the wall clock was set"]
     (line,) = told(refused="no such codec")
     assert line.startswith("old configuration: daemon: ") and "no such codec" in line
+
+
+def test_a_diagnostic_says_since_when_it_lasts_and_what_to_do():
+    onsets, utc = Onsets(), 1_700_000_000 * S
+    lost = Diagnostic("source.a", "no samples", "fails: no port", "recording goes on")
+    (first,) = onsets.explain([lost], 5 * S, utc)
+    (later,) = onsets.explain([replace(lost, why="the device is lost")], 9 * S, utc + 4 * S)
+    assert (first.since_ns, later.since_ns) == (5 * S, 5 * S) and first.do
+    said = (
+        "source.a: no samples since 2023-11-14 22:13:20 UTC: it fails: no port; recording goes on."
+    )
+    assert first.says == said
+    assert onsets.explain([], 10 * S, utc + 5 * S) == ()
+    assert onsets.explain([lost], 11 * S, utc + 6 * S)[0].since_ns == 11 * S
+
+
+def test_there_is_advice_for_every_kind_of_diagnostic():
+    made = re.findall(r'Diagnostic\([^,()]+, "([^"]+)"', Path(module.__file__).read_text())
+    rig = {what for kind in KINDS.values() for _, what in kind.named + kind.also}
+    assert {*made, *rig, "no systemd", "no metrics"} <= ADVICE.keys() and len(made) > 9
 
 
 class Hand:

@@ -36,12 +36,6 @@ def told(ledger):
     return ledger.on_disk(open=True, meant_ns=5, slow_s=2.0)
 
 
-def test_of_nothing_there_is_nothing():
-    disk = told(Ledger())
-    assert (disk.written_ns, disk.synced_ns, disk.samples) == (0, 0, 0)
-    assert (disk.lost_ns, disk.waits_ns, disk.open, disk.meant_ns) == (0, 0, True, 5)
-
-
 def test_all_files_count_and_those_that_are_done_are_let_go():
     ledger, first, second = Ledger(), File(7, at(7, 70), at(4, 40)), File(3, at(2, 90), at(0, 0))
     ledger.begin(first)

@@ -5,6 +5,7 @@ import http.client
 import json
 import socket
 import urllib.request
+from contextlib import ExitStack
 
 import msgspec
 import pytest
@@ -127,6 +128,7 @@ def test_health_is_the_status_and_state_is_everything(served):
     found = json.loads(body)
     assert (status, found["state"], found["uptime_s"]) == (503, "degraded", 8.0)
     assert found["degraded"] == ["no samples: source.finger: the device is lost"]
+    assert found["soon"] == ["disk full soon: recorder: it is full within 3 h"]
     view.shown = busy_snapshot(state="running")
     status, headers, body = get(port, "/health?x=1")
     assert (status, headers["Content-Type"]) == (200, "application/json")
@@ -151,6 +153,17 @@ def test_whatever_is_asked_gets_an_answer_of_its_own(served, method, path, host,
     port, _, _ = served
     assert get(port, path, method, host=host)[0] == status
     assert get(port, "/state")[0] == 200  # and it goes on
+
+
+def test_slow_connections_keep_nobody_away(served):
+    port, _, consumer = served
+    with ExitStack() as stack:
+        for _ in range(100):
+            line = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            line.sendall(b"GET /heal")
+        assert get(port, "/health")[0] == 503 and get(port, "/metrics")[0] == 200
+        assert consumer._server.connections <= module.LIMITS.connections
+    assert consumer._server.answered == 1 and not consumer.diagnose()
 
 
 def test_closing_waits_for_nobody_and_frees_the_port(monkeypatch):

@@ -17,7 +17,7 @@ from playwright.sync_api import sync_playwright
 from bench.daemon.process import free_port
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.health import ModelState, PartState, Snapshot, SourceState
+from tactile_rt.daemon.health import Diagnostic, ModelState, PartState, Snapshot, SourceState
 from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -164,6 +164,7 @@ class HostileView:
             EVIL, 1, EVIL, now, time.time_ns(), 7, 0, "degraded", (EVIL,),
             sources=(SourceState(self.part, EVIL, newest_ns=now),),
             models=(ModelState(model, "a", EVIL, labels=(EVIL, "y"), touching=True),),
+            diagnostics=(Diagnostic("source.a", EVIL, EVIL, says=EVIL, do=EVIL),),
         )  # fmt: skip
 
     def streams(self):

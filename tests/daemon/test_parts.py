@@ -34,10 +34,9 @@ from tactile_rt.daemon.items import (
     SourceChunk,
 )
 from tactile_rt.daemon.log import Log
-from tactile_rt.daemon.mailbox import AROUND_BYTES, FRAME_BYTES, Hub, Mailbox
+from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
-from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S, until
@@ -116,31 +115,6 @@ def test_every_item_has_a_class():
     for item in items:
         box.put(item)
     assert box.state.waiting == {"samples": 4, "packets": 1, "decisions": 1, "events": len(others)}
-
-
-def test_an_item_s_size_is_that_of_its_arrays_and_what_is_around_them():
-    box = Mailbox({SourceChunk, Packet}, 100, 10**9)
-    chunk = samples(5)
-    box.put(chunk)
-    arrays = sum(getattr(chunk.chunk, name).nbytes for name in ("seq", "t_ns", "values", "valid"))
-    assert box.state.waiting_bytes == arrays + AROUND_BYTES
-    box.take()
-    box.put(Packet("a", b"x" * 70, 5))
-    assert box.state.waiting_bytes == 70 + AROUND_BYTES
-    box.take()
-    box.put(Packet("a", [CanFrame(1)] * 3, 5))
-    assert box.state.waiting_bytes == 3 * FRAME_BYTES + AROUND_BYTES
-
-
-def test_whoever_is_there_hears_of_streams_as_they_open_and_close():
-    hub, box = Hub(), Mailbox({Opened, Closed}, 10, 10**6)
-    hub.join("x", box)
-    opened = Opened("a", SPEC, "url", ArraySource(SPEC, []), 1, OFFSET_NS, ())
-    closed = Closed("a", 2)
-    hub.post(opened)
-    assert dict(hub.streams()) == {"a": opened}
-    hub.post(closed)
-    assert box.take(0) == [opened, closed] and not hub.streams()
 
 
 def test_who_joins_late_hears_of_open_streams_once_and_of_closed_ones_not_at_all():
@@ -270,6 +244,41 @@ def test_what_comes_again_later_is_written_again(tmp_path, monkeypatch):
 def test_the_level_is_the_least_that_is_written(tmp_path):
     events = [event(level=level, reason=level) for level in ("info", "warning", "error")]
     assert len(logged(tmp_path / "log", events, level="warning")) == 2
+
+
+def test_a_log_that_is_moved_or_deleted_is_begun_anew_as_soon_as_it_can_be(tmp_path):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    log = Log("log", LogConfig(file=str(folder / "log")))
+    log.open(None)
+    log.handle([event("one")])
+    (folder / "log").rename(folder / "log.1")
+    log.handle([event("two")])
+    (folder / "log").unlink()
+    log.handle([event("three")])
+    assert [(folder / name).read_text()[-5:] for name in ("log.1", "log")] == [" one\n", "hree\n"]
+    folder.rename(tmp_path / "away")
+    log.handle([event("four"), event("five")])
+    assert "No such file" in log.diagnose() and log.details()["dropped"] == 2
+    folder.mkdir()
+    log.handle([])
+    log.close()
+    assert "log dropped: 2 lines: " in (folder / "log").read_text() and not log.diagnose()
+    assert log.details()["lines"] == 3
+
+
+def test_what_nobody_reads_any_more_is_dropped_and_counted(tmp_path):
+    reader, writer = os.pipe()
+    log = Log("log", LogConfig(file=f"/proc/self/fd/{writer}"))
+    log.open(None)
+    log.handle([event("one")])
+    os.close(reader)
+    for n in range(3):
+        log.handle([event(f"more {n}")])
+    assert log.details() == {**log.details(), "lines": 1, "dropped": 3}
+    assert log.diagnose().endswith("Broken pipe")
+    log.close()
+    os.close(writer)
 
 
 @contextmanager

@@ -10,6 +10,9 @@ import socket
 import subprocess
 import sys
 import termios
+import threading
+from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -105,6 +108,33 @@ def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, ca
     assert states.count(("source.a", "running")) == 1  # it went on undisturbed
     assert ("source.b", "stopped") in states
     assert "Traceback" not in log and "daemon stopping" in log
+
+
+def test_a_reload_that_hangs_is_told_and_keeps_no_later_one(monkeypatch):
+    """As one on a dead mount does."""
+    from tactile_rt.daemon import checks, loading, process
+
+    answers, calls, daemon = threading.Event(), process.Calls(), mock.Mock()
+    files = iter([lambda: answers.wait(PATIENCE_S) and "old", lambda: "good"])
+    monkeypatch.setattr(loading, "load_config", lambda path, sets: next(files)())
+    monkeypatch.setattr(checks, "check_config", lambda loaded: None)
+    monkeypatch.setattr(process, "READ_S", 0.1)
+    serve = threading.Thread(
+        target=process._serve, args=(daemon, Path("robot.toml"), (), calls, None)
+    )
+    serve.start()
+    calls.put(signal.SIGHUP)
+    until(lambda: daemon.refuse.called)
+    assert "robot.toml: 0.1 s do not do to read it" in daemon.refuse.call_args.args[0]
+    calls.put(signal.SIGHUP)
+    until(lambda: daemon.reload.called)
+    answers.set()  # now it answers, and what it read is of before
+    until(lambda: not any(t.name == "tactile-rt reload" for t in threading.enumerate()))
+    daemon.reload.assert_called_once_with("good")
+    daemon.refuse.assert_called_once()
+    calls.put(signal.SIGTERM)
+    serve.join(PATIENCE_S)
+    assert not serve.is_alive()
 
 
 def second(folder, file="robot.toml", *arguments, **environment):
@@ -298,8 +328,6 @@ def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
 @pytest.mark.parametrize("ends", [True, False])
 def test_a_model_that_is_being_loaded_does_not_abort_the_end(monkeypatch, ends):
     """A thread in native code is torn out of it when the interpreter ends, and C++ aborts."""
-    import threading
-
     from tactile_rt.daemon import process
 
     loaded, left = threading.Event(), []

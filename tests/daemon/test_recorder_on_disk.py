@@ -9,11 +9,14 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from tactile_rt.daemon import recordings_folder
 from tactile_rt.daemon.items import Closed, Contact, Control
+from tactile_rt.daemon.recordings_folder import RecordingsFolder
 from tactile_rt.recording import Recording, recover
 from tactile_rt.testing import cut
 from tests.helpers.recorder_by_hand import (
@@ -187,7 +190,7 @@ def test_what_a_sync_that_failed_may_have_lost_is_counted(closed, daemon, tmp_pa
     assert made.details()["lost_samples"] == 20
 
 
-def test_what_no_file_could_grow_by_is_counted(daemon, tmp_path):
+def test_what_no_file_could_grow_by_is_counted_and_told_once(daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0)
     made.handle([opened(), *(samples(c) for c in CHUNKS[:10])])
     look(made)
@@ -195,17 +198,49 @@ def test_what_no_file_could_grow_by_is_counted(daemon, tmp_path):
     (path,) = files(tmp_path)
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size, hard))
     try:
-        made.handle([samples(c) for c in CHUNKS[10:30]])
-        look(made)
+        for _ in range(20):
+            made.handle([samples(c) for c in CHUNKS[10:30]])
+            look(made)
+            assert on_disk(made).lost_why == f"{tmp_path}: File too large"
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    now = on_disk(made)
-    assert (now.samples, now.lost_samples) == (100, 200)
-    assert "File too large" in now.lost_why
-    look(made)
+    assert (on_disk(made).samples, on_disk(made).lost_samples, len(daemon.told)) == (100, 4000, 1)
+    assert len(files(tmp_path)) <= 3  # with pauses
+    until(lambda: (look(made), on_disk(made).open)[1])
     made.handle([samples(c) for c in CHUNKS[30:]])
     made.close()
     assert seqs(tmp_path) == [*range(100), *range(300, 400)]
+
+
+def test_when_the_disk_will_be_full_is_foreseen(tmp_path, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(recordings_folder, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    free_mb = shutil.disk_usage(tmp_path).free / 1e6
+    folder = RecordingsFolder(tmp_path, free_mb - 900.0, lambda job: None, lambda *told: None)
+    folder.has_room()
+    said = {}
+    for n in range(40):
+        now[0] += 5.0
+        said[n] = folder.foresee(0.1 * n if n < 20 else 2.0 + 1.0 * (n - 20))
+    assert not said[10] and "within 24 h" in said[19]  # 900 MB at 72 MB/h
+    assert "within 3 h" in said[39]
+
+
+def test_no_descriptor_left_ends_no_file(daemon, tmp_path):
+    made = begun(daemon, tmp_path, min_free_mb=0, sync_s=1e-6)
+    made.handle([opened(), samples(CHUNKS[0])])
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        for chunk in CHUNKS[1:]:
+            made.handle([samples(chunk)])
+            look(made)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    until(lambda: (look(made), on_disk(made).waits_ns == 0)[1])
+    made.close()
+    assert (len(files(tmp_path)), daemon.told) == (1, [])
+    assert (on_disk(made).samples, on_disk(made).lost_samples) == (400, 0)
 
 
 def test_who_is_stopped_or_waits_for_a_trigger_is_not_meant_to_record(daemon, tmp_path):
@@ -255,18 +290,25 @@ def test_a_folder_that_is_deleted_is_made_again_and_what_it_took_is_counted(daem
     assert (on_disk(made).samples, on_disk(made).lost_samples) == (200, 200)
 
 
-def test_one_file_that_is_deleted_is_not_written_on(daemon, tmp_path):
+@pytest.mark.parametrize("left_bytes", [None, 0, 300])  # deleted; as `copytruncate` leaves it
+def test_one_file_that_is_deleted_or_emptied_is_not_written_on(left_bytes, daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0)
     made.handle([opened("left"), opened("right")])
     made.handle([samples(CHUNKS[0], "left"), samples(CHUNKS[0], "right")])
     look(made)
-    next(p for p in files(tmp_path) if p.name.startswith("left")).unlink()
+    path = next(p for p in files(tmp_path) if p.name.startswith("left"))
+    path.unlink() if left_bytes is None else os.truncate(path, left_bytes)
+    made.handle([samples(c, "left") for c in CHUNKS[1:21]])
+    made._tracks["left"].file.flush()  # a chunk that was full before anybody looked
     look(made)
-    made.handle([samples(CHUNKS[1], "left"), samples(CHUNKS[1], "right")])
+    if left_bytes is not None:
+        path.unlink()
+    made.handle([samples(CHUNKS[21], "left"), samples(CHUNKS[1], "right")])
     made.close()
-    assert seqs(tmp_path) == sorted([*range(10, 20), *range(20)])
-    assert on_disk(made, "left").lost_samples == 10
+    assert seqs(tmp_path) == sorted([*range(210, 220), *range(20)])
+    assert on_disk(made, "left").lost_samples == 210
     assert on_disk(made, "right").lost_samples == 0
+    assert "210 samples are lost" in daemon.told[0][1]
 
 
 def test_what_was_moved_is_whole_where_it_is_and_nothing_is_lost(daemon, tmp_path):

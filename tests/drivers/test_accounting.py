@@ -55,6 +55,17 @@ def test_every_sample_is_accounted_for(fates, bits, data):
     assert sequencer.resets == 0
 
 
+@pytest.mark.parametrize("clock", [None, 1000.0])
+def test_a_counter_that_stands_is_none_until_it_goes_on(clock):
+    sequencer = Sequencer(16, SourceStats(), clock)
+    found = []
+    for k in range(60):
+        count = k if k < 20 or k >= 40 else 20
+        sequencer.number(samples([count], content=[float(k)], ticks=[1000 * k]))
+        found.append(sequencer.useless)
+    assert not any(found[:24]) and all(found[25:40]) and not any(found[40:])
+
+
 def test_noise_between_samples_is_no_lost_sample():
     stats = SourceStats()
     Sequencer(16, stats).number(samples([0, 1, 2], [0, 5, 0]))

@@ -95,6 +95,7 @@ def test_every_sample_is_accounted_for(kind):
         seq = np.concatenate([c.seq for c in chunks])
         lost = np.isin(fate, (Fate.DROPPED, Fate.CORRUPTED, Fate.TRUNCATED))
         assert np.array_equal(seq, np.flatnonzero(~lost))
+        assert source.measured[0] == seq[-1] + 1  # what was lost was measured
         assert np.array_equal(np.concatenate([c.values for c in chunks]), values[seq])
 
 
@@ -151,6 +152,17 @@ def test_a_device_that_restarts_goes_on(tmp_path):
         assert (np.diff(t) > 0).all()
         assert source.health.counter_resets + source.health.clock_steps >= 1
         assert source.stats.missing < 60_000  # not what a counter that began anew would suggest
+
+
+def test_what_a_device_says_of_itself_is_a_fault_but_for_what_is_none(device):
+    with device(signal(60_000)) as fake, open_source(fake.url + PATIENT) as source:
+        fails = ("a sensor fails",)
+        for status, told in ((0b111, (3, fails)), (0b101, (2, fails)), (0b101, (2, ()))):
+            fake.codec.status = status
+            until(
+                lambda told=told: (len(source.health.status), source.health.faults) == told,
+                meanwhile=lambda: source.read(0.01),
+            )
 
 
 def test_whisking_commands_reach_the_device():

@@ -127,6 +127,7 @@ def busy_snapshot(seconds=0, state="degraded"):
             ),
         ),
         diagnostics=(Diagnostic("source.finger", "no samples", "the device is lost"),),
+        soon=(Diagnostic("recorder", "disk full soon", "it is full within 3 h"),),
     )  # fmt: skip
 
 

@@ -82,6 +82,7 @@ class AtiCan(CanCodec):
 
     Options = AtiCanOptions
     polls = True
+    harmless_bits = frozenset((0,))
     status_bits: ClassVar[dict[int, str]] = {
         0: "restarted by its watchdog",
         1: "converter check too high",

@@ -89,6 +89,7 @@ class DescribedFrame(SerialCodec):
         self._invalid = self._refused = 0
         if mapping.status is not None:
             self.status_bits = frame.meanings  # type: ignore[misc]
+            self.harmless_bits = frozenset(mapping.status.harmless)  # type: ignore[misc]
             self._invalid = sum(1 << bit for bit in mapping.status.invalid)
             self._refused = sum(1 << bit for bit in mapping.status.invalid[:1])
         self._steps = {

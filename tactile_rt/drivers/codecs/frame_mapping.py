@@ -113,9 +113,11 @@ class FrameStatus(FrameCounter, frozen=True, kw_only=True):
         bits: What each bit means when it is set, by its number.
         invalid: Numbers of the bits that say that the values are none; an emulated device sets the
             first.
+        harmless: Numbers of the bits that are no fault of the device.
     """
 
     bits: dict[str, str] = {}
+    harmless: tuple[Annotated[int, msgspec.Meta(ge=0, lt=32)], ...] = ()
     invalid: tuple[Annotated[int, msgspec.Meta(ge=0, lt=32)], ...] = ()
 
 

@@ -81,6 +81,7 @@ class MlxHex(SerialCodec):
         3: "a bit of the chip's memory was corrected",
         4: "the chip refused a command",
     }
+    harmless_bits = frozenset((2, 3))
     cannot_detect = "lost and repeated lines (no counter); changed digits (no checksum)"
 
     def __init__(self, options: MlxHexOptions) -> None:

@@ -25,6 +25,7 @@ from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_common import (
     FORMATS,
+    HARMLESS,
     IMPOSSIBLE,
     RANGE_N,
     RANGE_NM,
@@ -62,12 +63,14 @@ class NativeOptions:
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
         range_si: The largest reading of channels of other units that it can tell.
+        serial_number: The serial number that an emulated device tells; empty for none.
     """
 
     format: str = "float32"
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
     range_si: float = RANGE_SI
+    serial_number: str = ""
 
     def __post_init__(self) -> None:
         check_ranges(self.range_n, self.range_nm, self.range_si)
@@ -80,13 +83,14 @@ def frame(
     payload: bytes = b"",
     *,
     format: int = 0,
+    status: int = 0,
     seq: int = 0,
     time_us: int = 0,
     shape: tuple[int, int] = (0, 0),
 ) -> bytes:
     """One frame of the serial form."""
     head = HEADER.pack(
-        SYNC, VERSION << 4 | kind, format, len(payload), 0, seq & 0xFFFFFFFF,
+        SYNC, VERSION << 4 | kind, format, len(payload), status, seq & 0xFFFFFFFF,
         time_us & 0xFFFFFFFF, *shape, 0,
     )[:-2]  # fmt: skip
     whole = head + crc16_xmodem(head[2:]).to_bytes(2, "little") + payload
@@ -102,12 +106,15 @@ class NativeSerial(SerialCodec):
     count_bits = 32
     tick_ns = 1000.0
     status_bits = STATUS
+    harmless_bits = HARMLESS
+    describes = True
     cannot_detect = ""
 
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(None)
         self._format = FORMATS[options.format]
         self._ranges = options.range_n, options.range_nm, options.range_si
+        self.serial_number = options.serial_number
         self._described: DeviceDescription | None = None
         self._rest = b""  # of a frame that is not complete
         self._synchronised = True
@@ -181,6 +188,7 @@ class NativeSerial(SerialCodec):
                     del rows[:], parts[:]  # of what it was before: another device
                     flags = b""
                 self._described, self.spec = found, found.spec
+                self.serial_number = found.serial_number
         if not rows:
             return None
         self._usual = AROUND + head[3]
@@ -235,6 +243,7 @@ class NativeSerial(SerialCodec):
                     MessageType.SAMPLE,
                     pack_valid(valid) + body,
                     format=self._format,
+                    status=self.status,
                     seq=seq,
                     time_us=t_ns // 1000,
                     shape=shape,
@@ -249,6 +258,7 @@ class NativeSerial(SerialCodec):
             if kind in MessageType.FROM_DEVICE:
                 continue  # an echo of our own; answering answers would never end
             if kind == MessageType.DESCRIBE:
+                self._described = None  # its serial number may be another
                 answer += frame(MessageType.DESCRIPTION, self._description().to_json())
                 continue
             if kind in (MessageType.START, MessageType.STOP):
@@ -269,7 +279,7 @@ class NativeSerial(SerialCodec):
     def _description(self) -> DeviceDescription:
         if self._described is None:
             assert self.spec is not None
-            self._described = DeviceDescription.of(self.spec, *self._ranges)
+            self._described = DeviceDescription.of(self.spec, *self._ranges, self.serial_number)
         return self._described
 
     def _valid_of(self, flags: bytes, n: int) -> NDArray[np.bool_]:

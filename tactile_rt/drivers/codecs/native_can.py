@@ -36,6 +36,7 @@ from tactile_rt.drivers.codecs.native_can_parts import (
 )
 from tactile_rt.drivers.codecs.native_common import (
     FORMATS,
+    HARMLESS,
     IMPOSSIBLE,
     RANGE_N,
     RANGE_NM,
@@ -69,6 +70,7 @@ class NativeCanOptions:
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
         range_si: The largest reading of channels of other units that it can tell.
+        serial_number: The serial number that an emulated device tells; empty for none.
     """
 
     base: int = 0x100
@@ -77,6 +79,7 @@ class NativeCanOptions:
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
     range_si: float = RANGE_SI
+    serial_number: str = ""
 
     def __post_init__(self) -> None:
         check_ranges(self.range_n, self.range_nm, self.range_si)
@@ -103,6 +106,8 @@ class NativeCan(CanCodec):
     count_bits = 16
     tick_ns = 1000.0
     status_bits = STATUS
+    harmless_bits = HARMLESS
+    describes = True
     cannot_detect = "65,536 samples lost in succession (over CAN)"
 
     @classmethod
@@ -121,6 +126,7 @@ class NativeCan(CanCodec):
         self._base, self._fd = options.base, options.fd
         self._float32 = options.format == "float32"
         self._ranges = options.range_n, options.range_nm, options.range_si
+        self.serial_number = options.serial_number
         self._described: DeviceDescription | None = None
         self._sample = SampleParts(self.stats)
         self._text = DescriptionParts()
@@ -170,6 +176,7 @@ class NativeCan(CanCodec):
             self._sample.refuse()
         else:
             self._described, self.spec = found, found.spec
+            self.serial_number = found.serial_number
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         if command == Command.START:
@@ -208,7 +215,7 @@ class NativeCan(CanCodec):
             else:
                 body = quantise(values, described.scale).astype("<i2").tobytes()
                 valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
-            head = head_of(seq, t_ns // 1000, flags)
+            head = head_of(seq, t_ns // 1000, flags, self.status)
             parts = sample_parts(head, pack_valid(valid) + body)
             if parts is None:
                 elements, channels = described.spec.shape
@@ -262,5 +269,5 @@ class NativeCan(CanCodec):
 
     def _description(self) -> DeviceDescription | None:
         if self._described is None and self.spec is not None:
-            return DeviceDescription.of(self.spec, *self._ranges)
+            return DeviceDescription.of(self.spec, *self._ranges, self.serial_number)
         return self._described

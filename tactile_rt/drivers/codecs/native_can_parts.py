@@ -20,9 +20,9 @@ MOST_PARTS: Final = 256  # what one byte of index counts
 PIECE: Final = struct.Struct("<BH")  # type and index, before each part of the description
 
 
-def head_of(seq: int, time_us: int, flags: int) -> bytes:
+def head_of(seq: int, time_us: int, flags: int, status: int = 0) -> bytes:
     """The header of a sample."""
-    return HEAD.pack(seq & 0xFFFF, time_us & 0xFFFFFFFF, 0, flags | (~flags & 15) << 4)
+    return HEAD.pack(seq & 0xFFFF, time_us & 0xFFFFFFFF, status, flags | (~flags & 15) << 4)
 
 
 def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:

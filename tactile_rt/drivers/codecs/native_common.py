@@ -12,6 +12,7 @@ from tactile_rt.core.stream import ArraySpec
 
 __all__ = [
     "FORMATS",
+    "HARMLESS",
     "IMPOSSIBLE",
     "RANGE_N",
     "RANGE_NM",
@@ -44,6 +45,7 @@ STATUS: Final = {
     2: "the device lost samples before this one",
     3: "the whisking drive fails",
 }
+HARMLESS: Final = frozenset((0, 2))  # no faults: a firm touch, and what the counter shows
 
 
 class MessageType:
@@ -66,10 +68,12 @@ class DeviceDescription:
 
     Attributes:
         scale: SI units per count of int16, by channel.
+        serial_number: Tells it from all others of its kind; empty for none.
     """
 
     spec: ArraySpec
     scale: tuple[float, ...]
+    serial_number: str = ""
 
     @classmethod
     def of(
@@ -78,6 +82,7 @@ class DeviceDescription:
         range_n: float = RANGE_N,
         range_nm: float = RANGE_NM,
         range_si: float = RANGE_SI,
+        serial_number: str = "",
     ) -> "DeviceDescription":
         """A description with scales for these largest readings, and +-pi rad.
 
@@ -87,12 +92,14 @@ class DeviceDescription:
             range_si: Largest reading in any other unit that an int16 can tell.
         """
         full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
-        return cls(spec, tuple(full.get(unit, range_si) / 32767 for unit in spec.units))
+        scale = tuple(full.get(unit, range_si) / 32767 for unit in spec.units)
+        return cls(spec, scale, serial_number)
 
     def to_json(self) -> bytes:
         """The payload of a DESCRIPTION."""
         spec = msgspec.Raw(self.spec.to_json().encode())
-        return msgspec.json.encode({"spec": spec, "scale": self.scale})
+        further = {"serial": self.serial_number} if self.serial_number else {}
+        return msgspec.json.encode({"spec": spec, "scale": self.scale, **further})
 
     @classmethod
     def from_json(cls, text: bytes) -> "DeviceDescription | None":
@@ -101,10 +108,11 @@ class DeviceDescription:
             fields = msgspec.json.decode(text, type=dict[str, msgspec.Raw])
             spec = ArraySpec.from_json(bytes(fields["spec"]).decode())
             scale = msgspec.json.decode(fields["scale"], type=tuple[float, ...])
+            serial_number = msgspec.json.decode(fields.get("serial", b'""'), type=str)
         except (msgspec.MsgspecError, ConfigError, KeyError, UnicodeDecodeError):
             return None
         good = len(scale) == len(spec.channels) and all(0 < s <= LARGEST for s in scale)
-        return cls(spec, scale) if good else None
+        return cls(spec, scale, serial_number) if good else None
 
 
 def pack_valid(valid: NDArray[np.bool_]) -> bytes:

@@ -189,6 +189,7 @@ class OptoForceSerial(SerialCodec):
         4: "mz overloaded",
         SEVERAL: "several sensors are at fault",
     }
+    harmless_bits = frozenset(range(4, 10))
     cannot_detect = (
         "changes that cancel each other, or bytes that change places (a sum of bytes); 65,536 "
         "samples lost in succession"
@@ -261,6 +262,7 @@ class OptoForceCan(CanCodec):
     Options = OptoForceCanOptions
     count_bits = 16
     status_bits = OptoForceSerial.status_bits
+    harmless_bits = OptoForceSerial.harmless_bits
     cannot_detect = OptoForceSerial.cannot_detect
 
     @classmethod

@@ -76,8 +76,12 @@ def test_a_description_is_plain_json() -> None:
     assert fields["scale"] == pytest.approx([0.1 / 32767, 1e-3 / 32767])
     host = NativeSerial(NativeOptions())
     # what a later version of the firmware adds does not disturb
-    host.feed(frame(MessageType.DESCRIPTION, json.dumps({**fields, "serial": "X1"}).encode()), T0)
-    assert host.spec == SPEC
+    host.feed(frame(MessageType.DESCRIPTION, json.dumps({**fields, "later": 1}).encode()), T0)
+    assert host.spec == SPEC and host.serial_number == ""
+    numbered = native(serial_number="X1").respond(frame(MessageType.DESCRIBE))
+    assert numbered[20:-4] == answer[20:-5] + b',"serial":"X1"}'
+    host.feed(numbered, T0)
+    assert host.serial_number == "X1"
 
 
 @pytest.mark.parametrize(

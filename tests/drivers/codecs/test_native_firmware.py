@@ -140,6 +140,7 @@ BOARD = r"""
 #include <stdint.h>
 const char board_description[] = DESCRIPTION;
 const uint16_t board_description_size = sizeof board_description - 1;
+const char board_serial[] = "A-17";
 static uint32_t us;
 uint32_t board_micros(void) { return us; }
 int board_running(void) { return !feof(stdin); }
@@ -485,6 +486,9 @@ def test_the_example_runs(tmp_path: Path) -> None:
         assert step.expect is None or step.expect in wire
     samples = host.feed(wire, T0)
     assert host.spec == SPEC and samples is not None and samples.valid.all()
+    numbered = NativeSerial(NativeOptions(serial_number="A-17"))
+    numbered.spec = SPEC
+    assert wire.startswith(numbered.respond(steps[0].send)) and host.serial_number == "A-17"
     assert (np.diff(samples.count) == 1).all() and (np.diff(samples.ticks) == 1000).all()
     assert samples.values[:, 0, 1] == pytest.approx(samples.ticks * 1e-6 + 1)
     assert host.stats.corrupt == host.stats.skipped == 0

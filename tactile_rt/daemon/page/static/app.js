@@ -115,7 +115,7 @@ const stream = new Stream({
   link(state, reason) {
     if (state === "locked") {
       $("login").hidden = false;
-      $("main").hidden = $("degraded").hidden = true;
+      $("main").hidden = $("degraded").hidden = $("soon").hidden = true;
       say("", 0);
       $("token").focus();
     } else if (state === "full") {
@@ -283,14 +283,24 @@ function states() {
   $("by-model").hidden = models.length === 0;
   $("daemon").textContent = "daemon " + s.state;
   $("daemon").className = "chip " + ({ running: "good", degraded: "warn" }[s.state] || "warn");
-  $("degraded").replaceChildren(...s.degraded.map((line) => make("li", line)));
-  $("degraded").hidden = s.degraded.length === 0;
+  tell("degraded", s.diagnostics);
+  tell("soon", s.soon);
   const now = s.models.find((m) => m.part.name === "model." + model);
   touching = Boolean(now && now.touching);
   figures(s, now);
   parts(s);
   recording(s.consumers.find((c) => c.kind === "recorder"));
   tellLink();
+}
+
+// Sentences of the daemon, and what to do.
+function tell(where, told) {
+  $(where).replaceChildren(...told.map(({ says, do: advice }) => {
+    const item = make("li", says);
+    if (advice) item.append(make("p", advice));
+    return item;
+  }));
+  $(where).hidden = told.length === 0;
 }
 
 // Without an array there is nothing to draw: say why instead.
@@ -314,7 +324,9 @@ function figures(s, now) {
     const { corrupt, missing, dropped, delivered, duplicates } = here.stats;
     const gone = corrupt + missing + dropped;
     const rate = then ? (here.samples - then.samples) / ((s.t_ns - before.t_ns) / 1e9) : NaN;
-    tiles.push(["Samples per second", Number.isFinite(rate) ? rate.toFixed(0) : "–"]);
+    const of = here.measured_hz ? `${+here.measured_hz.toPrecision(3)} Hz measured of ` : "";
+    tiles.push(["Samples per second", Number.isFinite(rate) ? rate.toFixed(0) : "–", here.slow,
+      `${of}${+here.rate_hz.toPrecision(4)} Hz nominal`]);
     const late = here.losses.minute ? `, ${here.losses.minute} in a minute` : "";
     tiles.push(["Lost samples", `${gone} (${percent(gone, gone + delivered)})${late}`, here.losses.minute > 0,
       `missing ${missing}, corrupt ${corrupt}, dropped ${dropped}, duplicates ${duplicates}`]);
@@ -351,8 +363,9 @@ function parts(s) {
   const lines = [];
   const base = (path) => path.split("/").at(-1) || "the shipped model";
   for (const p of s.sources) {
-    const device = p.device ? `, device ${p.device.state} ${p.device.reason}` : "";
-    lines.push([p.part, `${p.url}${device}`, p.device && p.device.state !== "streaming"]);
+    const said = p.device ? [`identity: ${p.device.identity}`, p.device.reason, ...new Set([...p.device.faults, ...p.device.status])].filter(Boolean) : [];
+    const device = p.device ? `, device ${p.device.state} ${said.join(", ")}` : "";
+    lines.push([p.part, `${p.url}${device}`, p.device && (p.device.state !== "streaming" || p.device.faults.length)]);
   }
   for (const m of s.models) lines.push([m.part, `${base(m.file)} on ${m.source}, ${m.labels.length} labels`]);
   for (const c of s.consumers) {

@@ -1,0 +1,69 @@
+"""Say of each diagnostic in a sentence what is wrong, since when, and what to do.
+
+The page and `tactile-rt doctor --daemon` show it, `/health` and the ``state`` message carry it. A
+sentence stays the same as long as its diagnostic does.
+"""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+
+from tactile_rt.daemon.health import BREAKS, Diagnostic
+
+__all__ = ["ADVICE", "Onsets"]
+
+LOAD = "Stop other programs, or take a faster machine or a smaller model; see `tactile-rt top`."
+VERIFY = "Look at the model's file: `tactile-rt model verify FILE`; then send SIGHUP."
+# What to do, by what is missing.
+ADVICE = {
+    "late": LOAD,
+    "UTC has jumped": "Let NTP or PTP set the clock before; times of samples do not depend on it.",
+    "old configuration": "Mend the file (`tactile-rt config check FILE`), then send SIGHUP.",
+    "no samples": "Look at power, cable and port: `tactile-rt doctor`. It is tried again.",
+    "late samples": "Lower the latency timer of the USB adapter (`tactile-rt doctor`) or the load.",
+    "lost samples": "Look at cable, connectors, baud rate and bus load: `tactile-rt hz URL`.",
+    "bad samples": "Look at the wiring, and at the scale and codec in the source's URL.",
+    "stuck-at fault": "Touch it. If still nothing changes, turn the device off and on.",
+    "slow": "Compare the device's rate with the one that it is described by; look at its load.",
+    "device fault": "See its manual on what it says; what touches a broken sensor is not felt.",
+    "another array": "Plug in the one that was there, or accept the new one by SIGHUP.",
+    "no counter": "Mend the device's program: its counter does not move.",
+    "no decisions": VERIFY,
+    "late decisions": LOAD,
+    "missing decisions": LOAD,
+    "implausible loads": "Compare unit, gain and sensor with what the model learnt from; tare.",
+    "old model": VERIFY,
+    "no recording": "Look at disk, folder and permissions. It goes on by itself.",
+    "not published": "Look at who reads it, and at its address or file. It goes on by itself.",
+    "no page": "Close browsers that nobody looks at, or free its port.",
+    "no metrics": "Free its port, or name another one.",
+    "no log": "Look at the file's folder and disk; of stderr, at the program that reads it.",
+    "no systemd": "Look at the unit: NotifyAccess and WatchdogSec.",
+    "disk full soon": "Move or delete recordings, or record less (see [recorder]).",
+}
+
+
+class Onsets:
+    """Keeps when each diagnostic began; from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._begun: dict[tuple[str, str], tuple[int, str]] = {}
+
+    def explain(
+        self, found: Sequence[Diagnostic], now_ns: int, utc_ns: int
+    ) -> tuple[Diagnostic, ...]:
+        """Return those of now, host CLOCK_MONOTONIC and UTC in ns, with onset and advice."""
+        when = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        with self._lock:
+            keys = [(one.part, one.what) for one in found]
+            begun = self._begun = {key: self._begun.get(key, (now_ns, when)) for key in keys}
+        return tuple(_explain(one, *begun[one.part, one.what]) for one in found)
+
+
+def _explain(one: Diagnostic, since_ns: int, when: str) -> Diagnostic:
+    it = "it " if one.why.startswith(BREAKS) else ""
+    still = f"; {one.still}" if one.still else ""
+    says = f"{one.part}: {one.what} since {when}: {it}{one.why}{still}."
+    return replace(one, since_ns=since_ns, says=says, do=ADVICE.get(one.what, ""))
