@@ -93,7 +93,7 @@ class RecordingsFolder:
         return not why
 
     def foresee(self, written_mb: float) -> str:
-        """Say within how many hours it is full at this rate; empty: not in a day.
+        """Say within how many hours it is full; empty: not in a day.
 
         Args:
             written_mb: All that has been written so far, MB.
