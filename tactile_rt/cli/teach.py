@@ -228,7 +228,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 _say(teacher.note("samples come again"))
             heard, silent = time.monotonic(), False
             writer.push(chunk)
-            if not listener.touching:
+            if not listener.classifier.deciding:
                 label = teacher.label
             hasty = listener.hasty
             for onset, end, felt in listener.push(chunk):

@@ -16,13 +16,15 @@ import pytest
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.cli.teach import Orders, _teach
 from tactile_rt.core.locks import alone_in
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.sources.opening import open_source
 from tactile_rt.teaching.lesson import Lesson
 from tactile_rt.teaching.page import TeachingPage
-from tactile_rt.testing import FakeSerial
-from tests.helpers.made_up_touches import KINDS, felt
+from tactile_rt.teaching.teacher import Teacher
+from tactile_rt.testing import ArraySource, FakeSerial, cut
+from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, wrench_spec
 from tests.helpers.processes import run_program, start_program
 from tests.helpers.source_tree import ROOT
 from tests.helpers.waiting import until
@@ -229,6 +231,22 @@ def test_a_device_that_falls_silent_is_told(tmp_path):
         words = ("teach", url(line), tmp_path / "a", "--classes", "press", "--seconds", "7")
         done = run_program(*words)
     assert "no sample for 3 s: is the device plugged in?" in done.stdout
+
+
+def test_a_tap_keeps_its_name_where_the_next_is_named_before_it_is_over(tmp_path, monkeypatch):
+    """It is let go after 0.1 s, and looked at for 0.9 s."""
+    spec = wrench_spec()
+    values = NOISE * np.random.default_rng(0).normal(size=(700, 1, 6))
+    values[400:410, 0, 2] += 4
+    source = ArraySource(spec, cut(values, RATE_HZ))
+    orders, due = Orders(None), ["press"]
+    monkeypatch.setattr(orders, "listen", lambda: None)
+    monkeypatch.setattr(
+        orders, "next", lambda: due.pop() if due and source.stats.delivered > 460 else ""
+    )
+    lesson = Lesson.begun(tmp_path / "a", spec, (0.3 * NOISE).astype(np.float32))
+    _teach(teacher := Teacher(lesson, ["tap", "press"], 9), source, "", orders)
+    assert [touch.label for touch in lesson.touches] == ["tap"] and teacher.label == "press"
 
 
 def test_letters_and_numbers_are_orders(tmp_path):
