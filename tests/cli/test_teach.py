@@ -1,11 +1,13 @@
 """`tactile-rt teach`, over a real serial line: taught, gone on with, killed, and used."""
 
+import os
 import random
 import re
 import shlex
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 import urllib.request
@@ -247,6 +249,25 @@ def test_a_tap_keeps_its_name_where_the_next_is_named_before_it_is_over(tmp_path
     lesson = Lesson.begun(tmp_path / "a", spec, (0.3 * NOISE).astype(np.float32))
     _teach(teacher := Teacher(lesson, ["tap", "press"], 9), source, "", orders)
     assert [touch.label for touch in lesson.touches] == ["tap"] and teacher.label == "press"
+
+
+def test_touches_are_judged_by_one_thread(tmp_path):
+    """Several keep the sensor unread for seconds where the processors are busy."""
+    code = (
+        "import os, sys\n"
+        "from tactile_rt.cli import main\n"
+        "class Look:\n"
+        "    def find_spec(name, path=None, target=None):\n"
+        "        if name == 'numpy': print('threads:', os.environ.get('OMP_NUM_THREADS'))\n"
+        "sys.meta_path.insert(0, Look)\n"
+        "main()\n"
+    )
+    alone = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    words = ("teach", "serial:/dev/none?codec=bota", str(tmp_path / "a"))
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], env=alone, capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "threads: 1\n", done.stderr
 
 
 def test_letters_and_numbers_are_orders(tmp_path):
