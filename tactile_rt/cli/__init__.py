@@ -31,9 +31,7 @@ def main() -> None:
         from tactile_rt.daemon.process import note_signals
 
         note_signals()
-    if sys.argv[1:2] == ["teach"]:
-        # A touch is judged between two reads: on a busy machine threads of numpy's libraries, which
-        # wait for one another, take two seconds for what one does in a twentieth.
+    if sys.argv[1:2] == ["teach"]:  # two threads of numpy's libraries take 30 times as long as one
         os.environ.setdefault("OMP_NUM_THREADS", "1")
     with _signals() as told:
         _run(told)

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import urllib.request
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -18,7 +19,7 @@ import pytest
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.cli.teach import Orders, _teach
+from tactile_rt.cli.teach import _teach
 from tactile_rt.core.locks import alone_in
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.sources.opening import open_source
@@ -235,20 +236,41 @@ def test_a_device_that_falls_silent_is_told(tmp_path):
     assert "no sample for 3 s: is the device plugged in?" in done.stdout
 
 
-def test_a_tap_keeps_its_name_where_the_next_is_named_before_it_is_over(tmp_path, monkeypatch):
-    """It is let go after 0.1 s, and looked at for 0.9 s."""
-    spec = wrench_spec()
+def tapped(live):
+    """A tap of 0.1 s, which is looked at for 0.9 s."""
     values = NOISE * np.random.default_rng(0).normal(size=(700, 1, 6))
     values[400:410, 0, 2] += 4
-    source = ArraySource(spec, cut(values, RATE_HZ))
-    orders, due = Orders(None), ["press"]
-    monkeypatch.setattr(orders, "listen", lambda: None)
-    monkeypatch.setattr(
-        orders, "next", lambda: due.pop() if due and source.stats.delivered > 460 else ""
+    return ArraySource(wrench_spec(), cut(values, RATE_HZ), live)
+
+
+def taught_tap(folder, source, say):
+    lesson = Lesson.begun(folder, source.spec, (0.3 * NOISE).astype(np.float32))
+    teacher = Teacher(lesson, ["tap", "press"], 9)
+    _teach(teacher, source, "", SimpleNamespace(listen=lambda: None, next=say))
+    return lesson, teacher
+
+
+def test_a_tap_keeps_its_name_where_the_next_is_named_before_it_is_over(tmp_path):
+    source, due = tapped(live=False), ["press"]
+    lesson, teacher = taught_tap(
+        tmp_path / "a",
+        source,
+        lambda: due.pop() if due and source.stats.delivered > 460 else "",
     )
-    lesson = Lesson.begun(tmp_path / "a", spec, (0.3 * NOISE).astype(np.float32))
-    _teach(teacher := Teacher(lesson, ["tap", "press"], 9), source, "", orders)
     assert [touch.label for touch in lesson.touches] == ["tap"] and teacher.label == "press"
+
+
+def test_a_device_is_read_while_a_touch_is_judged(tmp_path, monkeypatch):
+    source, judge = tapped(live=True), Lesson.leave_one_out
+
+    def judge_late(lesson):
+        if lesson.touches:
+            until(lambda: source.stats.delivered == 700, 10)
+        return judge(lesson)
+
+    monkeypatch.setattr(Lesson, "leave_one_out", judge_late)
+    lesson, _ = taught_tap(tmp_path / "a", source, lambda: "")
+    assert [touch.label for touch in lesson.touches] == ["tap"]
 
 
 def test_touches_are_judged_by_one_thread(tmp_path):
