@@ -31,6 +31,8 @@ def main() -> None:
         from tactile_rt.daemon.process import note_signals
 
         note_signals()
+    if sys.argv[1:2] == ["teach"]:  # two threads of numpy's libraries take 30 times as long as one
+        os.environ.setdefault("OMP_NUM_THREADS", "1")
     with _signals() as told:
         _run(told)
 

@@ -5,6 +5,8 @@ import shlex
 import sys
 import threading
 import time
+from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -202,7 +204,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     _say(lesson.taught.note)
     path = lesson.next_recording()
     orders.listen()
-    with StreamWriter(path, source, url=url) as writer:
+    with StreamWriter(path, source, url=url) as writer, closing(_hear(source, orders)) as coming:
         if sys.stdin is not None and sys.stdin.isatty() and not teacher.done:
             typer.echo(HELP)
         typer.echo(teacher.prompt())
@@ -214,11 +216,10 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 _say(teacher.note(listener.hint()))
                 quiet_since, patience_s = time.monotonic(), 2 * patience_s
             try:
-                chunk = source.read(POLL_S)
+                chunk, order = next(coming)
             except EndOfStream:
                 break
-            while not teacher.done and (order := orders.next()):
-                _say(teacher.obey(order))
+            _say(teacher.obey(order) if order else "")
             if chunk is None:
                 if time.monotonic() - heard > SILENT_S and not silent:
                     silent = True
@@ -228,7 +229,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 _say(teacher.note("samples come again"))
             heard, silent = time.monotonic(), False
             writer.push(chunk)
-            if not listener.touching:
+            if not listener.classifier.deciding:
                 label = teacher.label
             hasty = listener.hasty
             for onset, end, felt in listener.push(chunk):
@@ -239,6 +240,33 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 label = teacher.label
             if listener.hasty > hasty:
                 _say(teacher.note(HASTY))
+
+
+def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
+    """Yield chunks and the orders that came with them; a live source is read all the while."""
+    from tactile_rt.core.bounded_queue import BoundedQueue
+
+    waiting, endings = BoundedQueue[tuple["Chunk | None", str]](), list[Exception]()
+
+    def read() -> None:
+        try:
+            while not waiting.closed:
+                waiting.put((source.read(POLL_S), orders.next()))
+        except Exception as error:  # whatever it is, it belongs to who takes the chunks
+            endings.append(error)
+            waiting.close()
+
+    while not source.live:
+        yield source.read(POLL_S), orders.next()
+    reader = threading.Thread(target=read, name="tactile-rt-reader", daemon=True)
+    reader.start()
+    try:
+        while item := waiting.get():
+            yield item
+        raise endings[0]
+    finally:
+        waiting.close()
+        reader.join()
 
 
 def _losses(source: "Source") -> list[str]:
