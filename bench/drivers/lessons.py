@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.drivers.sensor_touches import RESTS_S, SENSORS, TAUGHT, Drawing, draw_touches
 from bench.emulated import PRIORITY, LoopedSource
 from bench.processes import Helper
 from tactile_rt.classifier.classifier import Classifier
@@ -30,7 +31,6 @@ from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.sources.opening import open_source
 from tactile_rt.teaching.lesson import MODEL
 from tactile_rt.teaching.teacher import Teacher
-from tests.helpers.sensor_touches import RESTS_S, SENSORS, TAUGHT, Drawing, draw_touches
 
 NAMED_S, LAST_S, START_S, FEW = 0.25, 3.0, 60.0, (2, 3, 5)  # before a touch; after the last
 FIGURES = ("known", "refused", *(f"of {n}" for n in FEW), "missed", "split", "mistaught")

@@ -244,28 +244,26 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
 
 def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
     """Yield chunks and the orders that came with them; a live source is read all the while."""
-    from tactile_rt.core.bounded_queue import BoundedQueue
-
-    waiting, endings = BoundedQueue[tuple["Chunk | None", str]](), list[Exception]()
+    waiting = queue.SimpleQueue[tuple["Chunk | None", str] | Exception]()
+    over = threading.Event()
 
     def read() -> None:
         try:
-            while not waiting.closed:
+            while not over.is_set():
                 waiting.put((source.read(POLL_S), orders.next()))
         except Exception as error:  # whatever it is, it belongs to who takes the chunks
-            endings.append(error)
-            waiting.close()
+            waiting.put(error)
 
     while not source.live:
         yield source.read(POLL_S), orders.next()
     reader = threading.Thread(target=read, name="tactile-rt-reader", daemon=True)
     reader.start()
     try:
-        while item := waiting.get():
+        while not isinstance(item := waiting.get(), Exception):
             yield item
-        raise endings[0]
+        raise item
     finally:
-        waiting.close()
+        over.set()
         reader.join()
 
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 
 from tactile_rt.daemon.health import BREAKS, Diagnostic
 
-__all__ = ["ADVICE", "Onsets"]
+__all__ = ["ADVICE", "DiagnosticOnsets"]
 
 LOAD = "Stop other programs, or take a faster machine or a smaller model; see `tactile-rt top`."
 VERIFY = "Look at the model's file: `tactile-rt model verify FILE`; then send SIGHUP."
@@ -44,7 +44,7 @@ ADVICE = {
 }
 
 
-class Onsets:
+class DiagnosticOnsets:
     """Keeps when each diagnostic began; from any thread."""
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.admission import file_stamp, model_path
-from tactile_rt.daemon.advice import Onsets
+from tactile_rt.daemon.advice import DiagnosticOnsets
 from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
@@ -70,7 +70,7 @@ class Daemon:
         self._degraded: tuple[str, ...] = ()
         self._reloads = self._clock_steps = 0
         self._turns = Turns()
-        self._onsets, self._foreseen = Onsets(), Onsets()
+        self._onsets, self._foreseen = DiagnosticOnsets(), DiagnosticOnsets()
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()

@@ -108,8 +108,6 @@ def test_the_last_step_of_a_touch_names_its_object(enrolled):
     assert all((d.object, d.object_margin) == ("", None) for d in found if not d.final)
     sliding = felt(enrolled, [8], mode="sliding", every=2)
     assert [d.step for d in sliding if d.object] == [4] and len(sliding) > 5
-    early = felt(enrolled, [8], sure=0.01, in_a_row=1)  # it has no last step
-    assert [(d.step, d.final, d.object) for d in early] == [(1, True, "")]
 
 
 def test_touches_that_follow_each_other_are_fused_if_asked(enrolled):

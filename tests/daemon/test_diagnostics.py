@@ -15,7 +15,7 @@ from bench.daemon.fault_kinds import KINDS
 from tactile_rt.core.stream import Chunk
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.daemon import diagnostics as module
-from tactile_rt.daemon.advice import ADVICE, Onsets
+from tactile_rt.daemon.advice import ADVICE, DiagnosticOnsets
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.diagnostics import LossWindow, diagnose
 from tactile_rt.daemon.health import (
@@ -222,7 +222,7 @@ def test_what_is_wrong_with_the_daemon_itself_is_told():
 
 
 def test_a_diagnostic_says_since_when_it_lasts_and_what_to_do():
-    onsets, utc = Onsets(), 1_700_000_000 * S
+    onsets, utc = DiagnosticOnsets(), 1_700_000_000 * S
     lost = Diagnostic("source.a", "no samples", "fails: no port", "recording goes on")
     (first,) = onsets.explain([lost], 5 * S, utc)
     (later,) = onsets.explain([replace(lost, why="the device is lost")], 9 * S, utc + 4 * S)

@@ -280,16 +280,10 @@ def test_names_are_covered_in_each_class_of_each_set(data):
         return logits.astype(np.float32)
 
     strengths = (6.0, 0.3), (0.3, 6.0)
-    per_noise = (2, 1, 1)
-    batches = iter(
-        [
-            batch
-            for repeats in per_noise
-            for strength in strengths
-            for _ in range(repeats)
-            for batch in np.array_split(draw(strength), range(64, len(names), 64))
-        ]
-    )
+    batches = iter([
+        batch for repeats in (2, 1, 1) for strength in strengths for _ in range(repeats)
+        for batch in np.array_split(draw(strength), range(64, len(names), 64))
+    ])  # fmt: skip
     rules = fit_names([many, many], lambda *_: next(batches), KINDS)
     assert [rule.noise for rule in rules["ball"]] == [0.3, 1.2, 2.2]
     for strength in strengths:

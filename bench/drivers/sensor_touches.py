@@ -24,7 +24,7 @@ EARLY_S = 0.15  # of an onset before its touch
 LONG, WIDE = 0.6, 0.35  # of a fingertip, half pads
 
 
-class Sensor(NamedTuple):
+class TaughtSensor(NamedTuple):
     """The wire, which of six loads its channels are of, these in a usual touch, noise, rest."""
 
     wire: str
@@ -35,19 +35,21 @@ class Sensor(NamedTuple):
 
 
 SENSORS = {
-    "bota": Sensor("serial", tuple(range(6)), (4,) * 3 + (0.08,) * 3, (0.04,) * 3 + (8e-4,) * 3),
-    "anyskin": Sensor(
+    "bota": TaughtSensor(
+        "serial", tuple(range(6)), (4,) * 3 + (0.08,) * 3, (0.04,) * 3 + (8e-4,) * 3
+    ),
+    "anyskin": TaughtSensor(
         "serial", (0, 1, 2, 2), (2e-4,) * 3 + (0,), (2e-6,) * 3 + (0.05,), (0, 0, 0, 298)
     ),
-    "hx711_whisker": Sensor("serial", (0, 1), 3e-3, 3e-5),
-    "xela": Sensor("can", (0, 1, 2), 2500, 15, 32_768),
-    "icub_skin": Sensor("can", (2,), -70, 1, 245),
+    "hx711_whisker": TaughtSensor("serial", (0, 1), 3e-3, 3e-5),
+    "xela": TaughtSensor("can", (0, 1, 2), 2500, 15, 32_768),
+    "icub_skin": TaughtSensor("can", (2,), -70, 1, 245),
 }
 
 Wave = Callable[[NDArray[np.float64]], Any]  # of a touch's time, 0 to 1
 
 
-class Kind(NamedTuple):
+class TouchKind(NamedTuple):
     """A pattern.
 
     Attributes:
@@ -67,19 +69,19 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "press": Kind(),
-    "tap": Kind(lambda u: np.sin(np.pi * u), seconds=0.15),
-    "double": Kind(lambda u: np.maximum(np.sin(3 * np.pi * u), 0), seconds=0.5),
-    "triple": Kind(lambda u: np.maximum(np.sin(5 * np.pi * u), 0)),
-    "ramp": Kind(lambda u: np.minimum(u / 0.85, (1 - u) / 0.15)),
-    "fade": Kind(lambda u: np.minimum(u / 0.1, (1 - u) / 0.9)),
-    "tremble": Kind(lambda u: np.sin(np.pi * u) * (1 + 0.5 * np.sin(12 * np.pi * u)), hz=10.6),
-    "buzz": Kind(lambda u: np.sin(np.pi * u) * (1 + 0.5 * np.sin(48 * np.pi * u)), hz=42.6),
-    "rub": Kind(path=lambda u: 0.5j * np.sin(4 * np.pi * u)),
-    "slide": Kind(path=lambda u: u - 0.5),
-    "circle": Kind(path=lambda u: 0.4 * np.exp(2j * np.pi * u)),
-    "side": Kind(path=lambda u: 0.7, pull=0.8),
-    "twist": Kind(turn=1.5),
+    "press": TouchKind(),
+    "tap": TouchKind(lambda u: np.sin(np.pi * u), seconds=0.15),
+    "double": TouchKind(lambda u: np.maximum(np.sin(3 * np.pi * u), 0), seconds=0.5),
+    "triple": TouchKind(lambda u: np.maximum(np.sin(5 * np.pi * u), 0)),
+    "ramp": TouchKind(lambda u: np.minimum(u / 0.85, (1 - u) / 0.15)),
+    "fade": TouchKind(lambda u: np.minimum(u / 0.1, (1 - u) / 0.9)),
+    "tremble": TouchKind(lambda u: np.sin(np.pi * u) * (1 + 0.5 * np.sin(12 * np.pi * u)), hz=10.6),
+    "buzz": TouchKind(lambda u: np.sin(np.pi * u) * (1 + 0.5 * np.sin(48 * np.pi * u)), hz=42.6),
+    "rub": TouchKind(path=lambda u: 0.5j * np.sin(4 * np.pi * u)),
+    "slide": TouchKind(path=lambda u: u - 0.5),
+    "circle": TouchKind(path=lambda u: 0.4 * np.exp(2j * np.pi * u)),
+    "side": TouchKind(path=lambda u: 0.7, pull=0.8),
+    "twist": TouchKind(turn=1.5),
 }
 
 
@@ -164,7 +166,7 @@ def _places(name: str, spec: ArraySpec) -> NDArray[np.complex128]:
 
 
 def _touch(
-    kind: Kind, places: NDArray[np.complex128], rate_hz: float, rng: np.random.Generator
+    kind: TouchKind, places: NDArray[np.complex128], rate_hz: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """(n, element, load) of one touch, 1 where a usual one is strongest."""
     n = round(kind.seconds * np.exp(rng.uniform(-SPEED, SPEED)) * rate_hz)
