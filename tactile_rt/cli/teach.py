@@ -243,7 +243,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
 
 
 def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
-    """Yield chunks and the orders that came with them; a live source is read all the while."""
+    """Yield chunks with the orders that came; read a live source all the while."""
     waiting = queue.SimpleQueue[tuple["Chunk | None", str] | Exception]()
     over = threading.Event()
 
