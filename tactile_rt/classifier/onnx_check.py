@@ -48,6 +48,7 @@ SHAPED_BY = {
     "MaxUnpool": 2,
     "SequenceInsert": 2,
 }  # fmt: skip
+VALUE_AT = {"OneHot": 2, "Pad": 2}  # but for this input, which fills places and makes none
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 TENSOR_BITS = {1: 32, 2: 8, 3: 8, 4: 16, 5: 16, 6: 32, 7: 64, 9: 8, 10: 16, 11: 64, 12: 32,
                13: 64, 14: 64, 15: 128, 16: 16, 17: 8, 18: 8, 19: 8, 20: 8, 21: 4,
@@ -221,7 +222,8 @@ class _Walk:
         while waiting:
             for i in readers.get(waiting.pop(), ()):
                 operator, inputs, outputs = self.nodes[i]
-                if live.intersection(inputs[SHAPED_BY.get(operator, len(inputs)) :]):
+                first, value = SHAPED_BY.get(operator, len(inputs)), VALUE_AT.get(operator)
+                if any(n in live for k, n in enumerate(inputs) if k >= first and k != value):
                     raise BadModel(f"operator {operator!r} makes a shape of what is measured")
                 new = set(outputs) - live
                 live |= new

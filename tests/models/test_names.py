@@ -32,7 +32,7 @@ from tests.helpers.tiny_sweeps import write_tiny_set
 
 KINDS = {"ball": ("globe", "rock"), "cube": ("globe", "rock")}
 SMALL = {
-    "encoder": "gru", "width": 1 / 32, "batch": 12, "updates": 30, "learning_rate": 0.01,
+    "encoder": "gru", "width": 1 / 32, "batch": 12, "updates": 60, "learning_rate": 0.01,
     "names": 0.5, "identity": 0.3, "dropout": 0.0,
 }  # fmt: skip
 
