@@ -15,6 +15,7 @@ from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
 
 READ_BYTES = 65_536
+TERMINAL_BYTES = 4095  # that Linux's terminals give at most at a time
 MOST_FRAMES = 512  # taken from a bus at a time
 WAIT_S = 0.05  # how soon a line without a descriptor looks for the end of the wait
 
@@ -93,7 +94,7 @@ class SerialLink(Link[bytes]):
             if timeout_s > 0 or self._blocks:
                 if not self._poll.poll(1e3 * max(timeout_s, 0.0)):
                     return None
-            data = os.read(self._fd, READ_BYTES)
+            data = self._read(self._fd)
             if not data and timeout_s <= 0 and self._terminal and not self._hung_up():
                 return None  # a terminal that has nothing gives nothing; it may have by now
         except BlockingIOError:
@@ -103,6 +104,17 @@ class SerialLink(Link[bytes]):
         if not data:
             raise SourceError(f"{self.name}: the line is gone (unplugged, or hung up)")
         return data, time.monotonic_ns()
+
+    def _read(self, fd: int) -> bytes:
+        """Read a backlog as one packet, or its parts are dated as if they came one by one."""
+        data = newest = os.read(fd, READ_BYTES)
+        while len(newest) >= TERMINAL_BYTES and len(data) < READ_BYTES and self._poll.poll(0):
+            try:
+                newest = os.read(fd, READ_BYTES)
+            except OSError:
+                break  # the next call meets it, too
+            data += newest
+        return data
 
     def _hung_up(self) -> bool:
         return any(events & ~select.POLLIN for _, events in self._poll.poll(0))

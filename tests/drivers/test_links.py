@@ -1,6 +1,7 @@
 """Serial ports that are somewhere else: pyserial's socket:// and rfc2217://, with a real device."""
 
 import contextlib
+import os
 import socket
 import threading
 
@@ -11,6 +12,7 @@ import serial.rfc2217
 
 from tactile_rt.core.stream import concatenate
 from tactile_rt.drivers.health import State
+from tactile_rt.drivers.links import SerialLink
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import FakeSerial
 from tests.helpers.waiting import PATIENCE_S, read_chunks, until
@@ -101,6 +103,16 @@ def served(path, protocol):
         thread.join(5)
         for connection in connections:
             connection.close()
+
+
+def test_a_backlog_is_one_packet():
+    """A terminal gives it in parts, which came at one moment all the same."""
+    far, near = os.openpty()
+    with contextlib.closing(SerialLink(os.ttyname(near), 115_200)) as link:
+        os.write(far, bytes(10_000))
+        data, _ = link.receive(PATIENCE_S)
+    os.close(far), os.close(near)
+    assert data == bytes(10_000)
 
 
 @pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # pyserial 3.5's own
