@@ -57,6 +57,8 @@ ABSURD = 1e9
 # Times the largest load that a model believes: beyond, a unit or a gain is not what it should be.
 IMPLAUSIBLE = 10.0
 IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
+ENDLESS_S = 10.0
+ENDLESS = "contact for 10 s without an end: something is held, or readings drift: let go to see"
 TOUCHES = 256
 FUSED = 8  # touches, at most, that are judged together
 log = logging.getLogger(__name__)
@@ -256,6 +258,7 @@ class Classifier:
         self._step = 0  # steps done since the onset
         self._onset_ns: int | None = None  # None when no episode is under way
         self._decided = False  # the episode has had its final decision
+        self._touched_ns, self._endless = 0, False  # the latest change of contact
         self._skipping = False
         self._next_seq = 0
         self._rated = rated_noise(self.card)
@@ -322,6 +325,10 @@ class Classifier:
         begins = self.detector.update(sample, valid)
         if self.detector.contact != touched:
             self.touches.append((t_ns, not touched))
+            self._touched_ns = t_ns
+        elif touched and not self._endless and t_ns - self._touched_ns > ENDLESS_S * NS_PER_S:
+            self._endless = True  # told once
+            log.warning("%s: %s", self.card.name, ENDLESS)
         # An element without a trustworthy value, or without a baseline, reads as untouched.
         untouched = ~(valid & self.detector.has_baseline)
         np.subtract(sample, self.detector.offset, out=self.deviation)

@@ -6,6 +6,7 @@ baseline (offset and noise) that it measured while nothing was touched.
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,10 @@ LEVELS = 8  # that are remembered
 STRETCH_SAMPLES = 20
 WILD_Z2, WILD_SAMPLES = 60.0, 2  # from the median: so many of a still stretch may be further away
 SAME_Z2 = 60.0  # of the medians of two stretches
+# A drift is a line through means of quiet samples, the latest blocks of so many.
+BLOCK_SAMPLES, FEWEST_BLOCKS, MOST_BLOCKS = 20, 8, 60
+DRIFTS = 6.0  # standard errors of a slope, beyond which it is one
+STRAIGHT = 4.0  # times the variance of such a mean: as far from the line as they are, at most
 
 # EWMA charts of rate r: the sample itself, and means over about 7 and 19 samples (2/r - 1).
 RATES = np.array([1.0, 0.25, 0.1], dtype=np.float32)
@@ -80,13 +85,18 @@ class ContactDetector:
     times, and was there for longer than it was ever quiet on the baseline, that level is the new
     baseline.
 
+    Where quiet samples lie on a slope, as of a sensor that warms up, the baseline goes on along it,
+    also within a contact, for as long as the slope has been seen before. A contact of which the
+    newest samples lie on a slope that leads back to the baseline was none.
+
     An element that is not trusted neither touches nor counts as rest: its baseline is that of its
     own trusted samples, and it is left out until it has enough of them.
 
     Attributes:
         ready: Whether enough quiet samples have been seen for a baseline; no contact is reported
             before.
-        offset: (element, channel) The baseline, which is the mean of the quiet samples, SI.
+        offset: (element, channel) The baseline, which is the mean of the quiet samples, or where
+            their slope has led since, SI.
         sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
             below `floor`.
         has_baseline: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
@@ -102,8 +112,8 @@ class ContactDetector:
         self.has_baseline: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
         self.doubted = 0
         # Quiet samples with their validity; an invalid one counts as nothing in every sum.
-        self._pending: deque[tuple[NDArray[np.float64], NDArray[np.bool_]]] = deque()
-        self._baseline: deque[tuple[NDArray[np.float64], NDArray[np.bool_]]] = deque()
+        self._pending: deque[tuple[int, NDArray[np.float64], NDArray[np.bool_]]] = deque()
+        self._baseline: deque[tuple[int, NDArray[np.float64], NDArray[np.bool_]]] = deque()
         self._count = np.zeros(shape[0], dtype=np.int64)
         self._sum = np.zeros(shape)
         self._sum_of_squares = np.zeros(shape)
@@ -115,6 +125,11 @@ class ContactDetector:
         self._quiet_for = 0
         self._quiet = 0  # samples that were quiet, ever
         self._rest = _Rest()
+        self._now = 0  # samples, ever
+        self._drift = _Drift()
+        self._slope = _Drift()  # of the contact under way
+        self._level = self.offset  # the mean of the baseline
+        self._middle = 0.0  # the number of the sample in the middle of it
 
     @property
     def ready(self) -> bool:
@@ -128,6 +143,9 @@ class ContactDetector:
             sample: (element, channel) SI.
             valid: (element,) elements to trust.
         """
+        self._now += 1
+        if self._drift.found:
+            self._follow_drift()
         if not self.ready:
             self._wait(sample, valid)
             self._learn(FIRST_GUARD_SAMPLES)
@@ -141,7 +159,7 @@ class ContactDetector:
         if begins:
             self.contact = True
             self._quiet_for = 0
-            self._rest = _Rest()
+            self._rest, self._slope = _Rest(), _Drift()
             # What came before the onset is known to be quiet now, and need not wait.
             self._learn(max(FIRST_GUARD_SAMPLES, int(self._suspicious_for[certain].max())))
             self.doubted = len(self._pending) + 1  # and the one that was above its threshold first
@@ -151,7 +169,11 @@ class ContactDetector:
             if self._quiet_for >= RELEASE_SAMPLES:
                 self.contact = False
             elif self._rest.found(sample, valid & self.has_baseline, self._pooled, self._quiet):
-                self._restart_baseline()
+                self._restart_baseline(_Drift())
+            elif self._slope.add(self._now, sample, valid, self._pooled) and self._slope.leads_to(
+                self._middle, self._level, self._pooled
+            ):
+                self._restart_baseline(self._slope)
         elif not above.any():
             self._wait(sample, valid)
             self._learn(GUARD_SAMPLES)
@@ -171,9 +193,14 @@ class ContactDetector:
             return
         self._quiet += 1
         quiet = np.where(valid[:, None], sample, 0.0).astype(np.float64)
-        self._pending.append((quiet, valid.copy()))
+        self._pending.append((self._now, quiet, valid.copy()))
 
-    def _restart_baseline(self) -> None:
+    def _follow_drift(self) -> None:
+        """Lead the baseline along the slope from its middle to now."""
+        ahead = min(self._now - self._middle, self._drift.span)
+        self.offset = (self._level + ahead * self._drift.slope).astype(np.float32)
+
+    def _restart_baseline(self, drift: "_Drift") -> None:
         """Measure the baseline anew: what was taken for a touch since long is rest."""
         self.contact = False
         self._above = np.zeros_like(self._above)
@@ -181,6 +208,7 @@ class ContactDetector:
         self._ewma = np.zeros_like(self._ewma)
         self._pending.clear()
         self._baseline.clear()
+        self._drift = drift
         self._quiet = 0
         for total in (self._count, self._sum, self._sum_of_squares):
             total[...] = 0
@@ -194,12 +222,13 @@ class ContactDetector:
             return
         while len(self._pending) > guard:
             if len(self._baseline) == BASELINE_SAMPLES:
-                oldest, was_valid = self._baseline.popleft()
+                _, oldest, was_valid = self._baseline.popleft()
                 self._count -= was_valid
                 self._sum -= oldest
                 self._sum_of_squares -= oldest**2
-            newest, is_valid = self._pending.popleft()
-            self._baseline.append((newest, is_valid))
+            at, newest, is_valid = self._pending.popleft()
+            self._baseline.append((at, newest, is_valid))
+            self._drift.add(at, newest, is_valid, self._pooled)
             self._count += is_valid
             self._sum += newest
             self._sum_of_squares += newest**2
@@ -210,14 +239,79 @@ class ContactDetector:
         n = np.maximum(self._count, 2)[:, None]
         mean = self._sum / n
         variance = np.maximum(self._sum_of_squares - n * mean**2, 0.0) / (n - 1)
+        times = np.array([at for at, _, _ in self._baseline])
+        self._middle = float(times.mean())
+        if self._drift.found:
+            variance = np.maximum(variance - np.square(self._drift.slope) * times.var(), 0.0)
         # An element with too few samples keeps what was last known of it.
         known = self.has_baseline[:, None]
-        self.offset = np.where(known, mean.astype(np.float32), self.offset)
+        self._level = np.where(known, mean.astype(np.float32), self._level)
+        self.offset = self._level
+        if self._drift.found:
+            self._follow_drift()
         sigma = np.maximum(np.sqrt(variance).astype(np.float32), self.floor)
         self.sigma = np.where(known, sigma, self.sigma)
         # Twenty samples underestimate an element's own noise often enough to raise false onsets:
         # for detection no element counts as quieter than the typical one.
         self._pooled = np.maximum(self.sigma, np.median(self.sigma[self.has_baseline], axis=0))
+
+
+class _Drift:
+    """The slope of quiet samples, where there is one for certain.
+
+    Attributes:
+        found: Whether any channel drifts.
+        straight: Whether all samples lie on a line, but for noise.
+        slope: (element, channel) SI per sample; 0 where it may be noise.
+        span: The number of samples over which it was seen.
+    """
+
+    def __init__(self) -> None:
+        self.found = self.straight = False
+        self.slope, self.span = np.zeros(()), 0.0
+        self._block: list[tuple[int, NDArray[np.float64], NDArray[np.bool_]]] = []
+        self._blocks: deque[tuple[float, NDArray[np.float64]]] = deque(maxlen=MOST_BLOCKS)
+
+    def add(self, at: int, sample: NDArray[Any], valid: NDArray[np.bool_], sigma: Floats) -> bool:
+        """Take a sample, whose number is `at`; return True if it completes a block.
+
+        Args:
+            sigma: (element, channel) the noise per sample, SI.
+        """
+        self._block.append((at, sample, valid))
+        if len(self._block) < BLOCK_SAMPLES:
+            return False
+        times, samples, trusted = zip(*self._block, strict=True)
+        mean = np.mean(samples, axis=0)
+        mean[~np.all(trusted, axis=0)] = np.nan
+        self._blocks.append((float(np.mean(times)), mean))
+        self._block = []
+        if len(self._blocks) < FEWEST_BLOCKS:
+            return True
+        t = np.array([time for time, _ in self._blocks])
+        means = np.array([mean for _, mean in self._blocks])
+        self.span, self._middle = t[-1] - t[0], float(t.mean())
+        t -= self._middle
+        slope = np.tensordot(t, means, 1) / np.square(t).sum()  # NaN where any is not known
+        self._mean = means.mean(axis=0)
+        left = means - self._mean - t[:, None, None] * slope
+        noise = sigma**2 / BLOCK_SAMPLES
+        variance = np.square(left).sum(axis=0) / (len(t) - 2)
+        self.straight = not (variance > STRAIGHT * noise).any()
+        if not self.straight and len(self._blocks) > FEWEST_BLOCKS:
+            self._blocks.popleft()  # it began later: look back less far
+        self._error = np.sqrt(np.maximum(variance, noise) / np.square(t).sum())  # of the slope
+        certain = np.abs(slope) > DRIFTS * self._error
+        self.slope, self.found = np.where(certain, slope, 0.0), bool(certain.any())
+        return True
+
+    def leads_to(self, at: float, level: NDArray[Any], sigma: Floats) -> bool:
+        """Return whether the samples lie on a slope on which this level was at that time."""
+        if not (self.found and self.straight):
+            return False
+        there = self._mean + (at - self._middle) * self.slope
+        error = np.hypot((at - self._middle) * self._error, sigma)
+        return not (np.abs(there - level) > DRIFTS * error).any()
 
 
 class _Rest:

@@ -106,6 +106,21 @@ def test_the_baseline_follows_drift_before_contact() -> None:
     assert (abs(detector.offset - drift[n - 10]) < 0.8 * RATED).all()
 
 
+@pytest.mark.parametrize("slope", [0.01, 0.02])
+def test_touches_on_a_drift_begin_and_end(slope: float) -> None:
+    """A sensor that warms up, touched every four seconds: once its slope is known, in a second."""
+    n = 9000
+    samples = noise(n) + (slope * RATED * np.arange(n)[:, None, None]).astype(np.float32)
+    begins = np.arange(800, n - 400, 450)
+    for at in begins:
+        samples[at : at + 150, 17, 2] += np.float32(30 * RATED[2])
+    detector = new()
+    onsets = [onset for onset in feed(detector, samples) if onset > 100]
+    assert len(onsets) == len(begins) and (abs(np.array(onsets) - begins) <= 2).all()
+    assert not detector.contact
+    assert (abs(detector.offset - slope * n * RATED) < 0.8 * RATED).all()
+
+
 @pytest.mark.parametrize("slope", [0.1, 0.2, 0.5])
 def test_a_slow_touch_is_caught_though_the_baseline_follows(slope: float) -> None:
     """A load that grows by a fraction of the noise per sample, in all channels of one whisker."""
