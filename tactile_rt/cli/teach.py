@@ -67,7 +67,8 @@ def teach(
 
     This is few-shot learning. Keep the sensor untouched for two seconds, then touch as prompted.
     Type a class's name or number, n (next), u (undo the last touch) or q (learn FOLDER/model.onnx,
-    and stop); list, forget NAME and rename OLD NEW change what is there.
+    and stop); list, forget NAME and rename OLD NEW change what is there. After the classes touch
+    anything else for twenty seconds: what is to be refused, and how well it is.
 
     With --model, a network that was trained to tell objects apart enrols objects instead: which of
     them is it, or none? Another network than before feels the recordings of FOLDER again.
@@ -119,6 +120,7 @@ def teach(
         "leave_one_out_right": {
             name: {"right": good, "of": count} for name, count, good in teacher.progress.classes
         },
+        "anything_else": dict(zip(("refused", "of"), teacher.progress.others, strict=True)),
         "corrupt": opened.stats.corrupt,
         "missing": opened.stats.missing,
     }
@@ -224,6 +226,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 if time.monotonic() - heard > SILENT_S and not silent:
                     silent = True
                     _say(teacher.note(f"no sample for {SILENT_S:g} s: is the device plugged in?"))
+                    teacher.watch(None)
                 continue
             if silent:
                 _say(teacher.note("samples come again"))
@@ -240,6 +243,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 label = teacher.label
             if listener.hasty > hasty:
                 _say(teacher.note(HASTY))
+            teacher.watch(listener.seconds(int(chunk.t_ns[-1])))
 
 
 def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
@@ -297,10 +301,12 @@ def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":
 
 
 def _check_labels(names: list[str]) -> None:
-    from tactile_rt.teaching.lesson import check_label
+    from tactile_rt.teaching.lesson import ANYTHING_ELSE, check_label
 
     for name in names:
         check_label(name)
+        if name == ANYTHING_ELSE:
+            raise ConfigError(f"--classes: {name!r} is asked for after the classes: leave it out")
         if names.count(name) > 1:
             raise ConfigError(f"--classes names {name!r} twice")
 

@@ -4,24 +4,36 @@ At every step, a class is the mean of its touches' features, and all classes sha
 one class differ: a covariance of few directions, and of the same small variance in all others
 (probabilistic principal components: Tipping & Bishop 1999, doi:10.1111/1467-9868.00196). A
 decision is the nearest mean by that measure; what is far from all of them is unknown. How far a
-touch of a class may be from its mean is learnt leave-one-out.
+touch of a class may be from its mean is learnt leave-one-out, and where there are touches of
+anything else, from these, too.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["ENOUGH", "FEWEST", "LeaveOneOut", "TouchClasses", "fit_classes", "leave_one_out"]
+__all__ = [
+    "ENOUGH",
+    "FEWEST",
+    "LeaveOneOut",
+    "TouchClasses",
+    "count_refused",
+    "fit_classes",
+    "leave_one_out",
+]
 
 FEWEST = 2  # touches of a class
 AXES = 16  # directions in which touches of a class differ
 SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction
 FOLDS = 10
 REFUSED = 0.06  # of the touches, leave-one-out, at most, are taken for unknown
+# Where touches of anything else are known, the reach leaves out so many of them, as long as it
+# refuses no more than this share of the classes' and is no wider than so many times the usual one.
+OTHERS_LET_IN, REFUSED_FOR_OTHERS, WIDER = 0.1, 0.12, 1.2
 ENOUGH = 5  # touches of a class, below which they do not tell how far others may be
 MAD, FARTHEST = 1.4826, 2.5  # standard deviations of the logarithm of the distance, at most
 LIMIT = 5.0  # standardised features are limited to, either way: one outlier is not the decision
@@ -85,7 +97,11 @@ class LeaveOneOut:
 
 
 def fit_classes(
-    features: Floats, labels: Sequence[str], kinds: Sequence[slice], told: LeaveOneOut | None = None
+    features: Floats,
+    labels: Sequence[str],
+    kinds: Sequence[slice],
+    told: LeaveOneOut | None = None,
+    others: Floats | None = None,
 ) -> TouchClasses:
     """Learn classes.
 
@@ -94,6 +110,7 @@ def fit_classes(
         labels: (touch,) the class of each.
         kinds: which features are of one kind, and so of one scale.
         told: what `leave_one_out` said of these touches; None: it is asked.
+        others: (touch, step, feature) of touches of anything else; None: there are none.
     """
     _check_enough(labels)
     told = told or leave_one_out(features, labels, kinds)
@@ -109,7 +126,26 @@ def fit_classes(
     reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
     temperature = _temperature(told.distances[:, -1], own)
     names = tuple(str(name) for name in classes)
-    return TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
+    found = TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
+    if others is None or not len(others):
+        return found
+    far = np.quantile(found.distances(others).min(axis=2), OTHERS_LET_IN, axis=0)
+    least = np.minimum(reach, np.quantile(nearest, 1 - REFUSED_FOR_OTHERS, axis=0))
+    return replace(found, reach=np.clip(far, least, WIDER * reach))
+
+
+def count_refused(
+    features: Floats, labels: Sequence[str], kinds: Sequence[slice], others: Floats
+) -> int:
+    """Count the touches of anything else (touch, step, feature) that are refused at the last step.
+
+    Each is judged by what is learnt without it.
+    """
+    told, refused = leave_one_out(features, labels, kinds), 0
+    for k in range(len(others)):
+        found = fit_classes(features, labels, kinds, told, np.delete(others, k, axis=0))
+        refused += bool(found.distances(others[k : k + 1])[0, -1].min() > found.reach[-1])
+    return refused
 
 
 def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeaveOneOut:

@@ -51,6 +51,7 @@ from tactile_rt.teaching.model import (
 )
 
 __all__ = [
+    "ANYTHING_ELSE",
     "BEFORE_NS",
     "FEATURES",
     "MODEL",
@@ -65,6 +66,7 @@ __all__ = [
 ORDERS = ("next", "undo", "done", "list")  # to a teacher; another word is the label from now on
 NAMING = ("forget", "rename")  # those with names after them
 FEATURES, MODEL = "features.onnx", "model.onnx"
+ANYTHING_ELSE = "anything else"  # the label of touches of no class, which are to be refused
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
 SAME = 0.65  # share of the touches of two classes that are told apart
 ODD = 3.0  # times as far from its class as its others are, a touch is odd
@@ -102,6 +104,7 @@ class Lesson:
     touches: list[TaughtTouch] = field(default_factory=list)
     lost: int = 0
     unfelt: list[str] = field(default_factory=list)
+    _listeners: list[Listener] = field(default_factory=list)  # to all that was felt
 
     @classmethod
     def begun(cls, folder: Path, spec: ArraySpec, floor: NDArray[np.float32]) -> "Lesson":
@@ -195,6 +198,7 @@ class Lesson:
         recording = Recording(path)
         # which of them counted, the labels tell
         listener = Listener(model, recording.spec, self.taught.describe, hasty_ns=0)
+        self._listeners.append(listener)
         found = []
         for chunk in recording:
             found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
@@ -202,7 +206,8 @@ class Lesson:
 
     def listener(self, spec: ArraySpec) -> Listener:
         """That finds touches in a stream of an array."""
-        return Listener(self.folder / FEATURES, spec, self.taught.describe)
+        self._listeners.append(Listener(self.folder / FEATURES, spec, self.taught.describe))
+        return self._listeners[-1]
 
     def next_recording(self) -> Path:
         """The path of the recording that goes on with the lesson."""
@@ -259,7 +264,8 @@ class Lesson:
     @property
     def labels(self) -> tuple[str, ...]:
         """The names of all classes, in the order in which they came."""
-        return tuple(dict.fromkeys(touch.label for touch in self.touches))
+        names = (touch.label for touch in self.touches if touch.label != ANYTHING_ELSE)
+        return tuple(dict.fromkeys(names))
 
     @property
     def taught_enough(self) -> tuple[str, ...]:
@@ -274,8 +280,11 @@ class Lesson:
         used, names = self._select_touches()
         if not used:
             return LessonProgress((), (), ())
-        found = self.taught.leave_one_out(self._features(used), names)
+        features, others = self._features(used), self._others()
+        found = self.taught.leave_one_out(features, names)
         progress = _progress(used, names, found, self.taught.few)
+        refused = self.taught.count_refused(features, names, others) if len(others) else 0
+        progress = replace(progress, others=(refused, len(others)))
         if isinstance(self.taught, FewShot) and len(set(names)) < 2:
             return replace(progress, classes=())
         return progress
@@ -291,7 +300,13 @@ class Lesson:
             "labels_sha256": hash_of(self.folder / LABELS),
         }
         return self.taught.learn(
-            self.folder / MODEL, self._features(used), names, self.folder.resolve().name, told
+            self.folder / MODEL,
+            self._features(used),
+            names,
+            self._others(),
+            np.max([one.largest for one in self._listeners], axis=0, initial=0.0),
+            self.folder.resolve().name,
+            told,
         )
 
     def _select_touches(self) -> tuple[list[int], list[str]]:
@@ -299,6 +314,11 @@ class Lesson:
         enough = self.taught_enough
         used = [k for k, touch in enumerate(self.touches) if touch.label in enough]
         return used, [self.touches[k].label for k in used]
+
+    def _others(self) -> Floats:
+        """(touch, step, feature) of touches of anything else."""
+        found = [touch.features for touch in self.touches if touch.label == ANYTHING_ELSE]
+        return np.array(found, dtype=float)
 
     def _features(self, used: Sequence[int]) -> Floats:
         return np.stack([self.touches[k].features for k in used]).astype(float)
@@ -315,12 +335,14 @@ class LessonProgress:
             the class that they are most like.
         confused: Pairs of classes that are taken for one another, the most often first.
         same: Pairs of classes that feel the same: touches of the two are told apart by chance.
+        others: How many touches of anything else are refused, and of how many.
     """
 
     classes: tuple[tuple[str, int, int], ...]
     odd: tuple[tuple[int, str], ...]
     confused: tuple[tuple[str, str], ...]
     same: tuple[tuple[str, str], ...] = ()
+    others: tuple[int, int] = (0, 0)
 
     @property
     def right(self) -> tuple[int, int]:

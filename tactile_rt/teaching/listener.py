@@ -31,6 +31,7 @@ class Listener:
 
     Attributes:
         classifier: The classifier that runs the features, and knows whether something is touched.
+        largest: (channel,) The largest reading within a contact, either way from the baseline.
         hasty: The number of touches that came so soon after another that they may be its rest; they
             are not given.
 
@@ -50,6 +51,7 @@ class Listener:
         # samples between two of the classifier's, whose readings can be seen after each of them
         self._together = max(1, round(spec.rate_hz * self.classifier.card.period_ns / NS_PER_S))
         self._first_ns: int | None = None
+        self.largest = np.zeros(spec.shape[1], np.float32)
         self._heard = 0  # samples since the last hint
         self._strongest, self._where = 0.0, ""  # since then, in units of the noise
         self._steps: list[Classification] = []
@@ -69,7 +71,10 @@ class Listener:
         decisions = self.classifier.push(chunk)
         detector = self.classifier.detector
         if detector.ready and detector.has_baseline.any():
-            now = np.abs(self.classifier.deviation / detector.sigma)
+            load = np.abs(self.classifier.deviation)
+            if detector.contact:
+                self.largest = np.maximum(self.largest, load.max(axis=0))
+            now = load / detector.sigma
             element, channel = np.unravel_index(now.argmax(), now.shape)
             if now[element, channel] > self._strongest:
                 self._strongest = float(now[element, channel])

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, OpenSetRule
-from tactile_rt.classifier.enrolment import EnrolledObject, margins, project
+from tactile_rt.classifier.enrolment import (
+    NONE_OF_THESE,
+    EnrolledObject,
+    identify,
+    margins,
+    project,
+)
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_logits, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
@@ -34,6 +40,7 @@ from tactile_rt.teaching.head import (
     LIMIT,
     LeaveOneOut,
     TouchClasses,
+    count_refused,
     fit_classes,
     leave_one_out,
 )
@@ -50,6 +57,7 @@ __all__ = [
 
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
+LARGER, NOISES = 3.0, 1e3  # times the largest load felt, or the noise, that may come later
 TINY = 1e-12  # least posterior
 MAYBE = 0.5  # posterior of `unknown` above which a touch is unknown
 
@@ -94,13 +102,24 @@ class FewShot:
         """Judge every touch by the others alone, at its last step."""
         return leave_one_out(features[:, -1:], labels, self.network.kinds)
 
+    def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
+        """Count the touches of anything else that are refused, each judged without it."""
+        last = features[:, -1:], labels, self.network.kinds, others[:, -1:]
+        return count_refused(*last)
+
     def learn(
-        self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
+        self,
+        path: Path,
+        features: Floats,
+        labels: Sequence[str],
+        others: Floats,
+        largest: NDArray[np.float32],
+        name: str,
+        told: dict[str, Any],
     ) -> ModelCard:
         """Write the model of the classes of these touches (touch, step, feature)."""
-        return write_few_shot(
-            path, self, fit_classes(features, labels, self.network.kinds), name, told
-        )
+        classes = fit_classes(features, labels, self.network.kinds, others=others)
+        return write_few_shot(path, self, classes, name, told, largest)
 
 
 class Enrolment:
@@ -146,22 +165,39 @@ class Enrolment:
         above = margins(rule, total / others[..., None], others, touches)
         return LeaveOneOut(-above[:, None], (above.argmax(axis=1) == own) & (above[mine] >= 0))
 
+    def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
+        """Count the touches of anything else that are of none of the objects."""
+        found = self._enrolled(features, labels)
+        assert self.card.identity is not None
+        names = [identify(self.card.identity, found, [other[-1]])[0] for other in others]
+        return names.count(NONE_OF_THESE)
+
     def learn(
-        self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
+        self,
+        path: Path,
+        features: Floats,
+        labels: Sequence[str],
+        others: Floats,
+        largest: NDArray[np.float32],
+        name: str,
+        told: dict[str, Any],
     ) -> ModelCard:
         """Write the same network with the objects of these touches in its card."""
-        own = np.asarray(labels)
         card = msgspec.structs.replace(
             self.card,
             name=name,
             provenance={**self.card.provenance, **_made_by(), **told},
-            enrolled=tuple(
-                EnrolledObject.of(one, features[own == one, -1]) for one in dict.fromkeys(labels)
-            ),
+            enrolled=self._enrolled(features, labels),
         )
         data = with_metadata(self._data, METADATA_KEY, msgspec.json.encode(card).decode())
         write_whole(path, lambda file: file.write(data))
         return card
+
+    def _enrolled(self, features: Floats, labels: Sequence[str]) -> tuple[EnrolledObject, ...]:
+        own = np.asarray(labels)
+        return tuple(
+            EnrolledObject.of(one, features[own == one, -1]) for one in dict.fromkeys(labels)
+        )
 
 
 def write_features(path: Path, taught: FewShot) -> ModelCard:
@@ -174,7 +210,12 @@ def write_features(path: Path, taught: FewShot) -> ModelCard:
 
 
 def write_few_shot(
-    path: Path, taught: FewShot, classes: TouchClasses, name: str, provenance: dict[str, Any]
+    path: Path,
+    taught: FewShot,
+    classes: TouchClasses,
+    name: str,
+    provenance: dict[str, Any],
+    largest: NDArray[np.float32],
 ) -> ModelCard:
     """Write the model of the classes; it appears whole or not at all."""
     graph, network = OnnxGraph(), taught.network
@@ -189,6 +230,9 @@ def write_few_shot(
         "temperature": classes.temperature,
         "provenance": {**_made_by(), **provenance},
     }
+    if largest.any():
+        believed = np.maximum(LARGER * largest, NOISES * taught.floor)
+        told["clip"] = tuple(map(float, believed))
     return _write(path, taught, graph, features, after, told)
 
 
@@ -223,13 +267,12 @@ def _write(
         graph.output(f"{name}_next", after[name], ["batch", *shape])
     floor = tuple(float(value) for value in taught.floor)
     card = ModelCard(
-        **{"name": path.stem, **told},
+        **{"name": path.stem, "clip": tuple(1e6 * value for value in floor), **told},
         spec=taught.spec.to_json(),
         period_ns=taught.period_ns,
         substeps=timing.substeps,
         steps=timing.steps,
         state=tuple(StateTensor(n, s, "float32") for n, s in network.state().items()),
-        clip=tuple(1e6 * value for value in floor),
         scale=floor,
         floor=floor,
         embedding=network.size,

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.teaching.lesson import NAMING, ORDERS, Lesson, LessonProgress
+from tactile_rt.teaching.lesson import ANYTHING_ELSE, NAMING, ORDERS, Lesson, LessonProgress
 
 __all__ = ["ORDERS", "Teacher"]
 
+ELSE_S = 20.0  # for touches of anything else
 LONG = 9  # digits: more are no class's number
 
 
@@ -39,6 +40,7 @@ class Teacher:
     said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether there is a list to be worked through, and then an end
+    _ends_s: float | None = None  # when there is enough of anything else
 
     def __post_init__(self) -> None:
         for name in self.wanted:
@@ -81,9 +83,19 @@ class Teacher:
             self.label = self.lesson.check(order)
         except ConfigError as error:
             return str(error)
-        if order not in self.wanted:
+        if order not in self.wanted and order != ANYTHING_ELSE:
             self.wanted.append(order)
         return self.prompt()
+
+    def watch(self, now_s: float | None) -> None:
+        """End when anything else was touched for long enough; None: no sample comes."""
+        if self.label != ANYTHING_ELSE or not self._planned:
+            self._ends_s = None
+        elif now_s is None:
+            self.done = True
+        else:
+            self._ends_s = self._ends_s or now_s + ELSE_S
+            self.done = self.done or now_s > self._ends_s
 
     def take(
         self,
@@ -99,14 +111,17 @@ class Teacher:
         said = [f"{len(self.lesson.touches):3d}  {label} {self.lesson.count(label)}"]
         before = set(self.progress.odd)
         self.progress = self.lesson.leave_one_out()
-        said.append(self._told_apart())
+        refused, others = self.progress.others
+        other = label == ANYTHING_ELSE and self.lesson.taught_enough
+        said.append(f"refused: {refused} of {others}" if other else self._told_apart())
         said += [
             f"touch {number} is unlike the others of {self.lesson.touches[number - 1].label}"
             + ("" if like == self.lesson.touches[number - 1].label else f", more like {like}")
             for number, like in self.progress.odd
             if (number, like) not in before
         ]
-        changed = self.label == label and self.lesson.count(label) >= self.each
+        enough = self.lesson.count(label) >= self.each and label != ANYTHING_ELSE
+        changed = self.label == label and enough
         if changed:
             self._go_on()
         if self.done or changed:
@@ -121,6 +136,8 @@ class Teacher:
             return "all touches are there"
         if not self.label:
             return "what is touched next? name it, or choose its number"
+        if self.label == ANYTHING_ELSE:
+            return f"touch it in any other way, for {ELSE_S:g} s: that will be refused"
         count = self.lesson.count(self.label)
         of = f" of {self.each}" if count < self.each else ""
         return f"touch it: {self.label} ({count + 1}{of})"
@@ -167,6 +184,9 @@ class Teacher:
         learnt = self.lesson.taught_enough
         if learnt and not lines:
             lines = [f"{learnt[0]} is the only class: teach another, to see if they are told apart"]
+        refused, count = self.progress.others
+        if count and learnt:
+            lines.append(f"{ANYTHING_ELSE}: {refused} of {count} touches refused, leave-one-out")
         few = self.lesson.taught.few
         for name in self.lesson.labels:
             count, wanted = self.lesson.count(name), max(few, self.each)
@@ -230,6 +250,8 @@ class Teacher:
         short = self._short()
         if short:
             self.label = short[0]
+        elif self._planned and not self.lesson.count(ANYTHING_ELSE):
+            self.label = ANYTHING_ELSE
         else:
             self.done = self._planned
 

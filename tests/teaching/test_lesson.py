@@ -14,8 +14,8 @@ from tactile_rt.classifier.model_file import load_model, verify_model
 from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
-from tactile_rt.teaching.head import fit_classes, leave_one_out
-from tactile_rt.teaching.lesson import MODEL, ORDERS, Lesson
+from tactile_rt.teaching.head import count_refused, fit_classes, leave_one_out
+from tactile_rt.teaching.lesson import ANYTHING_ELSE, MODEL, ORDERS, Lesson
 from tactile_rt.teaching.listener import find_motion, measured_floor
 from tactile_rt.teaching.onnx_bytes import OnnxGraph, with_metadata
 from tactile_rt.teaching.teacher import Teacher
@@ -286,6 +286,20 @@ def test_a_class_of_two_touches_does_not_let_strangers_through(taught):
     assert (nearest > classes.reach[-1]).sum() >= 9
 
 
+@pytest.mark.parametrize("near", [0.9, 1.1, 3.0])
+def test_touches_of_anything_else_set_the_reach(taught, near):
+    """It stays outside of them, as far as classes allow: 0.9, 1.1, 3 times the usual reach."""
+    features = np.stack([t.features for t in taught.touches]).astype(float)[:, -1:]
+    kinds = taught.taught.network.kinds
+    usual = fit_classes(features, TAUGHT, kinds)
+    far = features[:1] + np.geomspace(1e-4, 1e3, 4000)[:, None, None] * features[:1].std()
+    away = usual.distances(far)[:, 0].min(axis=1) / usual.reach[0]
+    other = far[np.argmax(away > near)][None]
+    found = fit_classes(features, TAUGHT, kinds, others=other)
+    assert found.reach[0] / usual.reach[0] == pytest.approx(min(near, 1.2), abs=0.1)
+    assert count_refused(features, TAUGHT, kinds, other) == (near > 1)
+
+
 def test_a_touch_under_a_wrong_name_is_found(taught):
     names = list(TAUGHT)
     names[1] = "slide"
@@ -322,10 +336,15 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert teacher.obey("2") == "touch it: slide (1 of 2)"
     take(9)
     said = take(9)
-    assert "told apart, leave-one-out: 4 of 4 touches" in said and said.endswith(
-        "all touches are there"
-    )
-    assert teacher.done
+    assert "told apart, leave-one-out: 4 of 4 touches" in said
+    assert said.splitlines()[-1].startswith("touch it in any other way, for 20 s")
+    teacher.watch(100.0)
+    assert "anything else 1, refused:" in take(40)
+    teacher.watch(120.0)
+    assert not teacher.done and lesson.labels == ("press", "slide")
+    teacher.watch(120.1)
+    assert teacher.done and teacher.prompt() == "all touches are there"
+    assert any("of 1 touches refused" in line for line in teacher.summary())
     teacher.done = False
     assert "cannot be part of a file's name" in teacher.obey("a/b")
     assert teacher.obey("rub") == "touch it: rub (1 of 2)"
@@ -355,7 +374,7 @@ def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
     for k in range(4):
         features = rng.normal(size=(22, lesson.taught.network.size)).astype(np.float32)
         teacher.take("press", features, "session-1.mcap", (k, k + 1))
-    assert teacher.done and teacher.progress.right == (0, 0)
+    assert teacher.label == ANYTHING_ELSE and teacher.progress.right == (0, 0)
     assert teacher.summary() == [
         "press is the only class: teach another, to see if they are told apart"
     ]
