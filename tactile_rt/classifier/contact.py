@@ -28,7 +28,7 @@ STRETCH_SAMPLES = 20
 WILD_Z2, WILD_SAMPLES = 60.0, 2  # from the median: so many of a still stretch may be further away
 SAME_Z2 = 60.0  # of the medians of two stretches
 # A drift is a line through means of quiet samples, the latest blocks of so many.
-BLOCK_SAMPLES, FEWEST_BLOCKS, MOST_BLOCKS = 20, 8, 60
+BLOCK_SAMPLES, FEWEST_BLOCKS, MOST_BLOCKS = 20, 8, 30
 DRIFTS = 6.0  # standard errors of a slope, beyond which it is one
 STRAIGHT = 4.0  # times the variance of such a mean: as far from the line as they are, at most
 
@@ -129,7 +129,6 @@ class ContactDetector:
         self._drift = _Drift()
         self._slope = _Drift()  # of the contact under way
         self._level = self.offset  # the mean of the baseline
-        self._middle = 0.0  # the number of the sample in the middle of it
 
     @property
     def ready(self) -> bool:
@@ -170,10 +169,9 @@ class ContactDetector:
                 self.contact = False
             elif self._rest.found(sample, valid & self.has_baseline, self._pooled, self._quiet):
                 self._restart_baseline(_Drift())
-            elif self._slope.add(self._now, sample, valid, self._pooled) and self._slope.leads_to(
-                self._middle, self._level, self._pooled
-            ):
-                self._restart_baseline(self._slope)
+            elif self._slope.add(self._now, sample, valid, self._pooled):
+                if self._slope.leads_to(self._middle(), self._level, self._pooled):
+                    self._restart_baseline(self._slope)
         elif not above.any():
             self._wait(sample, valid)
             self._learn(GUARD_SAMPLES)
@@ -197,8 +195,12 @@ class ContactDetector:
 
     def _follow_drift(self) -> None:
         """Lead the baseline along the slope from its middle to now."""
-        ahead = min(self._now - self._middle, self._drift.span)
+        ahead = min(self._now - self._middle(), self._drift.span)
         self.offset = (self._level + ahead * self._drift.slope).astype(np.float32)
+
+    def _middle(self) -> float:
+        """Return the number of the sample in the middle of the baseline."""
+        return float(np.mean([at for at, _, _ in self._baseline]))
 
     def _restart_baseline(self, drift: "_Drift") -> None:
         """Measure the baseline anew: what was taken for a touch since long is rest."""
@@ -239,10 +241,9 @@ class ContactDetector:
         n = np.maximum(self._count, 2)[:, None]
         mean = self._sum / n
         variance = np.maximum(self._sum_of_squares - n * mean**2, 0.0) / (n - 1)
-        times = np.array([at for at, _, _ in self._baseline])
-        self._middle = float(times.mean())
         if self._drift.found:
-            variance = np.maximum(variance - np.square(self._drift.slope) * times.var(), 0.0)
+            times = np.var([at for at, _, _ in self._baseline])
+            variance = np.maximum(variance - np.square(self._drift.slope) * times, 0.0)
         # An element with too few samples keeps what was last known of it.
         known = self.has_baseline[:, None]
         self._level = np.where(known, mean.astype(np.float32), self._level)
