@@ -25,7 +25,6 @@ __all__ = [
     "ANOTHER",
     "Alignments",
     "BoardCell",
-    "BoardColumn",
     "BoardDataset",
     "BoardRow",
     "joined",

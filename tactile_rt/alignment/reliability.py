@@ -16,7 +16,6 @@ from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "BOOTSTRAPS",
-    "CUTOFF",
     "SEED",
     "filtered_mean",
     "first_halves",

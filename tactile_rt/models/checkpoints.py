@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 __all__ = [
     "NETWORK",
     "begin_from",
-    "check_array",
     "describe_checkpoint",
     "fill_checkpoint",
     "load_checkpoint",

@@ -41,7 +41,6 @@ __all__ = [
     "read_splits",
     "relabelled",
     "windows",
-    "with_faults",
 ]
 
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets

@@ -45,10 +45,8 @@ from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, engine_v
 
 __all__ = [
     "CHUNK_SAMPLES",
-    "PACES",
     "PacedOptions",
     "PacedSource",
-    "Pass",
     "SimOptions",
     "SimSource",
     "compile_simulator",

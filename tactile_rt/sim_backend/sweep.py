@@ -21,12 +21,10 @@ from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
 __all__ = [
     "EARTH",
-    "NOTHING",
     "Sweep",
     "centrelines",
     "draw_sweep",
     "faces_right",
-    "lateral_reach",
     "usual_distance",
     "usual_size",
     "way_to_contact",

@@ -12,9 +12,6 @@ from tactile_rt.alignment.reliability import spearman_brown
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
-    "DIVISIONS",
-    "MINIMUM_TRIALS",
-    "MINIMUM_UNITS",
     "bins_of",
     "ceiling_of",
     "divisions",

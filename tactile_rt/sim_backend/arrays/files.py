@@ -71,7 +71,6 @@ __all__ = [
     "mouse_whiskers",
     "read_animals",
     "robot_text",
-    "species_array",
 ]
 
 # By name: the options of the serial URL that reads the array.

@@ -15,15 +15,12 @@ from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "DAMPING_RATIO",
-    "DENSITY_BASE",
-    "DENSITY_TIP",
     "FRICTION",
     "OPTIONAL",
     "PLAUSIBLE",
     "REQUIRED",
     "SOFTEST_MOUNT",
     "TURN",
-    "YOUNG_MODULUS_PA",
     "Whisker",
     "joint_stiffness",
     "keratin_radii",

@@ -45,8 +45,6 @@ from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 
 __all__ = [
     "GENERATED",
-    "PARAMETERS",
-    "SHAPES",
     "VARIED_SHAPES",
     "Choice",
     "ObjectChoice",
