@@ -132,7 +132,6 @@ def read_results(path: Path) -> Results:
 def _check_score(
     made: Score, targets: tuple[str, ...], layers: tuple[str, ...], where: str
 ) -> None:
-    """Check the shapes of the tables of a score."""
     shape = (len(layers), len(targets))
     if not (
         made.layers == layers

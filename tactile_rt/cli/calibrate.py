@@ -253,7 +253,6 @@ def _now() -> str:
 
 
 def _show_tare(measured: "Tare", console: Console) -> None:
-    """Offsets and noise, channel by channel."""
     import numpy as np
 
     spec = measured.spec
@@ -273,7 +272,6 @@ def _show_tare(measured: "Tare", console: Console) -> None:
 
 
 def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
-    """Residuals per axis, conditions, worst lines and warnings."""
     table = Table("axis", "unit", "full scale", "residual RMS", "of full scale", "R²", box=None)
     rows = zip(fit.axes, loads.units, fit.full_scale, fit.rms, fit.r_squared, strict=True)
     for axis, unit, full, rms, explained in rows:
@@ -298,7 +296,6 @@ def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
 
 
 def _show_uncalibrated(calibration: "Calibration") -> None:
-    """Name the elements that cannot be used yet, if there are any."""
     if calibration.uncalibrated:
         typer.echo(
             f"without a matrix, and so never valid: {', '.join(calibration.uncalibrated)}", err=True

@@ -76,7 +76,6 @@ def doctor(
 
 
 def _look_at_daemon(url: str) -> list[Any]:
-    """Say what a running daemon says of itself, and what its log said last."""
     from tactile_rt.cli.top import snapshot_at
     from tactile_rt.core.errors import SourceError
     from tactile_rt.drivers.discovery import Finding
@@ -112,7 +111,6 @@ def _quote_log(name: str) -> str:
 
 
 def _look_at_simulator() -> list[Any]:
-    """Say whether the simulator is compiled, where it can be."""
     from importlib.util import find_spec
 
     from tactile_rt.drivers.discovery import Finding

@@ -108,7 +108,6 @@ class SweepSet:
         return none if self.sweeps.recorded is None else self.sweeps.recorded
 
     def __getitem__(self, at: slice | NDArray[Any]) -> SweepSet:
-        """Some of the sweeps."""
         return replace(self, sweeps=self.sweeps[at])
 
     @property

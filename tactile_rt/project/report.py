@@ -90,7 +90,6 @@ def confused(
 
 
 def _describe_sweeps(folder: Path) -> str:
-    """Say how many sweeps are for what, and what share of them touches and saturates."""
     manifest = SweepManifest.read(folder)
     there = {s: [n for n in manifest.split[s] if has_object(folder, n)] for s in SPLITS}
     every = tally(

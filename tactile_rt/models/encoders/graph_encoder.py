@@ -216,7 +216,6 @@ class GraphEncoder(nn.Module):
     def _cell(
         self, node: Node, x: Tensor, memory: tuple[Tensor, ...], drive: Tensor | None = None
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The node's output and its cell's new memory."""
         if node.cell == "none":
             return F.relu(x), ()
         h, memory = self.cells[node.name](x, tuple(m.expand_as(x) for m in memory), drive)

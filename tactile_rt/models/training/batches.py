@@ -233,7 +233,6 @@ class TrainingBatches:
         return tensor.pin_memory().to(self._device, non_blocking=True)
 
     def _normal(self, shape: Sequence[int], rng: np.random.Generator) -> Tensor:
-        """Standard normal numbers on the device."""
         if self._device == "cpu":
             return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
         generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**63)))
