@@ -37,7 +37,8 @@ from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_parts
 from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
-from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig, TactileClassifier
+from tactile_rt.models.ead import EAD, TactileClassifier
+from tactile_rt.models.ead_config import ATTENDERS, DECODERS, ENCODERS, EADConfig
 
 STREAM_BAR, DOUBLE_BAR = 2e-6, 1e-9  # some constants are single
 # What is measured, and the most that it may be; bit by bit is 0.

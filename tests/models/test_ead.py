@@ -10,7 +10,8 @@ from torch.nn import functional as F
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.attenders import GPT
-from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, READOUTS, EADConfig
+from tactile_rt.models.ead import EAD
+from tactile_rt.models.ead_config import ATTENDERS, DECODERS, ENCODERS, READOUTS, EADConfig
 from tests.helpers.small_networks import STEPS, TOLERANCE, build, frames, stream
 
 NAMES = tuple(name for name in ENCODERS if name != "graph")  # which has its own tests

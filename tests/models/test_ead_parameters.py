@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tactile_rt.models.attenders import GPT, MambaAttender
+from tactile_rt.models.attenders import GPT, MambaStack
 from tactile_rt.models.ead import EAD, EADConfig, count_parameters
 from tactile_rt.models.encoders.gru import GRUEncoder
 from tactile_rt.models.encoders.mamba import MambaEncoder
@@ -62,6 +62,6 @@ def test_published_attenders():
     with torch.device("meta"):
         assert count_parameters(GPT(512, 0.1, 22)) == 25_778_688
         assert count_parameters(GPT(256, 0.1, 22, inputs=512)) == 6_532_608
-        assert count_parameters(MambaAttender(512)) == 6_784_000
+        assert count_parameters(MambaStack(512)) == 6_784_000
         assert count_parameters(MambaEncoder()) == 6_784_000 + 1051 * 512
         assert count_parameters(GRUEncoder()) == 3_978_240

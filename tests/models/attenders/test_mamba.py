@@ -8,15 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tactile_rt.models.attenders.mamba import MambaAttender, MambaBlock, selective_scan
+from tactile_rt.models.attenders.mamba import MambaBlock, MambaStack, selective_scan
 
 TOLERANCE = 2e-6
 
 
-def build(width: int = 32, seed: int = 1) -> MambaAttender:
+def build(width: int = 32, seed: int = 1) -> MambaStack:
     """In evaluation mode, every parameter off its initial value."""
     torch.manual_seed(seed)
-    attender = MambaAttender(width).eval()
+    attender = MambaStack(width).eval()
     with torch.no_grad():
         for parameter in attender.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
