@@ -21,12 +21,7 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import MOUSE, Timing
 from tactile_rt.models.implausible import implausible
 from tactile_rt.models.onsets import Onsets, find_onsets
-from tactile_rt.sets.manifest import (
-    FAULTS,
-    OUTLIERS,
-    SweepManifest,
-    object_path,
-)
+from tactile_rt.sets.manifest import FAULTS, OUTLIERS, SweepManifest, object_path
 from tactile_rt.sets.objects import Sweeps, read_split
 from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sets.splits import join_manifests, read_manifests

@@ -33,12 +33,7 @@ from tactile_rt.core.settings import (
 )
 from tactile_rt.models.training.config import TrainingConfig
 
-__all__ = [
-    "Recipe",
-    "load_recipe",
-    "read_recipe",
-    "shipped_recipes",
-]
+__all__ = ["Recipe", "load_recipe", "read_recipe", "shipped_recipes"]
 
 KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
 
