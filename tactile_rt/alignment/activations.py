@@ -6,8 +6,6 @@ ReLU. Always in evaluation mode: dropout and batch statistics would make a score
 and on what else is in the batch.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ transposed between steps; a convolution is one gather of every site's taps and o
 where that is less arithmetic. What cannot be rewritten is left as it was trained.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from typing import Any

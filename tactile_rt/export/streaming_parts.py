@@ -5,8 +5,6 @@ Tokens are the rows of one matrix, (lane * token, width), or where that is faste
 width).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ What is read without torch leaves the numbers where they are, and nothing but pl
 of the pickle. torch is imported where a network is made, seconds that a refusal need not take.
 """
 
-from __future__ import annotations
-
 import pickle
 import zipfile
 from collections import OrderedDict
@@ -193,7 +191,7 @@ def probed_on(
     return path, manifest
 
 
-def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
+def load_checkpoint(path: Path) -> "tuple[TactileClassifier, dict[str, Any]]":
     """The network of a `best.pt`, in evaluation mode on the CPU, with what it was trained on.
 
     Raises:
@@ -212,7 +210,7 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
 
 
 def begin_from(
-    model: TactileClassifier,
+    model: "TactileClassifier",
     path: Path,
     labels: Sequence[str],
     kinds: Mapping[str, Sequence[str]],
@@ -262,7 +260,7 @@ def _name_rows(
     return [*labels, *names, *range(network["identity"])]
 
 
-def untrained(saved: dict[str, Any]) -> TactileClassifier:
+def untrained(saved: dict[str, Any]) -> "TactileClassifier":
     """The network of a checkpoint as it might be before training: for the same channels."""
     from tactile_rt.models.ead import TactileClassifier
 
@@ -273,7 +271,7 @@ def untrained(saved: dict[str, Any]) -> TactileClassifier:
 
 
 def fill_checkpoint(
-    model: TactileClassifier,
+    model: "TactileClassifier",
     manifest: SweepManifest,
     refusals: Sequence[str],
     config: Mapping[str, Any],

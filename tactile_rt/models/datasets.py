@@ -4,8 +4,6 @@ A window is what the classifier would feed the network: it starts where `Contact
 onset on the noisy signal, and carries the baseline that the detector had measured by then.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -61,12 +59,12 @@ class SweepSet:
     joined_of: tuple[SweepManifest, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path, split: str) -> SweepSet:
+    def read(cls, folder: Path, split: str) -> "SweepSet":
         """Read a split."""
         return cls.read_known(folder, SweepManifest.read(folder), split)
 
     @classmethod
-    def read_known(cls, folder: Path, manifest: SweepManifest, split: str) -> SweepSet:
+    def read_known(cls, folder: Path, manifest: SweepManifest, split: str) -> "SweepSet":
         """Read a split of a set whose manifest is known."""
         limits = manifest.limits
         return cls(manifest, read_split(folder, manifest, split), limits.noise, limits.floor)
@@ -102,7 +100,7 @@ class SweepSet:
         none = np.zeros(len(self.sweeps), dtype=np.bool_)
         return none if self.sweeps.recorded is None else self.sweeps.recorded
 
-    def __getitem__(self, at: slice | NDArray[Any]) -> SweepSet:
+    def __getitem__(self, at: slice | NDArray[Any]) -> "SweepSet":
         return replace(self, sweeps=self.sweeps[at])
 
     @property

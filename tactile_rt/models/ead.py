@@ -18,8 +18,6 @@ uN m as they are, limited to 1000 of either (Chung et al. 2025, and its code).
 for streaming, and gives the same logits. The logits of a step use no later frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any

@@ -1,7 +1,5 @@
 """Decoders: old names, and the decoder of all steps adds up as it should."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor, nn

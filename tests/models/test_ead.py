@@ -1,7 +1,5 @@
 """Every combination is one network: its timing, and a stream that equals a window."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

@@ -14,8 +14,6 @@ contiguous block: the recurrence is a loop of products into buffers that already
 to, and everything else is done for all steps at once.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -10,8 +10,6 @@ Two cells differ between Nayebi et al.'s equations, "lstm-ln" and "vanilla", and
 published with the paper, "lstm-ln-published" and "vanilla-elu" or "vanilla-elu-ln".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import ClassVar

@@ -4,8 +4,6 @@ Inside, maps are `(row, column, lane, channel)`, vectors maps of one site; in th
 `(lane, row, column, channel)` and a vector `(lane, channel)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

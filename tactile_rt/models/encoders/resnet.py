@@ -6,8 +6,6 @@ is therefore one product with the matrix of its taps that lie inside the map, wh
 nothing else. Maps are `(frame, site * channel)`, sites row by row.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -146,7 +144,7 @@ class ResNet18Encoder(_FrameEncoder):
         self.blocks = nn.ModuleList(blocks)
         self.fc = nn.Linear(inputs, self.features)
 
-    def deployed(self) -> FoldedResNet18:
+    def deployed(self) -> "FoldedResNet18":
         """The same outputs from only the taps that matter, batch norm folded in; for inference."""
         return FoldedResNet18(self)
 

@@ -1,7 +1,5 @@
 """Zhuang's recurrent convolutional network on the whisker map, as a graph (Zhuang et al. 2017)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from torch import nn

@@ -7,8 +7,6 @@ Predictions are (sweep, step, class) posteriors; a sweep in which no contact was
 decision, and counts as wrong everywhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -333,7 +331,7 @@ def macro_accuracy(correct: NDArray[np.bool_], labels: Labels, objects: Names) -
     return bootstrap(mean, objects)
 
 
-def run_on(model: TactileClassifier, output: str = "logits") -> Step:
+def run_on(model: "TactileClassifier", output: str = "logits") -> Step:
     """The function that `predict` wants, of a torch model; or one that gives another output."""
     import torch  # here: a model file is measured without
 

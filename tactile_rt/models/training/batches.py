@@ -4,8 +4,6 @@ A thread draws and augments them while the network computes. Everything of a bat
 (seed, epoch, index) alone, so that neither threads nor an interruption change it.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 import time

@@ -1,7 +1,5 @@
 """Mamba is its equations, by a loop over every number; and a stream is the window."""
 
-from __future__ import annotations
-
 import math
 
 import torch
