@@ -28,7 +28,7 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR, channel_limits
-from tactile_rt.export import onnx_step, streaming, streaming_parts
+from tactile_rt.export import onnx_step, streaming
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
@@ -187,7 +187,7 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(streaming, "LARGE", 0)
-    monkeypatch.setattr(streaming_parts, "WIDE", 0)
+    monkeypatch.setattr(streaming, "WIDE", 0)
     path = tmp_path / "wide.onnx"
     export_step(exported.model, exported.card, path)
     wide, narrow = (
