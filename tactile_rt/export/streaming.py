@@ -141,7 +141,8 @@ class StreamingGraph(nn.Module):
     def __init__(self, encoder: GraphEncoder, integer: bool) -> None:
         super().__init__()
         self.graph, self.sizes, self.lag = encoder.graph, encoder.sizes, encoder.lag
-        self.features, self.heard = encoder.features, encoder.heard
+        self.features = encoder.features
+        self.keys = {node.name: encoder.keys(node) for node in self.graph.nodes}
         self.drives, self.cells = nn.ModuleDict(), nn.ModuleDict()
         self.integer = integer
         for node in self.graph.nodes:
@@ -184,7 +185,7 @@ class StreamingGraph(nn.Module):
         for node in self.graph.nodes:
             rows, columns = self.sizes[node.name]
             sites = () if node.kind == "dense" else (rows * columns,)
-            for key in self._keys(node.name):
+            for key in self.keys[node.name]:
                 state[key] = zeros((batch, *sites, node.channels), dtype=torch.float32)
         return state
 
@@ -206,7 +207,7 @@ class StreamingGraph(nn.Module):
                 x, memory = cell(x, tuple(state[name] for name in names))
                 new |= dict(zip(names, memory, strict=True))
             new[f"{node.name}_h"] = F.relu(x)
-        kept = (key for node in self.graph.nodes for key in self._keys(node.name))
+        kept = (key for node in self.graph.nodes for key in self.keys[node.name])
         return new[f"{self.graph.readout}_h"], {key: new[key] for key in kept}
 
     def _dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
@@ -219,14 +220,6 @@ class StreamingGraph(nn.Module):
         x = torch.cat([torch.cat(maps, -1).flatten(1), *vectors] if maps else vectors, -1)
         out = drive(x)
         return out
-
-    def _keys(self, name: str) -> list[str]:
-        memory = []
-        if name in self.cells:
-            cell = self.cells[name]
-            assert isinstance(cell, Cell)
-            memory = [f"{name}_{kind}" for kind in cell.states]
-        return memory + [f"{name}_h"] * (name in self.heard)
 
 
 class Product(nn.Module):

@@ -96,7 +96,7 @@ class GraphEncoder(nn.Module):
         state = {}
         for node in self.graph.nodes:
             sites = () if node.kind == "dense" else self.sizes[node.name]
-            for key in self._keys(node):
+            for key in self.keys(node):
                 state[key] = zeros(batch, *sites, node.channels)
         return state
 
@@ -108,7 +108,7 @@ class GraphEncoder(nn.Module):
         index does not matter to a network without positions.
         """
         name, now = self.graph.frame.name, _inside(frame)
-        keys = [key for node in self.graph.nodes for key in self._keys(node)]
+        keys = [key for node in self.graph.nodes for key in self.keys(node)]
         old = {key: _from_state(state[key]) for key in keys}
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
@@ -227,7 +227,8 @@ class GraphEncoder(nn.Module):
         assert isinstance(cell, Cell)
         return [f"{node.name}_{kind}" for kind in cell.states]
 
-    def _keys(self, node: Node) -> list[str]:
+    def keys(self, node: Node) -> list[str]:
+        """List the names of a node in the state: its cell's memory and, if heard, its output."""
         return self._memory(node) + [f"{node.name}_h"] * (node.name in self.heard)
 
 
