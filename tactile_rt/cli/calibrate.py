@@ -50,8 +50,7 @@ def tare(
 
     for file in (out, json):
         check_output(file)
-    opened = open_url(source)
-    with opened:
+    with open_url(source) as opened:
         raw, before = _find_raw(opened, source)
         name = device or (before.device if before else _own_id(raw))
         path = out or calibration_path(name)
@@ -189,8 +188,7 @@ def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArrayS
 
     if not url:
         raise ConfigError(f"{table} has times: name the recording they are in with --source")
-    opened = open_url(url)
-    with opened:
+    with open_url(url) as opened:
         raw, _ = _find_raw(opened, url)
         return concatenate(record(raw, float(loads.times.max()))), raw.spec
 

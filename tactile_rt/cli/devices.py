@@ -192,8 +192,7 @@ def echo(source: Url, seconds: Seconds = None) -> None:
     """
     import msgspec
 
-    opened = open_url(source)
-    with opened, leaving(seconds):
+    with open_url(source) as opened, leaving(seconds):
         for chunk in opened:
             for k in range(len(chunk)):
                 line = {
@@ -212,9 +211,8 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
 
     from tactile_rt.core.stream import EndOfStream
 
-    opened = open_url(source)
     looks: list[dict[str, Any]] = []
-    with opened, leaving(None):
+    with open_url(source) as opened, leaving(None):
         spec = opened.spec
         shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
         typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz", err=json == STDOUT)
