@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 PICKLE = "/data.pkl"  # in the archive, in a folder of any name
-NEEDED = ("model", "network", "config", "spec", "categories", "refusals")
+NEEDED = ("model", "network", "config", "spec", "period_ns", "categories", "refusals")
 # of a network's configuration, what a training configuration says
 NETWORK = (
     "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",

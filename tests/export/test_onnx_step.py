@@ -38,7 +38,7 @@ from tactile_rt.export.onnx_step import (
     write_model,
 )
 from tactile_rt.models.attenders import gpt
-from tactile_rt.models.checkpoints import load_checkpoint
+from tactile_rt.models.checkpoints import fill_checkpoint, load_checkpoint
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig, TactileClassifier
 from tactile_rt.models.onsets import find_onsets
@@ -88,14 +88,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     manifest.write(folder / "set")
     model = build()
     checkpoint = folder / "best.pt"
-    saved = {
-        "model": model.state_dict(),
-        "config": {"data": str(folder / "set"), "epochs": 0},
-        "network": msgspec.to_builtins(NETWORK),
-        "spec": SPEC.to_json(),
-        "categories": list(CATEGORIES),
-        "refusals": [],
-    }
+    config = {"data": str(folder / "set"), "epochs": 0}
+    saved = fill_checkpoint(model, manifest, (), config, {}, {})
     torch.save(saved, checkpoint)
     programs = []
     export = torch.onnx.export

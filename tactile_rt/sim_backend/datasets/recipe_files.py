@@ -28,7 +28,7 @@ from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_from_dict", "recipe_of_set", "shipped_recipes"]
+__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_of_set", "shipped_recipes"]
 
 DEFAULT_RECIPE = "wide24"
 
@@ -64,16 +64,6 @@ def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepReci
         ConfigError: it is not one that this release knows.
     """
     return _recipe(set_keys(make_node(recipe, "the set's recipe", 0, Path()), sets, SweepRecipe))
-
-
-def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
-    """Read what a recipe file holds.
-
-    Raises:
-        ConfigError: a key is unknown or of the wrong kind, or a value out of range: one line
-            that says which, where.
-    """
-    return _recipe(make_node(raw, where, 0, Path()))
 
 
 def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:

@@ -387,7 +387,7 @@ class SweepRecipe:
         return [self.seed, zlib.crc32(name.encode()), index, *([stream] if stream else [])]
 
     def to_dict(self) -> dict[str, Any]:
-        """Write it in full as a recipe file has it; `recipe_files.recipe_from_dict` reads it."""
+        """Write it in full as a recipe file has it; `recipe_files.recipe_of_set` reads it."""
         # asdict, as msgspec leaves out what it has decoded from a default
         plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(self)))
         return plain
