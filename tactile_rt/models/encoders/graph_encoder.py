@@ -228,7 +228,7 @@ class GraphEncoder(nn.Module):
         return [f"{node.name}_{kind}" for kind in cell.states]
 
     def keys(self, node: Node) -> list[str]:
-        """List the names of a node in the state: its cell's memory and, if heard, its output."""
+        """List a node's names in the state: its cell's memory and its output, if heard."""
         return self._memory(node) + [f"{node.name}_h"] * (node.name in self.heard)
 
 
