@@ -5,6 +5,9 @@ import pytest
 
 pytest.importorskip("trimesh")
 
+import os
+
+import pytest
 import trimesh
 
 from tactile_rt.core.errors import ConfigError
@@ -12,7 +15,7 @@ from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object, make_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
-from tactile_rt.sim_backend.objects.meshes import load_mesh
+from tactile_rt.sim_backend.objects.meshes import load_mesh, read_pieces, write_pieces
 from tactile_rt.sim_backend.objects.solids import box
 from tests.helpers import mesh_truth
 from tests.helpers.mesh_truth import inside
@@ -282,3 +285,29 @@ def test_no_large_face_is_lost_where_small_ones_go(tmp_path: Path) -> None:
     thing = load_mesh(save(cloth, tmp_path / "cloth.ply"))
     assert len(thing.pieces) < 1024
     within(thing, cloth, 0.4)
+
+
+@pytest.fixture
+def pieces():
+    return TactileObject("box", "box", (trimesh.creation.box(),), 0.0, "by hand")
+
+
+@pytest.mark.parametrize("relative", ["", "some/cache"])
+def test_a_relative_folder_is_the_home_s(pieces, tmp_path, monkeypatch, relative):
+    monkeypatch.delenv("TACTILE_RT_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", relative)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    write_pieces("key", pieces)
+    assert (tmp_path / ".cache" / "tactile_rt" / "pieces" / "key.npz").is_file()
+    assert read_pieces("key") is not None
+
+
+@pytest.mark.parametrize("home", ["~", "relative"])
+def test_without_a_home_nothing_is_kept(pieces, tmp_path, monkeypatch, home):
+    monkeypatch.delenv("TACTILE_RT_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path.replace("~", home))
+    monkeypatch.chdir(tmp_path)
+    write_pieces("key", pieces)
+    assert read_pieces("key") is None
+    assert os.listdir(tmp_path) == []
