@@ -66,7 +66,7 @@ def test_an_option_takes_the_same_in_every_command():
     kinds = defaultdict(set)
     for command in commands().values():
         for name, option in options_of(command).items():
-            kinds[name].add(_kind(option))
+            kinds[name].add(option.type.name.removesuffix(" range"))
     assert {name for name, found in kinds.items() if len(found) > 1} <= OF_TWO_KINDS.keys()
 
 
@@ -75,11 +75,6 @@ def test_options_have_few_names():
     names = {n for command in every for n in options_of(command)}
     negated = {n for command in every for p in command.params for n in p.secondary_opts}
     assert len(names | negated) <= MOST_NAMES
-
-
-def _kind(option):
-    """What one value of an option is."""
-    return option.type.name.removesuffix(" range")
 
 
 def test_every_option_and_argument_says_what_it_is():
