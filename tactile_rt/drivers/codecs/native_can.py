@@ -34,23 +34,9 @@ from tactile_rt.drivers.codec import (
     Step,
     WireStats,
 )
+from tactile_rt.drivers.codecs import native_common as common
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native_common import (
-    FORMATS,
-    HARMLESS,
-    IMPOSSIBLE,
-    RANGE_N,
-    RANGE_NM,
-    RANGE_SI,
-    STATUS,
-    UNKNOWN,
-    DeviceDescription,
-    MessageType,
-    check_ranges,
-    pack_valid,
-    quantise,
-    unpack_valid,
-)
+from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType
 
 __all__ = ["NativeCan", "NativeCanOptions"]
 
@@ -84,20 +70,22 @@ class NativeCanOptions:
     base: int = 0x100
     fd: bool = False
     format: str = "int16"
-    range_n: float = RANGE_N
-    range_nm: float = RANGE_NM
-    range_si: float = RANGE_SI
+    range_n: float = common.RANGE_N
+    range_nm: float = common.RANGE_NM
+    range_si: float = common.RANGE_SI
     serial_number: str = ""
 
     def __post_init__(self) -> None:
-        check_ranges(self.range_n, self.range_nm, self.range_si)
+        common.check_ranges(self.range_n, self.range_nm, self.range_si)
         if not 0 <= self.base <= 0x7FF - DESCRIPTION:
             raise ConfigError(
                 f"base must be from 0 to {0x7FF - DESCRIPTION:#x}, so that base to base + 4 have "
                 f"11 bits, not {self.base:#x}"
             )
-        if self.format not in FORMATS:
-            raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
+        if self.format not in common.FORMATS:
+            raise ConfigError(
+                f"format must be one of {', '.join(common.FORMATS)}, not {self.format!r}"
+            )
 
 
 class NativeCan(CanCodec):
@@ -113,8 +101,8 @@ class NativeCan(CanCodec):
     data_bitrate = 8_000_000  # 35 elements x 6 x int16 at 1 kHz take 1.09 ms a sample at 5 Mbit/s
     count_bits = 16
     tick_ns = 1000.0
-    status_bits = STATUS
-    harmless_bits = HARMLESS
+    status_bits = common.STATUS
+    harmless_bits = common.HARMLESS
     describes = True
     cannot_detect = "65,536 samples lost in succession (over CAN)"
 
@@ -221,10 +209,10 @@ class NativeCan(CanCodec):
             if self._float32:
                 body = values.astype("<f4").tobytes()
             else:
-                body = quantise(values, described.scale).astype("<i2").tobytes()
+                body = common.quantise(values, described.scale).astype("<i2").tobytes()
                 valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
             head = head_of(seq, t_ns // 1000, flags, self.status)
-            parts = sample_parts(head, pack_valid(valid) + body)
+            parts = sample_parts(head, common.pack_valid(valid) + body)
             if parts is None:
                 elements, channels = described.spec.shape
                 raise ConfigError(
@@ -252,7 +240,7 @@ class NativeCan(CanCodec):
         if kind == MessageType.DESCRIBE:
             described = self._description()
             if described is None:
-                return IMPOSSIBLE
+                return common.IMPOSSIBLE
             size = 64 if self._fd else 8
             pieces = cut_description(MessageType.DESCRIPTION, described.to_json(), size)
             answer += [self._frame(DESCRIPTION, piece) for piece in pieces]
@@ -262,10 +250,10 @@ class NativeCan(CanCodec):
             _, mhz, amplitude, offset = WHISKING.unpack_from(data)
             asked = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
             if not self.may_whisk(*asked):
-                return IMPOSSIBLE
+                return common.IMPOSSIBLE
             self.whisking = asked
         else:
-            return UNKNOWN
+            return common.UNKNOWN
         return 0
 
     # both
@@ -392,7 +380,7 @@ class SampleParts:
             self.refuse()
             return
         seq, time_us, status, flags = HEAD.unpack(head)
-        valid = unpack_valid(body[:bits], shape[0])
+        valid = common.unpack_valid(body[:bits], shape[0])
         kind = np.dtype("<f4" if flags & FLOAT32 else "<i2")
         values = np.frombuffer(body[:end], kind, offset=bits).reshape(shape)
         if not flags & FLOAT32:
