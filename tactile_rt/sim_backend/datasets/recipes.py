@@ -273,11 +273,6 @@ class SweepChoice:
     def __len__(self) -> int:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
-    @property
-    def keeps_misses(self) -> bool:
-        """Whether a sweep that misses the array stays: all combinations are to be there."""
-        return self.combinations() != [{}]
-
     def draw_index(self, index: int) -> int:
         """Which draw of its combination sweep `index` of an object is, from 0."""
         return index % (self.draws + self.held_out_draws)

@@ -130,6 +130,7 @@ class RodWorld:
                 answers.append(_answers(_shape_of(whiskers[i]), cells, steps_per_sample))
             self.sag.append(nodes[1] - nodes[0])
         rows = rows._replace(answers=_begins(answers))
+        degrees = [np.bincount(p.edges[:, 0], minlength=len(p.corners)) for p in pieces]
         self.angles = rest.copy()
         self._advance = partial(
             advance,
@@ -144,7 +145,7 @@ class RodWorld:
                 _begins([p.faces for p in pieces]),
                 np.array([p.rounding for p in pieces]),
                 np.concatenate([NO_EDGES, *(p.edges for p in pieces)])[:, 1].copy(),
-                np.cumsum(np.concatenate([[0], *map(_degrees, pieces)])),
+                np.cumsum(np.concatenate([[0], *degrees])),
             ),
             RodState(
                 self.angles,
@@ -267,11 +268,6 @@ def _stacked(each: Sequence[Any]) -> NDArray[Any]:
     if kept := [(0, 0)] * (np.ndim(each[0]) - 1):
         each = [np.pad(rows, (*kept, (0, wide - rows.shape[-1]))) for rows in each]
     return np.concatenate(each)
-
-
-def _degrees(piece: Piece) -> NDArray[np.int64]:
-    """The number of edges at each corner."""
-    return np.bincount(piece.edges[:, 0], minlength=len(piece.corners))
 
 
 def _begins(each: Sequence[Any]) -> NDArray[np.int64]:
