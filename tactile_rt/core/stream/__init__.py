@@ -29,6 +29,7 @@ __all__ = [
     "SourceStats",
     "Timing",
     "concatenate",
+    "quaternion_product",
     "rotation_matrices",
 ]
 
@@ -301,6 +302,13 @@ class Timing:
 
 
 MOUSE = Timing()  # 22 steps of five 9 ms samples
+
+
+def quaternion_product(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
+    """Hamilton's product of two quaternions (w, x, y, z)."""
+    w, x, y, z = np.asarray(p, dtype=np.float64)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return np.asarray(np.array(rows) @ np.asarray(q, dtype=np.float64))
 
 
 def rotation_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
