@@ -60,11 +60,7 @@ class NativeOptions:
     serial_number: str = ""
 
     def __post_init__(self) -> None:
-        common.check_ranges(self.range_n, self.range_nm, self.range_si)
-        if self.format not in common.FORMATS:
-            raise ConfigError(
-                f"format must be one of {', '.join(common.FORMATS)}, not {self.format!r}"
-            )
+        common.check_numbers(self.format, self.range_n, self.range_nm, self.range_si)
 
 
 def frame(

@@ -76,15 +76,11 @@ class NativeCanOptions:
     serial_number: str = ""
 
     def __post_init__(self) -> None:
-        common.check_ranges(self.range_n, self.range_nm, self.range_si)
+        common.check_numbers(self.format, self.range_n, self.range_nm, self.range_si)
         if not 0 <= self.base <= 0x7FF - DESCRIPTION:
             raise ConfigError(
                 f"base must be from 0 to {0x7FF - DESCRIPTION:#x}, so that base to base + 4 have "
                 f"11 bits, not {self.base:#x}"
-            )
-        if self.format not in common.FORMATS:
-            raise ConfigError(
-                f"format must be one of {', '.join(common.FORMATS)}, not {self.format!r}"
             )
 
 
