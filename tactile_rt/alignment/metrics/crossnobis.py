@@ -56,9 +56,8 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
     Returns:
         (division, 15).
     """
-    weights = np.stack([chosen * (stimulus == k) for k in range(len(STIMULI))], axis=1).astype(
-        np.float64
-    )  # (division, 6, trial)
+    of_each = [chosen * (stimulus == k) for k in range(len(STIMULI))]
+    weights = np.stack(of_each, axis=1).astype(np.float64)  # (division, 6, trial)
     number = weights.sum(axis=-1)
     total = weights @ white
     alone = weights @ (white**2).sum(axis=-1)

@@ -198,6 +198,7 @@ class NativeCan(CanCodec):
         described = self._description()
         assert described is not None
         flags = (LONG if self._fd else 0) | (FLOAT32 if self._float32 else 0)
+        flags |= (~flags & 15) << 4
         packets: list[Sequence[CanFrame]] = []
         for seq, t_ns, values, valid in zip(
             chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
@@ -207,7 +208,7 @@ class NativeCan(CanCodec):
             else:
                 body = common.quantise(values, described.scale).astype("<i2").tobytes()
                 valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
-            head = head_of(seq, t_ns // 1000, flags, self.status)
+            head = HEAD.pack(seq & 0xFFFF, t_ns // 1000 & 0xFFFFFFFF, self.status, flags)
             parts = sample_parts(head, common.pack_valid(valid) + body)
             if parts is None:
                 elements, channels = described.spec.shape
@@ -263,11 +264,6 @@ class NativeCan(CanCodec):
         if self._described is None and self.spec is not None:
             return DeviceDescription.of(self.spec, *self._ranges, self.serial_number)
         return self._described
-
-
-def head_of(seq: int, time_us: int, flags: int, status: int = 0) -> bytes:
-    """The header of a sample."""
-    return HEAD.pack(seq & 0xFFFF, time_us & 0xFFFFFFFF, status, flags | (~flags & 15) << 4)
 
 
 def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:

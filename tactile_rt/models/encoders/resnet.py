@@ -70,8 +70,7 @@ class ConvNorm(nn.Module):
         """(site out * outputs, site in * inputs)"""
         taps = F.pad(self.weight.flatten(2).permute(2, 0, 1), (0, 0, 0, 0, 0, 1))
         matrix = taps[self.taps]  # (site out, site in, output, input)
-        matrix = matrix.transpose(1, 2).flatten(2).flatten(0, 1)
-        return matrix
+        return matrix.transpose(1, 2).flatten(2).flatten(0, 1)
 
     def folded(self) -> tuple[Tensor, Tensor]:
         """Matrix and bias with the norm's running statistics multiplied in."""
