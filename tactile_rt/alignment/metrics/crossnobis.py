@@ -16,12 +16,10 @@ from tactile_rt.alignment.metrics import Measure
 from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
 from tactile_rt.alignment.metrics.halves import ceiling_of, divisions, sessions_of
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import UPPER, pearson
+from tactile_rt.alignment.rdm import UPPER, Floats, pearson
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["crossnobis", "distances", "shrunk_covariance"]
-
-Floats = NDArray[np.float64]
 
 
 def crossnobis(animal: Animal) -> Measure:

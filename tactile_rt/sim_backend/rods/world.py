@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from tactile_rt.core.errors import ConfigError, SourceError
-from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.resting import linearise, settle
 from tactile_rt.sim_backend.rods.rod import Rod, make_rod
@@ -21,8 +21,6 @@ from tactile_rt.sim_backend.rods.touching import Object, Segments, unseen
 from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 
 __all__ = ["Piece", "RodWorld"]
-
-Floats = NDArray[np.float64]
 
 WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
