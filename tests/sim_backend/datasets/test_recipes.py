@@ -273,15 +273,9 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
     ("text", "complaint"),
     [
         ("sead = 1", r":1: the file has no key 'sead'; did you mean seed\?"),
-        (
-            "[sweeps]\nyaw_deg = { betwen = [0, 1] }",
-            r"sweeps.yaw_deg has no key 'betwen'; did you mean between\?",
-        ),
         ("[sensor]\nnoise_force = -1", r"sensor: noise_force must be 0 or more, not -1"),
         ("[randomisation]\nfriction = 2", r"randomisation: friction is relative"),
-        ("seed = 1.5", "seed: expected a whole number, got 1.5"),
         ("seed = -1", "seed must be 0 or more, not -1"),
-        ("period_ms = 'nine'", "period_ms: expected a number, got 'nine' .in milliseconds"),
         ("period_ms = 0.5", "period_ms must be 1 or more, the simulator's own, not 0.5"),
         ("lead_ms = 2000", r"length_ms \(1476\) must exceed lead_ms \(2000\)"),
         ("profile = 'realtim'", r"no profile 'realtim'; did you mean realtime\?"),
