@@ -34,10 +34,10 @@ from tactile_rt.classifier.model_file import file_outputs, load_model, read_mode
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.stream import NS_PER_S, Chunk
 from tactile_rt.export import streaming as streaming_module
-from tactile_rt.export import streaming_parts
 from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
-from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig, TactileClassifier
+from tactile_rt.models.ead import EAD, TactileClassifier
+from tactile_rt.models.ead_config import ATTENDERS, DECODERS, ENCODERS, EADConfig
 
 STREAM_BAR, DOUBLE_BAR = 2e-6, 1e-9  # some constants are single
 # What is measured, and the most that it may be; bit by bit is 0.
@@ -55,7 +55,7 @@ STEPS, CLASSES, WIDTH = 22, 7, 1 / 32
 # A GRU's initial weights grow as it gets smaller, and its drives are sums of 1,050 inputs: one of
 # 16 features is driven five times as hard as one of 512, and rounds as much more.
 WIDTHS = {"gru": 1 / 4}
-FORMS = {"": (streaming_module.LARGE, streaming_parts.WIDE), "as if wide": (0, 0)}
+FORMS = {"": (streaming_module.LARGE, streaming_module.WIDE), "as if wide": (0, 0)}
 Combination = tuple[str, str, str, str]
 SPEC = read_model(shipped_model())[0].array
 
@@ -104,7 +104,7 @@ def main() -> int:
 def measure(job: tuple[Combination, int]) -> tuple[Combination, list[float]]:
     """Largest differences, in the order of `BARS`: of outputs, and last of posteriors."""
     (encoder, attender, decoder, form), episodes = job
-    streaming_module.LARGE, streaming_parts.WIDE = FORMS[form]
+    streaming_module.LARGE, streaming_module.WIDE = FORMS[form]
     torch.set_num_threads(1)
     torch.manual_seed(1)  # not of the weights (0) nor of the input (2), which would go together
     readout = "mean" if decoder == "mlp" else "last"

@@ -20,9 +20,8 @@ from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.measures import run_on
+from tactile_rt.models.evaluation.measures import run_on, run_steps
 from tactile_rt.models.evaluation.svm import PENALTIES, fit, window_features
-from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import train
 from tactile_rt.sets.objects import Sweeps
@@ -71,7 +70,7 @@ def baselines(data: Data, runs: Path | None) -> Iterator[Method]:
 def onnx_model(path: Path) -> Method:
     """A model file, as it is."""
     session, card = load_model(path)
-    run = stepped(session, card)
+    run = run_steps(session, card)
 
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return measures.predict(sweeps, run, disturbance=disturbance)[:, -1]

@@ -6,8 +6,6 @@ ReLU. Always in evaluation mode: dropout and batch statistics would make a score
 and on what else is in the batch.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -43,14 +41,8 @@ Change = Callable[[Tensor], Tensor]
 def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[str, Any]]:
     """Layers of a `best.pt`, and what else it holds."""
     model, saved = load_checkpoint(path)
-    timing, period = model.timing, saved.get("period_ns")  # which earlier ones do not say
-    stimuli.check(
-        ArraySpec.from_json(saved["spec"]),
-        timing.steps,
-        timing.substeps,
-        str(path),
-        period if isinstance(period, int) else None,
-    )
+    spec, timing = ArraySpec.from_json(saved["spec"]), model.timing
+    stimuli.check(spec, timing.steps, timing.substeps, str(path), saved["period_ns"])
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.resolve().parent.name if path.stem in ("best", "last") else path.stem
     layers = network_layers(model, stimuli, name, sha256)

@@ -13,8 +13,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from tactile_rt.alignment.json_file import Floats, Number, encode, read_json, write_json
-from tactile_rt.alignment.rdm import PAIRS
+from tactile_rt.alignment.json_file import Number, encode, read_json, write_json
+from tactile_rt.alignment.rdm import PAIRS, Floats
 from tactile_rt.alignment.statistics import standard_error
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI

@@ -12,11 +12,12 @@ import msgspec
 import numpy as np
 
 from tactile_rt.alignment.datasets import NeuralDataset
-from tactile_rt.alignment.json_file import Floats, Number
+from tactile_rt.alignment.json_file import Number
 from tactile_rt.alignment.layers import Layers
 from tactile_rt.alignment.metrics import METRICS, Measure, find_metric
 from tactile_rt.alignment.metrics.halves import LONGEST, bins_of, means_of, sessions_of
 from tactile_rt.alignment.neural import Animal
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.alignment.selection import part_of
 from tactile_rt.alignment.statistics import held_out, standard_error
 from tactile_rt.alignment.stimuli_input import StimuliInput
@@ -25,7 +26,6 @@ __all__ = [
     "ANOTHER",
     "Alignments",
     "BoardCell",
-    "BoardColumn",
     "BoardDataset",
     "BoardRow",
     "joined",

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CLOCKS", "WARNING", "ContactResponse", "contact_response", "said_of"]
+from tactile_rt.alignment.rdm import Floats
 
-Floats = NDArray[np.float64]
+__all__ = ["CLOCKS", "WARNING", "ContactResponse", "contact_response", "said_of"]
 
 CLOCKS = ("session", "recording")  # NWB's; and the published shift by the starting time
 WARNING = "WARNING: "  # begins a note that must not be overlooked

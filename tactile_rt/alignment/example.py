@@ -15,15 +15,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 __all__ = ["MODELS", "Brain", "example_models"]
-
-Floats = NDArray[np.float64]
 
 FEATURES = 6
 # Of a unit: the middle of the rates in spikes per second, the spread of their logarithm over units.

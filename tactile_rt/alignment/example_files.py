@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.example import MODELS, Brain, example_models, gains
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import whole_folder
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     import h5py
 
 __all__ = ["write_example"]
-
-Floats = NDArray[np.float64]
 
 TRIAL_S = 4.0
 FIRST_S, BEGIN_S = 5.9, 10.03  # when the first trial and the electrical recording begin

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark
-from tactile_rt.alignment.rdm import PAIRS, UPPER, relabellings, square
+from tactile_rt.alignment.rdm import PAIRS, UPPER, Floats, relabellings, square
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -41,15 +41,10 @@ from tactile_rt.core.stream.stimuli import STIMULI
 __all__ = [
     "FAIL",
     "INCONCLUSIVE",
-    "INPUT_ERROR",
-    "LARGEST_DROP",
     "LOST",
-    "MARGIN",
     "PASS",
-    "BesideMice",
     "Check",
     "Mice",
-    "Power",
     "exit_code",
     "mice_of",
     "neural_checks",
@@ -57,8 +52,6 @@ __all__ = [
     "turing",
     "validity",
 ]
-
-Floats = NDArray[np.float64]
 
 MARGIN = 0.65  # of the noise ceiling
 WORSE, SURE = 10, 8  # a mouse is called worse in one of so many cases, a floor is too high in one

@@ -5,14 +5,12 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer, write_whole
 
-__all__ = ["Floats", "Number", "encode", "read_json", "write_json"]
+__all__ = ["Number", "encode", "read_json", "write_json"]
 
-Floats = NDArray[np.float64]
 T = TypeVar("T")
 LARGEST = 1e12  # beyond it nothing can be drawn
 

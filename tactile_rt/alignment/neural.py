@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -22,8 +23,6 @@ __all__ = [
     "rates_sha256",
     "read_published",
 ]
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from tactile_rt.alignment import nwb_parts as parts
 from tactile_rt.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.alignment.neural import NeuralSession
-from tactile_rt.alignment.rdm import stimulus_index
+from tactile_rt.alignment.rdm import Floats, stimulus_index
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError, explain_errors, name_some
 from tactile_rt.core.files import check_no_pointer
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 __all__ = ["BIN_S", "WINDOWS", "Reading", "find_nwb", "read_nwb", "read_session"]
 
-Floats = NDArray[np.float64]
 Progress = Callable[[float], None]
 
 BIN_S = 0.045

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.alignment.selection import TASKS
 from tactile_rt.core.errors import ConfigError, name_some
 
@@ -41,8 +42,6 @@ __all__ = [
     "unit_column",
     "usable_units",
 ]
-
-Floats = NDArray[np.float64]
 
 COLUMNS = ("start_time", "choice_time", "outcome", "stimulus", "servo_position", "ignore_trial")
 TRIALS = "intervals/trials"

@@ -22,11 +22,10 @@ Where the published code stops with an assertion (a stimulus without a trial), t
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import pad, rates_sha256
-from tactile_rt.alignment.rdm import pearson, rdm
+from tactile_rt.alignment.rdm import Floats, pearson, rdm
 from tactile_rt.alignment.reliability import (
     BOOTSTRAPS,
     SEED,
@@ -41,8 +40,6 @@ from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["POOLED", "freeze_paper_code"]
-
-Floats = NDArray[np.float64]
 
 POOLED = "concatenated"  # the published name of all animals as one
 

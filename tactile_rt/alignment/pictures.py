@@ -12,8 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from tactile_rt.alignment.json_file import Floats
-from tactile_rt.alignment.rdm import square
+from tactile_rt.alignment.rdm import Floats, square
 
 __all__ = ["Bar", "Level", "Point", "draw_bars", "draw_heat_maps", "draw_profiles", "draw_scatter"]
 

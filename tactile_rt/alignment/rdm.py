@@ -18,6 +18,7 @@ __all__ = [
     "CONSTANT",
     "PAIRS",
     "UPPER",
+    "Floats",
     "normalised",
     "pearson",
     "rdm",

@@ -11,12 +11,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import pearson, rdm
+from tactile_rt.alignment.rdm import Floats, pearson, rdm
 from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "BOOTSTRAPS",
-    "CUTOFF",
     "SEED",
     "filtered_mean",
     "first_halves",
@@ -26,8 +25,6 @@ __all__ = [
     "split_half",
     "trial_mean",
 ]
-
-Floats = NDArray[np.float64]
 
 BOOTSTRAPS = 1000
 SEED = 1234  # of the first bootstrap in the published analysis

@@ -132,7 +132,6 @@ def _show_layers(results: Results, model: ModelResult) -> str:
 
 
 def _compare(results: Results) -> str:
-    """Models side by side, and their scores by performance, size and training."""
     columns = [_raw_bar(results)]
     for model in results.models:
         mark = model.untrained.score if model.untrained else math.nan

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_benchmark
 from tactile_rt.alignment.gate import neural_checks
-from tactile_rt.alignment.json_file import Floats, Number, read_json
+from tactile_rt.alignment.json_file import Number, read_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.rdm import PAIRS, normalised
+from tactile_rt.alignment.rdm import PAIRS, Floats, normalised
 from tactile_rt.alignment.scoring import Score, score
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
@@ -132,7 +132,6 @@ def read_results(path: Path) -> Results:
 def _check_score(
     made: Score, targets: tuple[str, ...], layers: tuple[str, ...], where: str
 ) -> None:
-    """Check the shapes of the tables of a score."""
     shape = (len(layers), len(targets))
     if not (
         made.layers == layers

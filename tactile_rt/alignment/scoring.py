@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tactile_rt.alignment.benchmark import Benchmark
-from tactile_rt.alignment.json_file import Floats, Number
-from tactile_rt.alignment.rdm import PAIRS, pearson, rdm
+from tactile_rt.alignment.json_file import Number
+from tactile_rt.alignment.rdm import PAIRS, Floats, pearson, rdm
 from tactile_rt.alignment.statistics import (
     held_out,
     highest,

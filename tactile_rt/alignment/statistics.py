@@ -10,11 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import normalised, relabellings
+from tactile_rt.alignment.rdm import Floats, normalised, relabellings
 
 __all__ = ["held_out", "highest", "max_statistic", "mean_held_out", "standard_error", "student"]
-
-Floats = NDArray[np.float64]
 
 # Points of Student's t that it exceeds in one of so many cases, for 1, 2, ... degrees of freedom;
 # and the normal's beyond.

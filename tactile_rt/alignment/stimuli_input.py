@@ -49,13 +49,11 @@ class StimuliInput:
         """(6, element, channel) float32: the baseline."""
         return np.zeros_like(self.sigma)
 
-    def check(
-        self, spec: ArraySpec, steps: int, substeps: int, model: str, period_ns: int | None = None
-    ) -> None:
+    def check(self, spec: ArraySpec, steps: int, substeps: int, model: str, period_ns: int) -> None:
         """Hold the input against what a model was trained on.
 
         Args:
-            period_ns: of its samples, ns; None where that is not known.
+            period_ns: of its samples, ns.
 
         Raises:
             ConfigError: they differ in elements, channels or units, in the cut of a window, or in
@@ -76,7 +74,7 @@ class StimuliInput:
                 f"of {SUBSTEPS}, a sample every {PERIOD_MS} ms: only a model trained on sweeps "
                 f"with period_ms = {PERIOD_MS} can be compared with barrel cortex"
             )
-        if period_ns not in (None, PERIOD_MS * 1_000_000):
+        if period_ns != PERIOD_MS * 1_000_000:
             raise ConfigError(
                 f"{model} takes a sample every {period_ns / 1e6:g} ms, but the stimuli have one "
                 f"every {PERIOD_MS} ms: only a model trained on sweeps with period_ms = "

@@ -31,14 +31,12 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import Animal, NeuralSession, rates_sha256
-from tactile_rt.alignment.rdm import CONSTANT, UPPER, normalised, pearson
+from tactile_rt.alignment.rdm import CONSTANT, UPPER, Floats, normalised, pearson
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["MINIMUM_TRIALS", "MINIMUM_UNITS", "divided", "freeze_strict"]
-
-Floats = NDArray[np.float64]
 
 MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves

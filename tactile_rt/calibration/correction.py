@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, SpecMismatch
 from tactile_rt.core.settings import no_such
-from tactile_rt.core.stream import ArraySpec, Chunk
+from tactile_rt.core.stream import ArraySpec, Chunk, quaternion_product
 
 __all__ = ["Calibration", "Mirror", "check_device"]
 
@@ -83,7 +83,8 @@ class Mirror:
         """Mirror a position (m) and a unit quaternion (w, x, y, z), w >= 0."""
         x, y, z = (0.0 - p if a == self.axis else p for a, p in zip(AXES, position, strict=True))
         # S and T are half turns about their axes times -1, and the two -1 cancel in S R T.
-        w, *v = _times(_times(_half_turn(self.axis), orientation), _half_turn(self.element_axis))
+        turned = quaternion_product(_half_turn(self.axis), orientation)
+        w, *v = quaternion_product(turned, _half_turn(self.element_axis)).tolist()
         # The first that is not zero is positive: two quaternions of one rotation are then equal.
         flip = next((q < 0 for q in (w, *v) if q), False)
         a, b, c, d = ((0.0 - q if flip else q) + 0.0 for q in (w, *v))
@@ -93,18 +94,6 @@ class Mirror:
 def _half_turn(axis: str) -> Quaternion:
     x, y, z = (float(a == axis) for a in AXES)
     return 0.0, x, y, z
-
-
-def _times(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Hamilton's product."""
-    a, b, c, d = p
-    e, f, g, h = q
-    return (
-        a * e - b * f - c * g - d * h,
-        a * f + b * e + c * h - d * g,
-        a * g - b * h + c * e + d * f,
-        a * h + b * g - c * f + d * e,
-    )
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,6 @@ __all__ = [
     "METADATA_KEY",
     "ModelCard",
     "StateTensor",
-    "check_graph",
     "element_order",
     "file_outputs",
     "fit_source",

@@ -11,7 +11,6 @@ can be lost.
 import contextlib
 import threading
 from collections.abc import Generator, Iterator
-from types import TracebackType
 from typing import Self
 
 from tactile_rt.classifier.classifier import Classification, Classifier
@@ -61,12 +60,7 @@ class Session:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def _close(self) -> None:

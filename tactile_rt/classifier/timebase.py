@@ -48,7 +48,7 @@ class Resampler:
         self._longest_gap_ns = max(LONGEST_GAP_NS, 2 * self.half_width_ns)
         self.out_of_order = 0
         self._origin: int | None = 0 if aligned else None  # time of output 0
-        self._next: int | None = None if aligned else 0  # index of the next output
+        self._next: int | None = None  # index of the next output
         self._held: Chunk | None = None  # inputs that a later output may still need
 
     def push(self, chunk: Chunk) -> Chunk | None:
@@ -68,7 +68,7 @@ class Resampler:
         pieces = []
         for run in self._runs(ordered):
             if self._held is not None and run.t_ns[0] - self._held.t_ns[-1] > self._longest_gap_ns:
-                self._skip_to(int(run.t_ns[0]))
+                self._held = self._next = None
             pieces += self._resample(run)
         return concatenate(pieces) if pieces else None
 
@@ -87,17 +87,12 @@ class Resampler:
             return chunk
         return chunk.select(keep) if keep.any() else None
 
-    def _skip_to(self, t_ns: int) -> None:
-        assert self._origin is not None
-        self._held = None
-        self._next = -(-(t_ns + self.half_width_ns - self._origin) // self.period_ns)
-
     def _resample(self, chunk: Chunk) -> list[Chunk]:
+        filled_ns = int(chunk.t_ns[0]) + self.half_width_ns  # on both sides of a kernel
         if self._origin is None:
-            # The first output is the first whose kernel is filled on both sides.
-            self._origin = int(chunk.t_ns[0]) + self.half_width_ns
+            self._origin = filled_ns
         if self._next is None:
-            self._next = -(-(int(chunk.t_ns[0]) + self.half_width_ns) // self.period_ns)
+            self._next = -(-(filled_ns - self._origin) // self.period_ns)
         held = chunk if self._held is None else concatenate([self._held, chunk])
         # An output is complete when its kernel's end has been reached (the weight there is zero).
         ready = (int(held.t_ns[-1]) - self.half_width_ns - self._origin) // self.period_ns + 1

@@ -127,11 +127,7 @@ def score_models(
             import matplotlib  # noqa: F401
         from tactile_rt.alignment.benchmark import load_benchmark
         from tactile_rt.alignment.loading import check_models, load_layers, load_untrained
-        from tactile_rt.alignment.results import (
-            ModelResult,
-            model_result,
-            results_of,
-        )
+        from tactile_rt.alignment.results import ModelResult, model_result, results_of
         from tactile_rt.alignment.stimuli_input import read_stimuli
 
         felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
@@ -210,12 +206,7 @@ def decode_stimuli(
     with needing("train"):
         from tactile_rt.alignment.benchmark import load_strict
         from tactile_rt.alignment.building import animal_means
-        from tactile_rt.alignment.decoding import (
-            decode,
-            decode_paper,
-            decode_rdm,
-            mean_decoded,
-        )
+        from tactile_rt.alignment.decoding import decode, decode_paper, decode_rdm, mean_decoded
         from tactile_rt.alignment.loading import check_models, load_layers
         from tactile_rt.alignment.stimuli_input import read_stimuli
 

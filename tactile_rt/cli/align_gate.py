@@ -4,7 +4,7 @@ import sys
 import traceback
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -16,10 +16,6 @@ from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Stimuli
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, TactileError
-
-if TYPE_CHECKING:
-    from tactile_rt.alignment.layers import Layers
-    from tactile_rt.alignment.stimuli_input import StimuliInput
 
 USAGE = 2  # click's exit code
 INPUT_ERROR = 3  # of the gate, whose 1 and 2 mean something else
@@ -101,7 +97,9 @@ def _gate(
         rows: list[Any] = []
         if reference is not None:
             original, _ = load_layers(reference, felt)
-            check, found = fidelity_check(original, _exported(model, felt, original, export_layers))
+            of_onnx = model.suffix == ".onnx"
+            made = export_layers(model, felt, original) if of_onnx else load_layers(model, felt)[0]
+            check, found = fidelity_check(original, made)
             checks.append(check)
             rows += found
         if frozen is not None:
@@ -118,12 +116,3 @@ def _gate(
         word = f"[{colours[check.verdict]}]{check.verdict}[/]"
         console.print(f"{check.name}: {word}: {escape(check.why)}", highlight=False)
     return code
-
-
-def _exported(model: Path, felt: "StimuliInput", original: "Layers", export: Any) -> "Layers":
-    if model.suffix == ".onnx":
-        layers: Layers = export(model, felt, original)
-        return layers
-    from tactile_rt.alignment.loading import load_layers
-
-    return load_layers(model, felt)[0]

@@ -81,8 +81,7 @@ def fit(
     from tactile_rt.core.files import write_whole
     from tactile_rt.core.stream import concatenate
 
-    source = open_url(url)
-    with source:
+    with open_url(url) as source:
         read_described(described, source.spec)  # a mistake is told before the reading
         chunks = record(source, seconds)
         fitted = fit_array(described, source.spec, concatenate(chunks))

@@ -50,8 +50,7 @@ def tare(
 
     for file in (out, json):
         check_output(file)
-    opened = open_url(source)
-    with opened:
+    with open_url(source) as opened:
         raw, before = _find_raw(opened, source)
         name = device or (before.device if before else _own_id(raw))
         path = out or calibration_path(name)
@@ -189,8 +188,7 @@ def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArrayS
 
     if not url:
         raise ConfigError(f"{table} has times: name the recording they are in with --source")
-    opened = open_url(url)
-    with opened:
+    with open_url(url) as opened:
         raw, _ = _find_raw(opened, url)
         return concatenate(record(raw, float(loads.times.max()))), raw.spec
 
@@ -253,7 +251,6 @@ def _now() -> str:
 
 
 def _show_tare(measured: "Tare", console: Console) -> None:
-    """Offsets and noise, channel by channel."""
     import numpy as np
 
     spec = measured.spec
@@ -273,7 +270,6 @@ def _show_tare(measured: "Tare", console: Console) -> None:
 
 
 def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
-    """Residuals per axis, conditions, worst lines and warnings."""
     table = Table("axis", "unit", "full scale", "residual RMS", "of full scale", "R²", box=None)
     rows = zip(fit.axes, loads.units, fit.full_scale, fit.rms, fit.r_squared, strict=True)
     for axis, unit, full, rms, explained in rows:
@@ -298,7 +294,6 @@ def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
 
 
 def _show_uncalibrated(calibration: "Calibration") -> None:
-    """Name the elements that cannot be used yet, if there are any."""
     if calibration.uncalibrated:
         typer.echo(
             f"without a matrix, and so never valid: {', '.join(calibration.uncalibrated)}", err=True

@@ -76,7 +76,6 @@ def doctor(
 
 
 def _look_at_daemon(url: str) -> list[Any]:
-    """Say what a running daemon says of itself, and what its log said last."""
     from tactile_rt.cli.top import snapshot_at
     from tactile_rt.core.errors import SourceError
     from tactile_rt.drivers.discovery import Finding
@@ -112,7 +111,6 @@ def _quote_log(name: str) -> str:
 
 
 def _look_at_simulator() -> list[Any]:
-    """Say whether the simulator is compiled, where it can be."""
     from importlib.util import find_spec
 
     from tactile_rt.drivers.discovery import Finding
@@ -194,8 +192,7 @@ def echo(source: Url, seconds: Seconds = None) -> None:
     """
     import msgspec
 
-    opened = open_url(source)
-    with opened, leaving(seconds):
+    with open_url(source) as opened, leaving(seconds):
         for chunk in opened:
             for k in range(len(chunk)):
                 line = {
@@ -214,9 +211,8 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
 
     from tactile_rt.core.stream import EndOfStream
 
-    opened = open_url(source)
     looks: list[dict[str, Any]] = []
-    with opened, leaving(None):
+    with open_url(source) as opened, leaving(None):
         spec = opened.spec
         shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
         typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz", err=json == STDOUT)

@@ -135,7 +135,6 @@ def codec_options(given: list[str]) -> dict[str, str]:
 
 
 def _watch(device: "EmulatedDevice") -> None:
-    """Show the count until it is done."""
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status("") as status:

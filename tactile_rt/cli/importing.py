@@ -138,7 +138,6 @@ def import_file(
 
 
 def _list_odd(made: "Import") -> list[str]:
-    """List what is odd about a file, a line each."""
     odd = [note for note in made.notes if not note.startswith("left out: ")]
     if made.corrupt and not any("corrupt" in note for note in odd):
         odd.append(f"{made.corrupt} corrupt {made.unit}")

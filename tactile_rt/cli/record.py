@@ -45,9 +45,8 @@ def record(
     check_is_mcap(output)
     check_new(output, force)  # before a device is opened and started
     session = _notes(note or [])
-    opened = open_url(source)
     with (
-        opened,
+        open_url(source) as opened,
         StreamWriter(output, opened, url=source, session=session, force=force) as writer,
         leaving(seconds),
     ):

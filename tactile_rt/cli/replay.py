@@ -209,7 +209,6 @@ class _Replay:
 
 
 def _in_order(files: list[Path]) -> "list[Recording]":
-    """The files of one source by time."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording.layout import DECISIONS, EVENTS, SAMPLES
 

@@ -72,8 +72,7 @@ def run(
     file = model or shipped_model()
     samples = printed = 0
     check_model(file, source)
-    opened = open_url(source)
-    with opened:
+    with open_url(source) as opened:
         try:
             classifier = Classifier(file, opened.spec, fuse_s=fuse)
         except SpecMismatch as error:

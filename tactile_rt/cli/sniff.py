@@ -93,7 +93,6 @@ class _Told:
             print_table(table)
 
     def say(self, text: str) -> None:
-        """A line."""
         self._all["said"].append(text)
         if not self._alone:
             typer.echo(text)
@@ -199,7 +198,6 @@ def _run(url: str, fit: "CodecFit", further: dict[str, str], told: _Told) -> Non
 
 
 def _usual_baud(fit: "CodecFit") -> int:
-    """The baud rate that its codec has by default."""
     from tactile_rt.drivers.opening import make_codec
 
     codec: Any = make_codec("serial", fit.codec, dict(fit.options))

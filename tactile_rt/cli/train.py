@@ -101,7 +101,6 @@ def train(
 
 
 def _in_words(at: "Progress") -> str:
-    """What came of an epoch."""
     m = at.metrics
     if "validation_top1" in m:
         found = (

@@ -323,7 +323,6 @@ class DeviceSource(Source):
     # connecting
 
     def _open(self) -> None:
-        """Open the line and start the device."""
         self._link = self._connect()
         self._connections += 1
         self._note(None, time.monotonic_ns())

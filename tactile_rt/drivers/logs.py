@@ -21,19 +21,8 @@ from typing import Any, BinaryIO, Final, cast
 from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
+from tactile_rt.drivers import log_lines
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.log_lines import (
-    TRC_COLUMNS,
-    AscLines,
-    Found,
-    TrcLines,
-    of_candump,
-    of_gvret,
-    of_heard,
-    of_hex,
-    of_slcan,
-    read_csv_line,
-)  # fmt: skip
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "Occurrences", "open_log_file", "read_log"]
 
@@ -62,9 +51,9 @@ SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
 DAY_NS: Final = 86_400 * NS_PER_S
 FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
-LINES: Final[dict[str, Callable[[str], Found]]] = {
-    "candump": of_candump, "slcan": of_slcan,
-    "terminal": of_heard, "hex": of_hex, "gvret": of_gvret, "csv": read_csv_line,
+LINES: Final[dict[str, Callable[[str], log_lines.Found]]] = {
+    "candump": log_lines.of_candump, "slcan": log_lines.of_slcan, "terminal": log_lines.of_heard,
+    "hex": log_lines.of_hex, "gvret": log_lines.of_gvret, "csv": log_lines.read_csv_line,
 }  # fmt: skip
 Read = tuple[str, Any, int | None]  # bus, packet, empty for an error frame, and time, ns
 
@@ -164,7 +153,7 @@ class LineLog:
 
     def _text(self, file: BufferedReader) -> Iterator[Read]:
         """Read lines of text, and note those that are none of its form."""
-        asc, trc = AscLines(self.names), TrcLines()
+        asc, trc = log_lines.AscLines(self.names), log_lines.TrcLines()
         parse = {"asc": asc.read, "trc": trc.read, **LINES}[self.form]
         odd, number, now = Occurrences("line"), 0, 0
         apart = self.form == "candump" and _times_are_apart(self.path)
@@ -193,10 +182,10 @@ class LineLog:
                 f"identifiers are names here ({name_some(list(asc.unknown))}), not read in "
                 f"{asc.unknown.total()} frames: {why}"
             )
-        if trc.version not in TRC_COLUMNS:
+        if trc.version not in log_lines.TRC_COLUMNS:
             self.notes.append(
                 f"version {trc.version[:20]!r} of a .trc is not read: there are "
-                f"{', '.join(TRC_COLUMNS)}"
+                f"{', '.join(log_lines.TRC_COLUMNS)}"
             )
         if asc.begun:  # in its last line, most often
             self.notes.append(f"it ends before its end: {self.frames} frames were read")
@@ -325,7 +314,7 @@ def _count_days(reads: Iterator[Read]) -> Iterator[Read]:
         yield *read[:2], now - wrong
 
 
-def _parse(parse: Callable[[str], Found], line: str) -> tuple[Found, str]:
+def _parse(parse: Callable[[str], log_lines.Found], line: str) -> tuple[log_lines.Found, str]:
     """Read a line, or say why it is none."""
     try:
         return parse(line), ""
@@ -333,13 +322,13 @@ def _parse(parse: Callable[[str], Found], line: str) -> tuple[Found, str]:
         return None, str(error)
 
 
-def _count_frames(parse: Callable[[str], Found], lines: list[str]) -> int:
+def _count_frames(parse: Callable[[str], log_lines.Found], lines: list[str]) -> int:
     return sum(x is not None and x[1] is not None for x in (_parse(parse, y)[0] for y in lines))
 
 
 def _times_are_apart(path: Path) -> bool:
     """Whether the times of candump are differences (-td): from 0 on, up and down."""
-    found = [_parse(of_candump, line)[0] for line in _lines(_head(path))]
+    found = [_parse(log_lines.of_candump, line)[0] for line in _lines(_head(path))]
     times = [one[2] for one in found if one is not None and one[2] is not None]
     if len(times) < 3 or times[0]:
         return False
@@ -360,14 +349,14 @@ def _form(path: Path) -> str:
     entries = [x for x in lines if not x.startswith(";")]
     if any(x.startswith(";$FILEVERSION") for x in lines) or (
         entries != lines
-        and _count_frames(TrcLines().read, entries) >= max(1, MOSTLY * len(entries))
+        and _count_frames(log_lines.TrcLines().read, entries) >= max(1, MOSTLY * len(entries))
     ):
         return "trc"
     if lines[0].startswith(CSV_HEADER):
         return "csv"
     if lines[0].lower().startswith(SAVVYCAN_HEADER):
         return "gvret"
-    asc = AscLines({})
+    asc = log_lines.AscLines({})
     begins = {x.split()[0].lower() for x in lines[:6]}
     if begins >= {"date", "base"} or _count_frames(asc.read, lines) + asc.unknown.total() >= most:
         return "asc"
@@ -375,7 +364,7 @@ def _form(path: Path) -> str:
         if _count_frames(LINES[form], lines) >= most:
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
-    hexes = [x for x in (_parse(of_hex, line)[0] for line in lines) if x is not None]
+    hexes = [x for x in (_parse(log_lines.of_hex, line)[0] for line in lines) if x is not None]
     data = b"".join(x[1] for x in hexes)
     letters = sum(b & 15 > 9 or b > 0x9F for b in data)
     right = len(hexes) >= most and len(data) >= 16 and letters > len(data) / 16

@@ -14,8 +14,6 @@ channel (`MatMulInteger`), and their activations are quantised before the taps a
 per map. States, norms, biases and sums stay in single precision.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Literal

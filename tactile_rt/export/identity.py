@@ -10,19 +10,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.enrolment import (
-    ENROLLED,
-    JUDGED,
-    LOG_ODDS,
-    IdentityRule,
-    log_odds,
-    project,
-)
+from tactile_rt.classifier import enrolment
+from tactile_rt.classifier.enrolment import IdentityRule
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation.measures import Floats, Names, Step, cut_windows, run_over
 
-__all__ = ["fit_gaussians", "fit_identity", "identity_thresholds"]
+__all__ = ["Doubles", "fit_gaussians", "fit_identity", "identity_thresholds"]
 
 REFUSED = 0.05  # of touches of enrolled objects
 AMONG = (1, 5, 20, 100)  # objects that are enrolled
@@ -34,7 +28,7 @@ TINY = 1e-6  # variance of embeddings of length 1
 PER_DIRECTION = 4  # objects, at least: of fewer, how they differ is not known in so many
 
 Doubles = NDArray[np.float64]
-NONE_YET = np.zeros((len(AMONG), ENROLLED, JUDGED))
+NONE_YET = np.zeros((len(AMONG), enrolment.ENROLLED, enrolment.JUDGED))
 
 
 def fit_identity(sets: Sequence[SweepSet], run: Step) -> IdentityRule | None:
@@ -66,22 +60,22 @@ def identity_thresholds(embeddings: Floats, objects: Names) -> Doubles:
         for one, that of fewer; NaN where there is none.
     """
     rng = np.random.default_rng(0)
-    table = np.full((len(AMONG), ENROLLED, JUDGED), np.nan)
+    table = np.full((len(AMONG), enrolment.ENROLLED, enrolment.JUDGED), np.nan)
     names, count = np.unique(objects, return_counts=True)
     if (count > 1).sum() < FEWEST:
         return table
     halves = [np.isin(objects, names[k::2]) for k in range(2)]
     rules = [fit_gaussians(embeddings[half], objects[half]) for half in halves]
-    for n, m in product(range(1, ENROLLED + 1), range(1, JUDGED + 1)):
+    for n, m in product(range(1, enrolment.ENROLLED + 1), range(1, enrolment.JUDGED + 1)):
         best: list[list[float]] = [[] for _ in AMONG]
         for k, rule in enumerate(rules[::-1]):
-            places = project(rule, embeddings)
+            places = enrolment.project(rule, embeddings)
             known = [np.flatnonzero(objects == name) for name in names[k::2]]
             known = [own for own in known if len(own) >= n + m]
             for _ in range(DRAWS if known else 0):
                 drawn = np.stack([places[rng.permutation(own)[: n + m]] for own in known])
                 enrolled, judged = drawn[:, :n].mean(axis=1), drawn[:, n:].mean(axis=1)
-                odds = log_odds(np.array(rule.between), enrolled, n, judged[:, None], m)
+                odds = enrolment.log_odds(np.array(rule.between), enrolled, n, judged[:, None], m)
                 order = rng.permutation(len(known))
                 for many, scores in zip(AMONG, best, strict=True):
                     groups = order[: len(order) // many * many].reshape(-1, many)
@@ -116,7 +110,7 @@ def fit_gaussians(
     most = max(1, known)
     directions = whitening @ vectors[:, ::-1][:, :most]
     return IdentityRule(
-        LOG_ODDS,
+        enrolment.LOG_ODDS,
         REFUSED,
         AMONG,
         tuple(thresholds.ravel().tolist()),

@@ -44,7 +44,6 @@ from tactile_rt.sets.splits import join_manifests, trained_objects
 __all__ = [
     "OPSET",
     "PARITY_BAR",
-    "StreamingStep",
     "export_checkpoint",
     "export_step",
     "parity",

@@ -17,7 +17,6 @@ from typing import Any
 import msgspec
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import (
     MASS_ABOVE,
@@ -32,7 +31,7 @@ from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, file_outpu
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.files import write_whole
 from tactile_rt.export.graph_forms import Precision
-from tactile_rt.export.identity import fit_identity
+from tactile_rt.export.identity import Doubles, fit_identity
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.models.checkpoints import load_checkpoint, trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
@@ -66,8 +65,6 @@ SMALLEST = 0.05  # what is usual, at least: where nearly all sweeps are right, i
 # A rule holds up to a noise, in units of the rated, and is fitted at the ends of its range.
 NOISE = {0.3: (0.0, 0.3), 1.2: (1.2,), 2.2: (2.2,)}
 REFUSED_AT = (0.0, 1.0)  # the noise at which so few are refused, each
-
-Doubles = NDArray[np.float64]
 
 
 def release(

@@ -31,10 +31,8 @@ from tactile_rt.models import published_pictures
 
 __all__ = [
     "Augmentation",
-    "Symmetry",
     "as_published",
     "build",
-    "compose",
     "image",
     "mask_steps",
     "symmetries",

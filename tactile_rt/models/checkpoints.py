@@ -5,8 +5,6 @@ What is read without torch leaves the numbers where they are, and nothing but pl
 of the pickle. torch is imported where a network is made, seconds that a refusal need not take.
 """
 
-from __future__ import annotations
-
 import pickle
 import zipfile
 from collections import OrderedDict
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
 __all__ = [
     "NETWORK",
     "begin_from",
-    "check_array",
     "describe_checkpoint",
     "fill_checkpoint",
     "load_checkpoint",
@@ -44,7 +41,7 @@ __all__ = [
 ]
 
 PICKLE = "/data.pkl"  # in the archive, in a folder of any name
-NEEDED = ("model", "network", "config", "spec", "categories", "refusals")
+NEEDED = ("model", "network", "config", "spec", "period_ns", "categories", "refusals")
 # of a network's configuration, what a training configuration says
 NETWORK = (
     "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",
@@ -194,7 +191,7 @@ def probed_on(
     return path, manifest
 
 
-def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
+def load_checkpoint(path: Path) -> "tuple[TactileClassifier, dict[str, Any]]":
     """The network of a `best.pt`, in evaluation mode on the CPU, with what it was trained on.
 
     Raises:
@@ -213,7 +210,7 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
 
 
 def begin_from(
-    model: TactileClassifier,
+    model: "TactileClassifier",
     path: Path,
     labels: Sequence[str],
     kinds: Mapping[str, Sequence[str]],
@@ -263,7 +260,7 @@ def _name_rows(
     return [*labels, *names, *range(network["identity"])]
 
 
-def untrained(saved: dict[str, Any]) -> TactileClassifier:
+def untrained(saved: dict[str, Any]) -> "TactileClassifier":
     """The network of a checkpoint as it might be before training: for the same channels."""
     from tactile_rt.models.ead import TactileClassifier
 
@@ -274,7 +271,7 @@ def untrained(saved: dict[str, Any]) -> TactileClassifier:
 
 
 def fill_checkpoint(
-    model: TactileClassifier,
+    model: "TactileClassifier",
     manifest: SweepManifest,
     refusals: Sequence[str],
     config: Mapping[str, Any],

@@ -4,8 +4,6 @@ A window is what the classifier would feed the network: it starts where `Contact
 onset on the noisy signal, and carries the baseline that the detector had measured by then.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,12 +19,7 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import MOUSE, Timing
 from tactile_rt.models.implausible import implausible
 from tactile_rt.models.onsets import Onsets, find_onsets
-from tactile_rt.sets.manifest import (
-    FAULTS,
-    OUTLIERS,
-    SweepManifest,
-    object_path,
-)
+from tactile_rt.sets.manifest import FAULTS, OUTLIERS, SweepManifest, object_path
 from tactile_rt.sets.objects import Sweeps, read_split
 from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sets.splits import join_manifests, read_manifests
@@ -41,7 +34,6 @@ __all__ = [
     "read_splits",
     "relabelled",
     "windows",
-    "with_faults",
 ]
 
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets
@@ -67,12 +59,12 @@ class SweepSet:
     joined_of: tuple[SweepManifest, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path, split: str) -> SweepSet:
+    def read(cls, folder: Path, split: str) -> "SweepSet":
         """Read a split."""
         return cls.read_known(folder, SweepManifest.read(folder), split)
 
     @classmethod
-    def read_known(cls, folder: Path, manifest: SweepManifest, split: str) -> SweepSet:
+    def read_known(cls, folder: Path, manifest: SweepManifest, split: str) -> "SweepSet":
         """Read a split of a set whose manifest is known."""
         limits = manifest.limits
         return cls(manifest, read_split(folder, manifest, split), limits.noise, limits.floor)
@@ -108,8 +100,7 @@ class SweepSet:
         none = np.zeros(len(self.sweeps), dtype=np.bool_)
         return none if self.sweeps.recorded is None else self.sweeps.recorded
 
-    def __getitem__(self, at: slice | NDArray[Any]) -> SweepSet:
-        """Some of the sweeps."""
+    def __getitem__(self, at: slice | NDArray[Any]) -> "SweepSet":
         return replace(self, sweeps=self.sweeps[at])
 
     @property

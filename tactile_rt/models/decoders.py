@@ -5,8 +5,6 @@ step's logits use no later step. It does so in two parts: `embed` gives what its
 reads, the embedding `(batch, step, unit)`, and `logits` is that layer. `step` embeds one by one.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

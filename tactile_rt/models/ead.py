@@ -18,8 +18,6 @@ uN m as they are, limited to 1000 of either (Chung et al. 2025, and its code).
 for streaming, and gives the same logits. The logits of a step use no later frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
@@ -32,28 +30,10 @@ from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream import ArraySpec, Timing
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models import attenders, decoders
-from tactile_rt.models.ead_config import (
-    ATTENDERS,
-    DECODERS,
-    ENCODERS,
-    READOUTS,
-    EADConfig,
-    encoder_class,
-)
+from tactile_rt.models.ead_config import EADConfig, encoder_class
 from tactile_rt.models.encoders.cells import Cell
 
-__all__ = [
-    "ATTENDERS",
-    "DECODERS",
-    "EAD",
-    "ENCODERS",
-    "READOUTS",
-    "EADConfig",
-    "InputStage",
-    "TactileClassifier",
-    "count_parameters",
-    "paper_units",
-]
+__all__ = ["EAD", "EADConfig", "InputStage", "TactileClassifier", "count_parameters", "paper_units"]
 
 PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
 PAPER_CLIP = 1000.0  # of these units
@@ -222,14 +202,14 @@ class EAD(nn.Module):
         self._alone = _alone(config)
         self.lag: int = self.encoder.lag
         width: int = self.encoder.features
-        self.attender: attenders.GPT | attenders.MambaAttender | attenders.NoAttender
+        self.attender: attenders.GPT | attenders.MambaStack | attenders.NoAttender
         if config.attender == "gpt":
             inputs = width
             if config.encoder == "resnet18":
                 width = round(GPT_OF_RESNET * config.width)
             self.attender = attenders.GPT(width, config.dropout, config.max_steps, inputs)
         elif config.attender == "mamba":
-            self.attender = attenders.MambaAttender(width)
+            self.attender = attenders.MambaStack(width)
         else:
             self.attender = attenders.NoAttender()
         self.feature_size = width

@@ -13,7 +13,6 @@ __all__ = [
     "ENCODERS",
     "MAX_STEPS",
     "MOUSE_FRAME",
-    "PREPROCESSINGS",
     "READOUTS",
     "EADConfig",
     "added_cells",

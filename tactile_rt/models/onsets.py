@@ -9,16 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.contact import (
-    BASELINE_SAMPLES,
-    FIRST_GUARD_SAMPLES,
-    GUARD_SAMPLES,
-    LIMIT,
-    MIN_BASELINE_SAMPLES,
-    RATES,
-    SUSPICION,
-    onset_z2,
-)
+from tactile_rt.classifier import contact
 
 __all__ = ["Onsets", "find_onsets"]
 
@@ -61,39 +52,39 @@ def _batch(
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
     n, samples, elements, _ = values.shape
     baseline = _Baseline(values, floor)
-    means = np.zeros((len(RATES), n, *values.shape[2:]), dtype=np.float32)  # in sigma
+    means = np.zeros((len(contact.RATES), n, *values.shape[2:]), dtype=np.float32)  # in sigma
     suspicious_for = np.zeros((n, elements), dtype=np.int64)
     was_above = np.zeros((n, elements), dtype=np.bool_)
     start = np.full(n, -1, dtype=np.int64)
     active = np.arange(n)
     for k in range(samples):
-        ready = baseline.count[active] >= MIN_BASELINE_SAMPLES
+        ready = baseline.count[active] >= contact.MIN_BASELINE_SAMPLES
         first = active[~ready]
         baseline.wait(first, k)
-        baseline.learn(first, np.full(len(first), FIRST_GUARD_SAMPLES))
+        baseline.learn(first, np.full(len(first), contact.FIRST_GUARD_SAMPLES))
         at = active[ready]
         if not len(at):
             continue
         z = (values[at, k] - baseline.offset[at]) / baseline.pooled[at]
         mean = means[:, at]
-        mean += RATES[:, None, None, None] * (
-            np.clip(z, -LIMIT[..., None], LIMIT[..., None]) - mean
+        mean += contact.RATES[:, None, None, None] * (
+            np.clip(z, -contact.LIMIT[..., None], contact.LIMIT[..., None]) - mean
         )
         means[:, at] = mean
-        size = np.minimum(baseline.count[at], BASELINE_SAMPLES)
+        size = np.minimum(baseline.count[at], contact.BASELINE_SAMPLES)
         z2 = np.square(mean).sum(axis=3)  # (mean, sweep, element)
-        excess = (z2 / onset_z2(size)[..., None]).max(axis=0)
+        excess = (z2 / contact.onset_z2(size)[..., None]).max(axis=0)
         above = excess > 1
         certain = above & was_above[at]
         was_above[at] = above
-        suspicious_for[at] = np.where(excess > SUSPICION, suspicious_for[at] + 1, 0)
+        suspicious_for[at] = np.where(excess > contact.SUSPICION, suspicious_for[at] + 1, 0)
         begins = certain.any(axis=1)
         start[at[begins]] = k
         since = np.where(certain, suspicious_for[at], 0).max(axis=1)[begins]
-        baseline.learn(at[begins], np.maximum(since, FIRST_GUARD_SAMPLES))
+        baseline.learn(at[begins], np.maximum(since, contact.FIRST_GUARD_SAMPLES))
         quiet = at[~above.any(axis=1)]
         baseline.wait(quiet, k)
-        baseline.learn(quiet, np.full(len(quiet), GUARD_SAMPLES))
+        baseline.learn(quiet, np.full(len(quiet), contact.GUARD_SAMPLES))
         active = active[start[active] < 0]
         if not len(active):
             break
@@ -125,18 +116,18 @@ class _Baseline:
         while len(of):
             more = self.came[of] - self.count[of] > guard
             of, guard = of[more], guard[more]
-            full = of[self.count[of] >= BASELINE_SAMPLES]
-            oldest = self._sample(full, self.count[full] - BASELINE_SAMPLES)
+            full = of[self.count[of] >= contact.BASELINE_SAMPLES]
+            oldest = self._sample(full, self.count[full] - contact.BASELINE_SAMPLES)
             self.total[full] -= oldest
             self.squares[full] -= oldest**2
             newest = self._sample(of, self.count[of])
             self.total[of] += newest
             self.squares[of] += newest**2
             self.count[of] += 1
-        of = changed[self.count[changed] >= MIN_BASELINE_SAMPLES]
+        of = changed[self.count[changed] >= contact.MIN_BASELINE_SAMPLES]
         if not len(of):
             return
-        size = np.minimum(self.count[of], BASELINE_SAMPLES)[:, None, None]
+        size = np.minimum(self.count[of], contact.BASELINE_SAMPLES)[:, None, None]
         mean = self.total[of] / size
         variance = np.maximum(self.squares[of] - size * mean**2, 0.0) / (size - 1)
         own = np.maximum(np.sqrt(variance).astype(np.float32), self.floor)

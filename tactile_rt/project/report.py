@@ -16,7 +16,6 @@ from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.pictures import draw_confusion
 from tactile_rt.models.evaluation.records import Record
-from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.project.folder import Project
 from tactile_rt.sets.manifest import SPLITS, SweepManifest, has_object
 from tactile_rt.sim_backend.datasets.inventory import tally
@@ -41,7 +40,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
     """Write ``report/report.html`` beside the pictures of `evaluate_model`, and its confusions."""
     session, card = load_model(project.model)
     test = SweepSet.read(sweeps, "test")
-    run = stepped(session, card)
+    run = measures.run_steps(session, card)
     labels, objects = test.sweeps.labels, test.sweeps.objects
     step_ms = card.period_ns * card.substeps * 1e-6
     noisy = measures.predict(test, run, 1.0)
@@ -90,7 +89,6 @@ def confused(
 
 
 def _describe_sweeps(folder: Path) -> str:
-    """Say how many sweeps are for what, and what share of them touches and saturates."""
     manifest = SweepManifest.read(folder)
     there = {s: [n for n in manifest.split[s] if has_object(folder, n)] for s in SPLITS}
     every = tally(

@@ -25,18 +25,8 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.core.files import whole_folder
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.recording import lerobot_meta as meta
 from tactile_rt.recording.conversion import about_text
-from tactile_rt.recording.lerobot_meta import (
-    DATA,
-    FRAME,
-    CameraFilm,
-    Episode,
-    Statistics,
-    describe_feature,
-    import_pyarrow,
-    write_film,
-    write_meta,
-)
 from tactile_rt.recording.reader import Recording
 
 __all__ = ["write_dataset"]
@@ -56,7 +46,7 @@ def write_dataset(
     folder: Path,
     fps: int = 30,
     task: str = "",
-    films: Sequence[CameraFilm] = (),
+    films: Sequence[meta.CameraFilm] = (),
 ) -> int:
     """Write recordings of one array as the episodes of a dataset; the number of samples.
 
@@ -71,7 +61,7 @@ def write_dataset(
             unevenly for rows.
         SpecMismatch: They are of several arrays.
     """
-    pa, pq = import_pyarrow()
+    pa, pq = meta.import_pyarrow()
     if films and len(recordings) != 1:
         raise ConfigError("films go with one recording: make a dataset of each")
     spec = recordings[0].spec
@@ -87,9 +77,9 @@ def write_dataset(
         for k, (recording, end) in enumerate(zip(recordings, ends, strict=True)):
             about = recording.description
             said = task or about.session.get("task") or spec.name
-            episode = Episode(k, len(end), first, said, tasks.setdefault(said, len(tasks)))
-            state, values = Statistics(), Statistics()
-            path = made / DATA.format(chunk_index=k // 1000, file_index=k % 1000)
+            episode = meta.Episode(k, len(end), first, said, tasks.setdefault(said, len(tasks)))
+            state, values = meta.Statistics(), meta.Statistics()
+            path = made / meta.DATA.format(chunk_index=k // 1000, file_index=k % 1000)
             path.parent.mkdir(parents=True, exist_ok=True)
             # A dictionary of values takes all kinds of NaN for one.
             with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False) as file:
@@ -102,13 +92,13 @@ def write_dataset(
             episode.statistics[STATE] = state.found()
             episode.statistics[f"{TACTILE}.values"] = values.found(repeat=width)
             for film in films:
-                episode.statistics[film.key] = write_film(film, made, len(end), fps)
+                episode.statistics[film.key] = meta.write_film(film, made, len(end), fps)
             beside = made / "meta" / "tactile_rt" / f"episode-{k:06d}.json"
             beside.parent.mkdir(parents=True, exist_ok=True)
             beside.write_text(about_text(about), "utf-8")
             episodes.append(episode)
             first += episode.rows
-        write_meta(made, fps, {**_features(spec, width), **FRAME}, episodes, tasks, films)
+        meta.write_meta(made, fps, {**_features(spec, width), **meta.FRAME}, episodes, tasks, films)
     return n
 
 
@@ -196,7 +186,7 @@ def _newest(
 
 def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
     """As ``info.json`` has them."""
-    elements, channels, feature = list(spec.elements), list(spec.channels), describe_feature
+    elements, channels, feature = list(spec.elements), list(spec.channels), meta.describe_feature
     flat = [f"{e}.{c}" for e in elements for c in channels]
     return {
         STATE: feature("float32", len(flat), names=flat),
@@ -214,7 +204,7 @@ def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
 def _schema(pa: Any, spec: ArraySpec, width: int) -> Any:
     kinds = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
     fields = []
-    for name, feature in {**_features(spec, width), **FRAME}.items():
+    for name, feature in {**_features(spec, width), **meta.FRAME}.items():
         kind = kinds[feature["dtype"]]
         for size in reversed(feature["shape"] if feature["shape"] != [1] else []):
             kind = pa.list_(kind, size)

@@ -23,18 +23,7 @@ from tactile_rt.recording.layout import WIRE
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.replay import prepare_replay
 
-__all__ = [
-    "FACTS",
-    "Checked",
-    "RecordedModel",
-    "Redecoded",
-    "check_decisions",
-    "compare_decoding",
-    "file_of_model",
-    "live_model",
-    "recorded_models",
-    "samples_given",
-]
+__all__ = ["check_decisions", "compare_decoding", "file_of_model", "live_model", "samples_given"]
 
 FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
          "prediction_set", "coverage", "names", "names_coverage",

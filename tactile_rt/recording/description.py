@@ -21,7 +21,6 @@ __all__ = [
     "Description",
     "describe",
     "seal",
-    "unseal",
     "utc_offset_ns",
 ]
 

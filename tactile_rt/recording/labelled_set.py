@@ -18,13 +18,7 @@ from tactile_rt.core.files import whole_folder
 from tactile_rt.core.packages import VERSION
 from tactile_rt.recording.labelling import LabelledTouch, LabelledTouches
 from tactile_rt.recording.touches import REST
-from tactile_rt.sets.manifest import (
-    RECORDED_VERSION,
-    RECORDINGS,
-    SPLITS,
-    UNLABELLED,
-    SweepManifest,
-)
+from tactile_rt.sets.manifest import RECORDED_VERSION, RECORDINGS, SPLITS, UNLABELLED, SweepManifest
 from tactile_rt.sets.objects import write_object
 
 __all__ = ["SHARES", "check_shares", "write_set"]

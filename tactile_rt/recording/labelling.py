@@ -193,9 +193,10 @@ def find_labelled(
                 of = [i for i in mine if i.start_s <= onset_s < i.end_s]
                 touched.update(of)
                 why = touch.flaw if of else OUTSIDE
+                begun = {i.thing for i in mine if onset_s < i.start_s <= end_s}
                 if len({i.thing for i in of}) > 1:
                     why = DISPUTED
-                elif of and not why and _runs_into(of[0], onset_s, end_s, mine):
+                elif of and not why and begun - {of[0].thing}:
                     why = MIXED
                 elif of and not why and met.setdefault(_digest(touch), one) != one:
                     why = AGAIN
@@ -265,13 +266,6 @@ class _Reasons:
 
 def _digest(touch: RecordedTouch) -> bytes:
     return hashlib.sha256(touch.values.tobytes()).digest()
-
-
-def _runs_into(
-    own: LabelledInterval, onset_s: float, end_s: float, intervals: Sequence[LabelledInterval]
-) -> bool:
-    """Whether another thing's interval begins before the window ends."""
-    return any(onset_s < i.start_s <= end_s and i.thing != own.thing for i in intervals)
 
 
 def _sums(recordings: Sequence[Path]) -> dict[Path, str]:

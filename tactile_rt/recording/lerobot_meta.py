@@ -20,7 +20,6 @@ from tactile_rt.core.packages import require_extra
 __all__ = [
     "DATA",
     "FRAME",
-    "VIDEO",
     "CameraFilm",
     "Episode",
     "Statistics",

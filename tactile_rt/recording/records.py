@@ -209,7 +209,6 @@ class _Reader:
             raise ValueError("its checksum is another")
 
     def _unpack(self, record: bytes) -> bytes:
-        """What is in a chunk."""
         _, _, size, crc, name_length = _CHUNK.unpack_from(record)
         at = _CHUNK.size + name_length
         name = record[_CHUNK.size : at]
@@ -233,7 +232,6 @@ class _Reader:
         return data
 
     def _inside(self, data: bytes) -> "Iterator[Record]":
-        """The records of a chunk."""
         at, end, unpack = 0, len(data), _FRAME.unpack_from
         while at < end:
             opcode, length = unpack(data, at)

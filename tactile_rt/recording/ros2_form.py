@@ -4,16 +4,8 @@ definition is in the file, so that whatever reads ROS 2 reads it.
     /tactile/whiskers/samples    tactile_rt_msgs/msg/Samples
 """
 
+from tactile_rt.recording import layout
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.layout import (
-    DECISIONS,
-    EVENTS,
-    HEALTH,
-    SAMPLES,
-    WIRE,
-    is_samples,
-    last_ns,
-)
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import CDR, token
 
@@ -31,16 +23,16 @@ __all__ = [
 ARRAY, WRENCH = "array", "wrench"
 # In the order in which they are numbered, by which a file is recovered whose beginning is damaged.
 CHANNELS = {
-    (SAMPLES, ""): messages.SAMPLES,
-    (WIRE, "serial"): f"{messages.OURS}/SerialPacket",
-    (WIRE, "can"): f"{messages.OURS}/CanPacket",
-    (HEALTH, ""): messages.EVENT,
-    (DECISIONS, ""): messages.DECISION,
-    (EVENTS, ""): messages.EVENT,
+    (layout.SAMPLES, ""): messages.SAMPLES,
+    (layout.WIRE, "serial"): f"{messages.OURS}/SerialPacket",
+    (layout.WIRE, "can"): f"{messages.OURS}/CanPacket",
+    (layout.HEALTH, ""): messages.EVENT,
+    (layout.DECISIONS, ""): messages.DECISION,
+    (layout.EVENTS, ""): messages.EVENT,
     (ARRAY, ""): messages.ARRAY,
 }
 PREFIX = "tactile"
-TEXTS = (HEALTH, DECISIONS, EVENTS)
+TEXTS = (layout.HEALTH, layout.DECISIONS, layout.EVENTS)
 
 
 class FileForm:
@@ -60,9 +52,9 @@ class FileForm:
 
     def encode(self, name: str, data: bytes) -> bytes:
         """A message of `layout` as it stands in the file."""
-        if name == SAMPLES:
-            return messages.stamped(data, last_ns(data) + self._offset_ns, self._spec.frame)
-        if name == DECISIONS:
+        if name == layout.SAMPLES:
+            return messages.stamped(data, layout.last_ns(data) + self._offset_ns, self._spec.frame)
+        if name == layout.DECISIONS:
             return messages.decision_message(data)
         return messages.event_message(data) if name in TEXTS else data
 
@@ -77,10 +69,12 @@ def name_channel(topic: str) -> str:
 
 def plain(name: str, data: bytes) -> bytes:
     """What was given to `FileForm.encode`."""
-    if name == SAMPLES:
+    if name == layout.SAMPLES:
         return messages.unstamped(data)
     if name in TEXTS:
-        return messages.json_of(messages.DECISION if name == DECISIONS else messages.EVENT, data)
+        return messages.json_of(
+            messages.DECISION if name == layout.DECISIONS else messages.EVENT, data
+        )
     return data
 
 
@@ -93,9 +87,9 @@ def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
     """
     if name in TEXTS:
         return data[:4] == CDR and data[-2:] == b"}\0"
-    if name == WIRE:
+    if name == layout.WIRE:
         return len(data) >= 12 and data[:4] == CDR
     try:
-        return name != SAMPLES or is_samples(messages.unstamped(data), shape)
+        return name != layout.SAMPLES or layout.is_samples(messages.unstamped(data), shape)
     except ValueError:
         return False

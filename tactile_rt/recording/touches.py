@@ -76,8 +76,6 @@ def find_touches(
 
 
 class _Cutter:
-    """Cuts a resampled stream."""
-
     def __init__(self, spec: ArraySpec, period_ns: int, floor: NDArray[np.float32]) -> None:
         self._detector = ContactDetector(spec.shape, floor)
         self._samples = Timing.of(period_ns).samples

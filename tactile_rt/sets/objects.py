@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import check_no_pointer, write_whole
-from tactile_rt.sets.manifest import (
-    CONTACTS,
-    SKIPPED,
-    SweepManifest,
-    has_object,
-    object_path,
-)
+from tactile_rt.sets.manifest import CONTACTS, SKIPPED, SweepManifest, has_object, object_path
 
 __all__ = [
     "Sweeps",

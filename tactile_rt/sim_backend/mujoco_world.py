@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import SourceError
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, link_nodes
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, link_nodes
 from tactile_rt.sim_backend.world import (
     JAMMED,
     OBJECT_BIT,
@@ -34,8 +34,6 @@ __all__ = [
     "contact_distances",
     "sweep_model",
 ]
-
-Floats = NDArray[np.float64]
 
 # Additive, so that they can be averaged over time as loads are.
 CONTACT_CHANNELS = ("touching", "normal force, N", "normal force x arc length, N m")

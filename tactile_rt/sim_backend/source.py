@@ -45,10 +45,8 @@ from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, engine_v
 
 __all__ = [
     "CHUNK_SAMPLES",
-    "PACES",
     "PacedOptions",
     "PacedSource",
-    "Pass",
     "SimOptions",
     "SimSource",
     "compile_simulator",
@@ -372,7 +370,6 @@ def compile_simulator() -> None:
 def _drawing(
     animals: tuple[WhiskerArray, ...], options: SimOptions
 ) -> Callable[[np.random.Generator], Sweep]:
-    """What draws the parameters of each sweep."""
     chosen = options.chosen
     if (recipe := _recipe_of(options)) is None:
         return partial(draw_sweep, distance_mm=usual_distance(animals), chosen=chosen)
@@ -385,7 +382,6 @@ def _drawing(
 
 
 def _recipe_of(options: SimOptions) -> SweepRecipe | None:
-    """The recipe that the options name, if any."""
     return read_recipe(options.recipe, Path(options.recipe).parent) if options.recipe else None
 
 

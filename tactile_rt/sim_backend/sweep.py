@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, rotation
 
 __all__ = [
     "EARTH",
-    "NOTHING",
     "Sweep",
     "centrelines",
     "draw_sweep",
     "faces_right",
-    "lateral_reach",
     "usual_distance",
     "usual_size",
     "way_to_contact",
@@ -39,7 +37,6 @@ PASSED_BY_MM = 0.5  # a miss by less is simulated
 SIDES = 500  # from which a piece of more corners is looked at
 
 EARTH = 9.80665  # m/s^2
-Floats = NDArray[np.float64]
 NOTHING: Mapping[str, float] = MappingProxyType({})
 LIMITS = {
     "size_mm": (1e-3, 1e4),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, link_nodes
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, link_nodes
 from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sweep import (
@@ -35,7 +35,6 @@ DRAWS = 20  # tries to draw parameters with which an object meets the array at a
 SHAKEN_IN_MS = 50.0  # in which shaking grows to its whole
 WEDGED_MM, WEDGED_MS = 0.02, 25  # deeper and longer a whisker overlaps only without room
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
-Floats = NDArray[np.float64]
 
 
 def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:

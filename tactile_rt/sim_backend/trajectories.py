@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import convert, read_csv
-from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
 
 __all__ = ["ANGLES", "Trajectory", "Whisk", "base_angles", "coupled", "mirror", "read_trajectory"]
 
@@ -26,8 +25,6 @@ TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)
 ANGLES = ("theta", "phi", "zeta")
 COLUMN = re.compile(r"(theta|phi|zeta)_deg(?:_(.+))?")
 LARGEST_DEG = 120.0  # beyond it is an absolute angle or another unit, not a whisk
-
-Floats = NDArray[np.float64]
 
 
 class Trajectory(Protocol):

@@ -68,9 +68,7 @@ class WhiskSimulation:
         world = empty_world(profile)
         add_whiskers(world, whiskers, profile, mount)
         clamped = world.compile()
-        set_damping(
-            clamped, whiskers
-        )  # by the resonance of the whisker on a base that stands still
+        set_damping(clamped, whiskers)  # by the resonance of a whisker whose base stands still
         for whisker in whiskers:
             _add_base_joints(world, whisker)
         _add_object(world, pieces)

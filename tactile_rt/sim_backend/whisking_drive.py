@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
 from tactile_rt.sim_backend.trajectories import coupled
 
 __all__ = ["FASTEST_HZ", "LAG_S", "LARGEST_RAD", "MOST", "STEEPEST", "Drive", "Whisking"]
@@ -31,8 +30,6 @@ STEEPEST: Final = 1e4  # rad/s^2 of a steady whisk: 23 degrees at 25 Hz
 # a w^2 <= 1.37e4 on the chords of what may be commanded, 2 a' w <= 2 (L / lag) W,
 # a w' <= L W / lag, and o'' + a'' <= 4 L / lag^2.
 MOST: Final = 3.2e4
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -36,6 +36,7 @@ from tactile_rt.core.stream import (
     Chunk,
     EndOfStream,
     Source,
+    quaternion_product,
     rotation_matrices,
 )
 from tactile_rt.drivers.opening import Prepared
@@ -139,7 +140,7 @@ def combine_specs(
         if abs(np.linalg.norm(turn) - 1) > 1e-6:
             raise ConfigError(f"{part.name}: orientation {part.orientation} is no unit quaternion")
         positions += [tuple(rotation_matrices(turn) @ p + part.position) for p in spec.positions]
-        orientations += [tuple(_product(turn, q)) for q in spec.orientations]
+        orientations += [tuple(quaternion_product(turn, q)) for q in spec.orientations]
     return replace(
         specs[0],
         name=name,
@@ -277,9 +278,3 @@ class CombinedSource(Source):
         points = np.arange(self._next, ready + 1, dtype=np.int64)
         self._next = ready + 1
         return Chunk(points - self._first, points * self._period_ns, values, valid)
-
-
-def _product(a: NDArray[Any], b: tuple[float, ...]) -> NDArray[Any]:
-    """Hamilton product of two quaternions (w, x, y, z)."""
-    w, x, y, z = a
-    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b

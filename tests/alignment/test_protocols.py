@@ -106,7 +106,7 @@ def test_a_score_is_the_mean_over_halves_of_units_chosen_on_the_other():
     """The whole protocol as a plain loop over divisions and directions."""
     rng = np.random.default_rng(6)
     shared = geometry(rng)
-    animal = brain_of(rng, shared)
+    animal = animals(rng, 1, shared=shared, noise=6, trials=9)[0]
     (target,) = freeze_strict([animal], 30).targets
     model = responses(rng, shared, 50)
     made = [
@@ -136,10 +136,6 @@ def test_a_score_is_the_mean_over_halves_of_units_chosen_on_the_other():
     found = np.corrcoef(upper(model), target.chosen.rdm)[0, 1] * target.chosen.factor
     assert found == pytest.approx(expected, abs=1e-10)
     assert target.chosen.reliability == pytest.approx(2 * r / (1 + r), abs=1e-10)
-
-
-def brain_of(rng, shared):
-    return animals(rng, 1, shared=shared, noise=6, trials=9)[0]
 
 
 @settings(max_examples=15, deadline=None)

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.decision_rules import Lanes
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError
@@ -130,15 +130,11 @@ def test_the_shipped_model_slides_as_it_decides_episodes() -> None:
 # Episodes that end early
 
 
-def by_largest(d: Classification) -> float:
-    return float(d.probabilities.max())
-
-
 def test_a_decision_that_is_sure_ends_the_episode(model: Path) -> None:
     touches = [(QUIET, QUIET + 40, 0.1), (300, 340, 0.1)]
     values = signal(touches, 400)
     whole = push_all(Classifier(model, SAME_RATE), stream(values))
-    rising = [by_largest(d) for d in whole[:STEPS]]
+    rising = [float(d.probabilities.max()) for d in whole[:STEPS]]
     assert rising == sorted(rising)
     for step, in_a_row in ((1, 1), (2, 1), (3, 1), (4, 1), (2, 2), (3, 2), (4, 2), (3, 3)):
         sure = rising[step - in_a_row]

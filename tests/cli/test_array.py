@@ -52,13 +52,10 @@ def test_every_array_that_has_a_name_is_listed(call) -> None:
     assert rows["hx711_whisker"] == ("9", "bridge0, bridge1", "V", "80", "codec=hx711_whisker")
 
 
-def page_commands() -> list[list[str]]:
-    (block,) = re.findall(r"```console\n(.*?)```", PAGE.read_text("utf-8"), re.S)
-    return [shlex.split(line)[1:] for line in re.findall(r"^\$ (.*array fit.*)", block, re.M)]
-
-
 def test_the_page_s_commands_measure_and_then_write(project: Project, call) -> None:
-    look, change = page_commands()
+    (block,) = re.findall(r"```console\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+    lines = re.findall(r"^\$ (.*array fit.*)", block, re.M)
+    look, change = (shlex.split(line)[1:] for line in lines)
     before = project.array.read_text()
     code, out, err = call(*look)
     assert (code, err) == (0, "")

@@ -5,12 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.calibration import (
-    CalibratedSource,
-    Calibration,
-    load_calibration,
-    save_calibration,
-)
+from tactile_rt.calibration import CalibratedSource, Calibration, load_calibration, save_calibration
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sources import opening as sources
 from tactile_rt.testing import ArraySource, cut, small_spec

@@ -66,7 +66,7 @@ def test_an_option_takes_the_same_in_every_command():
     kinds = defaultdict(set)
     for command in commands().values():
         for name, option in options_of(command).items():
-            kinds[name].add(_kind(option))
+            kinds[name].add(option.type.name.removesuffix(" range"))
     assert {name for name, found in kinds.items() if len(found) > 1} <= OF_TWO_KINDS.keys()
 
 
@@ -75,11 +75,6 @@ def test_options_have_few_names():
     names = {n for command in every for n in options_of(command)}
     negated = {n for command in every for p in command.params for n in p.secondary_opts}
     assert len(names | negated) <= MOST_NAMES
-
-
-def _kind(option):
-    """What one value of an option is."""
-    return option.type.name.removesuffix(" range")
 
 
 def test_every_option_and_argument_says_what_it_is():
@@ -135,13 +130,9 @@ def test_no_word_of_a_table_is_lost_in_a_pipe_or_at_forty_columns(
     assert "…" not in shown
     lines = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown)
     seen = "".join(lines.split())
-    for word in _words(piped):
-        assert word in seen, word
-
-
-def _words(text):
-    """Words without rules and what changes from call to call."""
-    return [w for w in re.sub(r"[\d.]+|[━─│┃┏┓┗┛┡┩└┘├┤┼┴┬┳╇]+", " ", text).split() if len(w) > 1]
+    # Without rules and what changes from call to call.
+    for word in re.sub(r"[\d.]+|[━─│┃┏┓┗┛┡┩└┘├┤┼┴┬┳╇]+", " ", piped).split():
+        assert len(word) == 1 or word in seen, word
 
 
 def _ready(words, monkeypatch):

@@ -187,7 +187,7 @@ def tiny_model(torch, tmp_path, sweep_set):
     from tactile_rt.classifier.model_file import METADATA_KEY
     from tactile_rt.core.stream.sensor_spec import channel_limits
     from tactile_rt.export.onnx_step import export_checkpoint
-    from tactile_rt.models.checkpoints import load_checkpoint
+    from tactile_rt.models.checkpoints import fill_checkpoint, load_checkpoint
     from tactile_rt.models.ead import EADConfig, TactileClassifier
     from tactile_rt.models.training.config import TrainingConfig
     from tactile_rt.sets.manifest import SweepManifest
@@ -195,15 +195,9 @@ def tiny_model(torch, tmp_path, sweep_set):
     manifest = SweepManifest.read(sweep_set)
     spec = manifest.spec
     network = EADConfig(classes=12, encoder="gru", attender="none", width=1 / 16)  # soon traced
-    saved = {
-        "model": TactileClassifier(spec, network, channel_limits(spec)).state_dict(),
-        "network": msgspec.to_builtins(network),
-        "config": msgspec.to_builtins(TrainingConfig(str(sweep_set))),
-        "spec": spec.to_json(),
-        "categories": list(manifest.categories),
-        "refusals": [],
-    }
-    torch.save(saved, tmp_path / "best.pt")
+    model = TactileClassifier(spec, network, channel_limits(spec))
+    config = msgspec.to_builtins(TrainingConfig(str(sweep_set)))
+    torch.save(fill_checkpoint(model, manifest, (), config, {}, {}), tmp_path / "best.pt")
     path = tmp_path / "tiny.onnx"
     trained = load_checkpoint(tmp_path / "best.pt")
     card = export_checkpoint(tmp_path / "best.pt", trained, [manifest], path, "tiny")

@@ -35,17 +35,14 @@ def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text("utf-8"), re.S)
 
 
-def place_of(folder):
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
     """A folder with the tutorial's recording, its labels, and a simulated set of the array."""
+    folder = tmp_path_factory.mktemp("label")
     record_touches(folder / "night.mcap", ["mug"] * 12 + ["cup"] * 12)
     (folder / "labels.csv").write_text("".join(blocks("csv")))
     write_tiny_set(folder / "data" / "robot", spec=ARRAY, categories=("mug", "bowl"))
     return folder
-
-
-@pytest.fixture(scope="module")
-def here(tmp_path_factory):
-    return place_of(tmp_path_factory.mktemp("label"))
 
 
 @pytest.fixture(scope="module")

@@ -40,10 +40,6 @@ def here(monkeypatch):
     )
 
 
-def made(folder):
-    return recipe_of_set(SweepManifest.read(folder).recipe)
-
-
 def test_a_set_is_made_gone_on_with_described_and_checked(call, refused, recipe, tmp_path):
     folder = tmp_path / "set"
     options = ("--seed", 3, "--set", "sweeps.draws=1", "--processes", 1)
@@ -51,7 +47,8 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, refused, recipe,
     assert (code, out) == (0, "")
     assert "1 sweeps at profile realtime" in err
     assert sorted(p.stem for p in folder.glob("*.npz")) == ["mug-2"]
-    assert (made(folder).name, made(folder).seed, len(made(folder).sweeps)) == ("tiny", 3, 1)
+    made = recipe_of_set(SweepManifest.read(folder).recipe)
+    assert (made.name, made.seed, len(made.sweeps)) == ("tiny", 3, 1)
 
     code, _, err = call("sweep", folder, "--processes", 1)  # goes on as it was begun
     assert code == 0

@@ -40,10 +40,6 @@ def arguments_of(command):
     return [p for p in command.params if p.param_type_name == "argument"]
 
 
-def kind_of(parameter):
-    return {"int": int, "float": float}.get(parameter.type.name.removesuffix(" range"), str)
-
-
 def bounds_of(parameter):
     """(least, most) that an option takes; None where it has no bound."""
     return getattr(parameter.type, "min", None), getattr(parameter.type, "max", None)
@@ -67,12 +63,12 @@ def wrong_calls():
         for option, parameter in options_of(command).items():
             if option in ("--help", "--version"):
                 continue
-            kind = kind_of(parameter)
+            kind = parameter.type.name.removesuffix(" range")
             if parameter.is_flag:
                 yield name, [*needed, f"{option}=perhaps"], "flag"
                 continue
             yield name, [*needed, option], "value"
-            if kind in (int, float):
+            if kind in ("int", "float"):
                 yield name, [*needed, option, "many"], "number"
                 yield name, [*needed, option, "1_0x"], "number"
                 least, most = bounds_of(parameter)
@@ -80,7 +76,7 @@ def wrong_calls():
                     yield name, [*needed, option, str(least - 1)], "too small"
                 if most is not None:
                     yield name, [*needed, option, str(2 * most + 1)], "too large"
-                if kind is int:
+                if kind == "int":
                     yield name, [*needed, option, "1.5"], "number"
                     yield name, [*needed, option, "nan"], "number"
             if option == "--set":

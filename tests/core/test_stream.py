@@ -67,11 +67,9 @@ def with_item(items: tuple, at: int, item: object) -> tuple:
     [
         ({"name": "other"}, "name is 'other', not 'small'"),
         ({"rate_hz": 500.0}, "rate_hz is 500.0, not 1000.0"),
-        ({"frame": "base"}, "frame is 'base', not 'mount'"),
         ({"elements": with_item(SPEC.elements, 2, "B2")}, "elements[2] is 'B2', not 'A2'"),
         ({"grid": with_item(SPEC.grid, 1, (4, 1))}, "grid[1] is (4, 1), not (0, 1)"),
         ({"channels": ("fy", "fx")}, "channels[1] is 'fx', not 'mz'"),
-        ({"units": ("mN", "N m")}, "units[0] is 'mN', not 'N'"),
         (
             {"positions": with_item(SPEC.positions, 1, (0.0, 0.003, 0.0))},
             "positions[1] is (0.0, 0.003, 0.0), not (0.0, 0.002, 0.0)",
@@ -122,7 +120,6 @@ def test_a_pose_may_be_off_by_less_than_anyone_can_measure() -> None:
         ({"grid": ((0, 0), (0, 1), (0, 0))}, "grid repeat"),
         ({"grid": ((0, 0), (0, 1), (-1, 0))}, "counted from 0"),
         ({"rate_hz": 0.0}, "rate_hz must be positive, not 0.0"),
-        ({"rate_hz": -1.0}, "rate_hz must be positive"),
         ({"rate_hz": float("nan")}, "rate_hz must be positive"),
         ({"rate_hz": float("inf")}, "rate_hz must be positive"),
         # JSON has no infinity: such a spec could be written and never be read again
@@ -145,7 +142,6 @@ def edited(**fields: object) -> str:
         ("", "not an array spec"),
         ("{", "not an array spec"),
         ("[]", "not an array spec"),
-        ("null", "not an array spec"),
         ("{}", "version None; this release reads 1"),
         (edited(version=2), "version 2; this release reads 1"),
         (edited(version="1"), "version '1'; this release reads 1"),

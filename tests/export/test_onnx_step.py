@@ -28,7 +28,7 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ModelError
 from tactile_rt.core.stream import MOUSE, ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR, channel_limits
-from tactile_rt.export import onnx_step, streaming, streaming_parts
+from tactile_rt.export import onnx_step, streaming
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
@@ -38,7 +38,7 @@ from tactile_rt.export.onnx_step import (
     write_model,
 )
 from tactile_rt.models.attenders import gpt
-from tactile_rt.models.checkpoints import load_checkpoint
+from tactile_rt.models.checkpoints import fill_checkpoint, load_checkpoint
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig, TactileClassifier
 from tactile_rt.models.onsets import find_onsets
@@ -88,14 +88,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     manifest.write(folder / "set")
     model = build()
     checkpoint = folder / "best.pt"
-    saved = {
-        "model": model.state_dict(),
-        "config": {"data": str(folder / "set"), "epochs": 0},
-        "network": msgspec.to_builtins(NETWORK),
-        "spec": SPEC.to_json(),
-        "categories": list(CATEGORIES),
-        "refusals": [],
-    }
+    config = {"data": str(folder / "set"), "epochs": 0}
+    saved = fill_checkpoint(model, manifest, (), config, {}, {})
     torch.save(saved, checkpoint)
     programs = []
     export = torch.onnx.export
@@ -187,7 +181,7 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(streaming, "LARGE", 0)
-    monkeypatch.setattr(streaming_parts, "WIDE", 0)
+    monkeypatch.setattr(streaming, "WIDE", 0)
     path = tmp_path / "wide.onnx"
     export_step(exported.model, exported.card, path)
     wide, narrow = (

@@ -11,9 +11,7 @@ import torch
 
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.export import streaming as streaming_module
-from tactile_rt.export import streaming_parts
-from tactile_rt.export.streaming import streaming
-from tactile_rt.export.streaming_parts import Pointwise
+from tactile_rt.export.streaming import Pointwise, streaming
 from tests.helpers.small_networks import TOLERANCE, build, frames, stream
 
 STEPS = 22
@@ -59,7 +57,7 @@ def test_steps_give_the_window_s_logits(encoder: str, attender: str, decoder: st
 def as_if_wide(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small networks take the forms of wide ones."""
     monkeypatch.setattr(streaming_module, "LARGE", 0)
-    monkeypatch.setattr(streaming_parts, "WIDE", 0)
+    monkeypatch.setattr(streaming_module, "WIDE", 0)
 
 
 @pytest.mark.usefixtures("as_if_wide")

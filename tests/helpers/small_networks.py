@@ -1,7 +1,5 @@
 """Small EAD networks and windows for them, shared by the tests of networks."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -11,7 +11,8 @@ import torch
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Timing
 from tactile_rt.core.stream.sensor_spec import channel_limits
-from tactile_rt.models.ead import EAD, ENCODERS, EADConfig, TactileClassifier
+from tactile_rt.models.ead import EAD, TactileClassifier
+from tactile_rt.models.ead_config import ENCODERS, EADConfig
 from tests.helpers.small_networks import TOLERANCE, build, stream
 from tests.helpers.tiny_sweeps import plate
 

@@ -1,7 +1,5 @@
 """Training windows: the detector's onsets, noise of three kinds, and nothing lost on the way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

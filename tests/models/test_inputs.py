@@ -1,7 +1,5 @@
 """The input stage against the same arithmetic in plain numpy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -8,7 +8,8 @@ import torch
 
 from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig, TactileClassifier
+from tactile_rt.models.ead import TactileClassifier
+from tactile_rt.models.ead_config import ATTENDERS, ENCODERS, EADConfig
 from tactile_rt.models.training.objectives import (
     Autoencoder,
     Predictive,

@@ -114,8 +114,6 @@ def test_overrides_come_last():
             "[train]\nlerning_rate = 1.0",
             "train has no key 'lerning_rate'; did you mean learning_rate?",
         ),
-        ("[tarin]\nbatch = 3", "the file has no key 'tarin'; did you mean train?"),
-        ("[train]\nbatch = 'many'", ":2: train.batch: expected a whole number, got 'many'"),
         ("[search]\noptimizer = ['sgd', 'sdg']", "optimizer is 'sdg', not one of"),
         ("[train]\nencoder = 'foo'", ":1: encoder is 'foo', not one of"),
         (
@@ -123,8 +121,6 @@ def test_overrides_come_last():
             ":3: train: learning_rate must be positive",
         ),
         ("[train]\ndata = 'set'", "train has no key 'data'"),
-        ("[search]\nbatch = 3", "search.batch: expected a list, got 3"),
-        ("train = ]", ":1: not TOML"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_file_and_key(tmp_path, text, said):

@@ -27,16 +27,13 @@ TOPICS = ("samples", "decisions", "events", "health")
 DOCS = Path(__file__).parents[2] / "docs"
 
 
-def described():
-    return Description(
-            SPEC, 1_700_000_000_123_456_789, "serial:x", codec="native", clock="device",
-            calibration=replace(Calibration.of("it", SPEC), gain=(2.0, 1.5)),
-            session={"who": "Ada\n\u2028", "daemon_source": "left"},
-    )  # fmt: skip
-
-
 def write(path, chunks):
-    return write_as_daemon(path, described(), chunks)
+    about = Description(
+        SPEC, 1_700_000_000_123_456_789, "serial:x", codec="native", clock="device",
+        calibration=replace(Calibration.of("it", SPEC), gain=(2.0, 1.5)),
+        session={"who": "Ada\n\u2028", "daemon_source": "left"},
+    )  # fmt: skip
+    return write_as_daemon(path, about, chunks)
 
 
 @pytest.fixture

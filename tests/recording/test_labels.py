@@ -86,7 +86,6 @@ def test_recordings_that_are_not_asked_for_are_kept_apart(night, tmp_path):
         ("", "labels.csv: is empty"),
         ("recording,start_s,end,label\n", "labels.csv:1: no column 'end'; did you mean end_s"),
         ("recording,start_s,end_s\n", "labels.csv:1: no column label; add it"),
-        (HEADER + "night.mcap,x,2,mug,\n", "labels.csv:2: start_s: expected a number, got 'x'"),
         (HEADER + "night.mcap,-1,2,mug,\n", "labels.csv:2: start_s: must be 0 or more, not -1"),
         (HEADER + "\nnight.mcap,3,2,mug,\n", "labels.csv:3: end_s: must be after start_s, 3 s"),
         (HEADER + "night.mcap,1,2,,\n", "labels.csv:2: label: is empty; name what"),
@@ -95,9 +94,7 @@ def test_recordings_that_are_not_asked_for_are_kept_apart(night, tmp_path):
         (HEADER + f"night.mcap,1,2,mug,{'漢' * 41}\n", "object: .* too long: 123 bytes, 120 at"),
         (HEADER + "nigth.mcap,1,2,mug,\n", "2: recording: no file 'nigth.mcap' .* mean night.mcap"),
         (HEADER + "a\0b.mcap,1,2,mug,\n", r"2: recording: 'a\\x00b.mcap' is no file's name"),
-        (HEADER + "night.mcap,1,2,mug\n", "labels.csv:2: 4 values for 5 columns"),
         (HEADER + f"{'n' * 200_000},1,2,mug,\n", "labels.csv:2: field larger than field limit"),
-        ("recording;start_s;end_s;label\n", "labels.csv:1: columns are separated by semicolons"),
     ],
 )
 def test_a_mistake_is_one_line_with_place_and_column(night, text, said):

@@ -8,12 +8,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.recording.layout import (
-    decode_packet,
-    decode_samples,
-    encode_packet,
-    encode_samples,
-)
+from tactile_rt.recording.layout import decode_packet, decode_samples, encode_packet, encode_samples
 from tactile_rt.testing import cut
 from tests.helpers.recordings import noise, parts
 

@@ -11,6 +11,8 @@ from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import cut
+from tests.helpers.hostile_files import MCAPS
+from tests.helpers.measured import measured
 from tests.helpers.recordings import SPEC, all_parts, noise, odd_chunks, write
 
 
@@ -44,10 +46,6 @@ def foreign(path, **metadata):
         other.finish()
 
 
-def older(path):
-    foreign(path, tactile_rt={"version": "2"})
-
-
 @pytest.mark.parametrize(
     ("make", "kind", "said"),
     [
@@ -56,7 +54,11 @@ def older(path):
         (lambda p: p.write_bytes(b""), RecordingError, "not an MCAP file"),
         (lambda p: p.write_text("seq,t_ns\n"), RecordingError, "not an MCAP file"),
         (foreign, RecordingError, "no recording of tactile-rt"),
-        (older, RecordingError, "of version '2'; this release reads 3"),
+        (
+            lambda path: foreign(path, tactile_rt={"version": "2"}),
+            RecordingError,
+            "of version '2'; this release reads 3",
+        ),
     ],
     ids=["missing", "folder", "empty", "text", "another's mcap", "older"],
 )
@@ -89,3 +91,25 @@ def test_a_recording_is_read_as_often_as_one_likes(path):
         file.write(bytes(50))
     with pytest.raises(RecordingError, match=r"run\.mcap is damaged"):
         list(recording)
+
+
+@pytest.mark.parametrize("name", MCAPS)
+def test_a_hostile_recording_is_refused(name, tmp_path):
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(MCAPS[name]())
+    for command in (("recover", path), ("replay", path, "--speed", "max")):
+        measured(*command).assert_refused("hostile.mcap")
+    assert list(tmp_path.iterdir()) == [path]
+    with pytest.raises(RecordingError) as caught:  # as a robot's own program reads it
+        list(Recording(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("convert", "hostile.mcap", "out.npz"), ("label", "hostile.mcap", "set", "--by-name")],
+)
+def test_every_command_that_reads_recordings_refuses_it(command, cwd):
+    (cwd / "hostile.mcap").write_bytes(MCAPS["zstd of 1 GiB"]())
+    measured(*command).assert_refused("hostile.mcap")
+    assert [p.name for p in cwd.iterdir()] == ["hostile.mcap"]

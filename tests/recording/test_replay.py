@@ -100,13 +100,6 @@ def test_options_of_a_codec_are_recorded_and_may_be_replaced(path, tmp_path):
         replayed(path, "from=wire&speed=0&codec=native")
 
 
-def touches(n=800):
-    """Rest, then a touch, on a small array at 1 kHz."""
-    values = noise(n, seed=3) * 1e-5
-    values[300:700] += 0.5
-    return values
-
-
 def decisions_of(url, model):
     from tactile_rt.classifier.classifier import Classifier
 
@@ -127,8 +120,10 @@ def decisions_of(url, model):
 def test_every_speed_gives_the_same_chunks_and_decisions(channel, path, tmp_path):
     tiny_model = pytest.importorskip("tests.helpers.tiny_model")
     model = tiny_model.write_model(tmp_path / "tiny.onnx")
+    values = noise(800, seed=3) * 1e-5  # at 1 kHz
+    values[300:700] += 0.5
     for _ in range(5):  # a busy machine may open the line when the touch is under way
-        fake = FakeSerial(touches(), spec=SPEC)
+        fake = FakeSerial(values, spec=SPEC)
         recorded, _ = record_device(fake, path, 800, force=True)
         first = decisions_of(f"replay:{path}?from={channel}&speed=0", model)
         assert first[0] == all_parts(recorded)

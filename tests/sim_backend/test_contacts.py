@@ -18,7 +18,7 @@ from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_object, read_sweeps
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
-from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sim_backend.datasets.recipes import ObjectChoice, Range, SweepChoice, SweepRecipe
 from tactile_rt.sim_backend.mujoco_world import ContactProbe, contact_distances
 from tactile_rt.sim_backend.objects.catalogue import make_object
@@ -108,7 +108,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_set_with_contacts_holds_the_loads_of_one_without(made: Path) -> None:
     sweeps, manifest = read_sweeps(made, "train"), SweepManifest.read(made)
     assert manifest.recipe["contacts"] is True
-    assert recipe_from_dict(manifest.recipe) == RECIPE
+    assert recipe_of_set(manifest.recipe) == RECIPE
     contacts = sweeps.contacts
     assert contacts.shape == sweeps.values.shape[:3] and contacts.dtype == np.float32
     for index in range(2):

@@ -234,12 +234,6 @@ def test_a_scale_fits_the_forces_but_not_a_rare_snap():
 # ---- the map and the whole picture
 
 
-def arrow_in(force_map, element):
-    """(2,) where the arrow of an element points, rightward and upward, as drawn."""
-    tail, tip = np.array(force_map._cells[element][1]._posA_posB)
-    return (tip - tail) / np.linalg.norm(tip - tail) * (1, -1)  # rows are counted downward
-
-
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("name", ["mouse", "mouse-left", "rat"])
 @pytest.mark.parametrize(
@@ -256,7 +250,9 @@ def test_the_map_points_where_the_force_goes_on_the_head(name, mirrored, head_fo
     force_map.show(loads, np.linalg.norm(loads[:, :3], axis=1))
     wanted = np.array(points) * (-1 if mirrored else 1, 1) / np.linalg.norm(points)
     for i in (0, len(spec.elements) // 2, -1):
-        np.testing.assert_allclose(arrow_in(force_map, i), wanted, atol=0.05)
+        tail, tip = np.array(force_map._cells[i][1]._posA_posB)
+        drawn = (tip - tail) / np.linalg.norm(tip - tail) * (1, -1)  # rows are counted downward
+        np.testing.assert_allclose(drawn, wanted, atol=0.05)
 
 
 def test_only_touched_cells_change(footage):

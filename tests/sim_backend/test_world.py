@@ -55,13 +55,6 @@ def build(
     return model, data, resonances
 
 
-def run(model: mujoco.MjModel, data: mujoco.MjData, ms: float) -> None:
-    """Step for a time, then bring poses and sensors up to the state reached."""
-    for _ in range(round(ms / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-    mujoco.mj_forward(model, data)
-
-
 def test_the_step_itself_over_damps_only_the_short_whiskers() -> None:
     for profile, most in (("realtime", 18), ("dataset", 11), ("accurate", 4)):
         model, _, resonances = build(PROFILES[profile], *mouse_whiskers())
@@ -94,7 +87,9 @@ def test_base_loads_are_what_was_applied(profile: str, axis: int) -> None:
         force *= 100 * whisker.length / compliance(whisker, 1)  # mN
         data.xfrc_applied[last, :3] = head @ turn @ force
         pushed.append((whisker, head @ turn, last, force))
-    run(model, data, 60e3 / min(resonances.values()))
+    for _ in range(round(60e3 / min(resonances.values()) / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)  # poses and sensors of the state reached
     loads = read_base_loads(data.sensordata)
     assert loads.shape == (3, 6)
     for (whisker, frame, last, force), load in zip(pushed, loads, strict=True):

@@ -2,11 +2,14 @@ from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import install_extra
+from tactile_rt.core.stream import concatenate
 from tactile_rt.sources.opening import open_source
+from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
 from tactile_rt.testing import ArraySource, small_spec
 from tests.helpers.refusals import refusal
 
@@ -145,3 +148,11 @@ class TestSimulation:
     )
     def test_what_it_cannot_do_is_named(self, url: str, said: str) -> None:
         assert said in refusal(open_source, url)
+
+
+def test_one_at_rest_only_has_noise() -> None:
+    made = SyntheticSource("35x6", SyntheticOptions(seconds=6.0, pace="fast", touches=False))
+    values = concatenate(list(made)).values
+    touched = SyntheticSource("35x6", SyntheticOptions(seconds=6.0, pace="fast"))
+    assert np.abs(values).max() < 0.05 * np.abs(concatenate(list(touched)).values).max()
+    assert values.std(axis=0).min() > 0

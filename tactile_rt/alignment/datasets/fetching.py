@@ -17,17 +17,8 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 from urllib.request import getproxies
 
+from tactile_rt.alignment import nwb_parts as parts
 from tactile_rt.alignment.nwb import read_nwb
-from tactile_rt.alignment.nwb_parts import (
-    COLUMNS,
-    CONTACTS,
-    EXPERIMENT,
-    LARGEST,
-    SUBJECT,
-    TRIALS,
-    WHISKER,
-    last_time,
-)
 from tactile_rt.core.errors import ConfigError, describe_error
 from tactile_rt.core.files import write_whole
 
@@ -240,8 +231,8 @@ def _needed(remote: RangeFile, published: PublishedFile) -> tuple[bytes, int]:
 
 def _columns(file: Any) -> Iterator[str]:
     """Datasets that `nwb` reads, those that are there."""
-    yield from (name for name in (SUBJECT, EXPERIMENT) if name in file)
-    for table, columns in ((TRIALS, COLUMNS), ("units", UNITS)):
+    yield from (name for name in (parts.SUBJECT, parts.EXPERIMENT) if name in file)
+    for table, columns in ((parts.TRIALS, parts.COLUMNS), ("units", UNITS)):
         yield from (f"{table}/{c}" for c in columns if table in file and c in file[table])
     yield from (
         f"acquisition/{name}/starting_time"
@@ -252,7 +243,7 @@ def _columns(file: Any) -> Iterator[str]:
         yield from (
             f"{table.name[1:]}/start_time"
             for name, table in module.items()
-            if name.startswith(CONTACTS) and "start_time" in table
+            if name.startswith(parts.CONTACTS) and "start_time" in table
         )
 
 
@@ -260,14 +251,14 @@ def _clocks(file: Any) -> Iterator[tuple[str, float]]:
     """Clocks of whiskers, millions of times, and the last time, which alone counts."""
     for module in file.get("processing", {}).values():
         for name, group in module.items():
-            end = last_time(group) if name.startswith(WHISKER) else None
+            end = parts.last_time(group) if name.startswith(parts.WHISKER) else None
             if end is not None:
                 yield f"{group.name[1:]}/angle/timestamps", end
 
 
 def _copy(source: Any, target: Any, name: str) -> None:
     data, (place, _, leaf) = source[name], name.rpartition("/")
-    if data.size * max(data.dtype.itemsize, 1) > LARGEST:
+    if data.size * max(data.dtype.itemsize, 1) > parts.LARGEST:
         raise ConfigError(f"{name} has {data.size} values, more than a session can have")
     group = target.require_group(place)
     source.copy(data, group, leaf)

@@ -15,17 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tactile_rt.alignment.neural import Animal
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import added, added_names
 from tactile_rt.core.settings import no_such
 
 __all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "metric_names"]
-
-Floats = NDArray[np.float64]
 
 ENTRY_POINTS = "tactile_rt.alignment_metrics"  # of other packages
 # Of a correlation: with a lower one the correction for noise would more than double a value.

@@ -16,12 +16,10 @@ from tactile_rt.alignment.metrics import Measure
 from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
 from tactile_rt.alignment.metrics.halves import ceiling_of, divisions, sessions_of
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import UPPER, pearson
+from tactile_rt.alignment.rdm import UPPER, Floats, pearson
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["crossnobis", "distances", "shrunk_covariance"]
-
-Floats = NDArray[np.float64]
 
 
 def crossnobis(animal: Animal) -> Measure:
@@ -56,9 +54,8 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
     Returns:
         (division, 15).
     """
-    weights = np.stack([chosen * (stimulus == k) for k in range(len(STIMULI))], axis=1).astype(
-        np.float64
-    )  # (division, 6, trial)
+    of_each = [chosen * (stimulus == k) for k in range(len(STIMULI))]
+    weights = np.stack(of_each, axis=1).astype(np.float64)  # (division, 6, trial)
     number = weights.sum(axis=-1)
     total = weights @ white
     alone = weights @ (white**2).sum(axis=-1)

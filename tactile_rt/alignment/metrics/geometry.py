@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.alignment.metrics import Measure
 from tactile_rt.alignment.metrics.halves import (
@@ -26,11 +25,9 @@ from tactile_rt.alignment.metrics.halves import (
     sessions_of,
 )
 from tactile_rt.alignment.neural import Animal
-from tactile_rt.alignment.rdm import UPPER, pearson, rdm
+from tactile_rt.alignment.rdm import UPPER, Floats, pearson, rdm
 
 __all__ = ["NOTHING", "cka", "cosine", "mean_pattern", "rsa", "rsa_time", "time_course"]
-
-Floats = NDArray[np.float64]
 
 NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # of an animal that has too little
 

@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.alignment.reliability import spearman_brown
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = [
-    "DIVISIONS",
-    "MINIMUM_TRIALS",
-    "MINIMUM_UNITS",
     "bins_of",
     "ceiling_of",
     "divisions",
@@ -23,8 +21,6 @@ __all__ = [
     "sessions_of",
     "values_of",
 ]
-
-Floats = NDArray[np.float64]
 
 DIVISIONS = 100
 SEED = 1234

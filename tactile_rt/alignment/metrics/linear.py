@@ -14,17 +14,15 @@ perfect model reaches it in expectation.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.alignment.metrics import MINIMUM_CEILING, Measure
 from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
 from tactile_rt.alignment.metrics.halves import bins_of, means_of, sessions_of, values_of
 from tactile_rt.alignment.neural import Animal, NeuralSession
+from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["PENALTIES", "linear", "predicted"]
-
-Floats = NDArray[np.float64]
 
 PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel's diagonal
 

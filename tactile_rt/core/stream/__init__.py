@@ -9,7 +9,6 @@ Everything downstream sees `Chunk`s described by one `ArraySpec`.
 import abc
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -30,6 +29,7 @@ __all__ = [
     "SourceStats",
     "Timing",
     "concatenate",
+    "quaternion_product",
     "rotation_matrices",
 ]
 
@@ -276,12 +276,7 @@ class Source(abc.ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -307,6 +302,13 @@ class Timing:
 
 
 MOUSE = Timing()  # 22 steps of five 9 ms samples
+
+
+def quaternion_product(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
+    """Hamilton's product of two quaternions (w, x, y, z)."""
+    w, x, y, z = np.asarray(p, dtype=np.float64)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return np.asarray(np.array(rows) @ np.asarray(q, dtype=np.float64))
 
 
 def rotation_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:

@@ -19,7 +19,6 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec
 __all__ = [
     "CHANNEL_FLOOR",
     "LOADS",
-    "RATED_NOISE",
     "ChannelLimits",
     "ChannelSpec",
     "MagnetSpec",

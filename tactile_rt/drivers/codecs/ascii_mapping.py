@@ -42,7 +42,6 @@ __all__ = [
     "LineMapping",
     "array_of",
     "order_columns",
-    "parse_column",
     "parse_columns",
     "read_mapping",
 ]

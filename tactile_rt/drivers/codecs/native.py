@@ -22,22 +22,9 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
+from tactile_rt.drivers.codecs import native_common as common
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native_common import (
-    FORMATS,
-    HARMLESS,
-    IMPOSSIBLE,
-    RANGE_N,
-    RANGE_NM,
-    RANGE_SI,
-    STATUS,
-    UNKNOWN,
-    DeviceDescription,
-    MessageType,
-    check_ranges,
-    pack_valid,
-    quantise,
-)
+from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType
 
 __all__ = ["NativeOptions", "NativeSerial", "frame"]
 
@@ -67,15 +54,13 @@ class NativeOptions:
     """
 
     format: str = "float32"
-    range_n: float = RANGE_N
-    range_nm: float = RANGE_NM
-    range_si: float = RANGE_SI
+    range_n: float = common.RANGE_N
+    range_nm: float = common.RANGE_NM
+    range_si: float = common.RANGE_SI
     serial_number: str = ""
 
     def __post_init__(self) -> None:
-        check_ranges(self.range_n, self.range_nm, self.range_si)
-        if self.format not in FORMATS:
-            raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
+        common.check_numbers(self.format, self.range_n, self.range_nm, self.range_si)
 
 
 def frame(
@@ -105,14 +90,14 @@ class NativeSerial(SerialCodec):
     baud = 2_000_000  # nominal: most boards speak it over USB, which has no baud rate
     count_bits = 32
     tick_ns = 1000.0
-    status_bits = STATUS
-    harmless_bits = HARMLESS
+    status_bits = common.STATUS
+    harmless_bits = common.HARMLESS
     describes = True
     cannot_detect = ""
 
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(None)
-        self._format = FORMATS[options.format]
+        self._format = common.FORMATS[options.format]
         self._ranges = options.range_n, options.range_nm, options.range_si
         self.serial_number = options.serial_number
         self._described: DeviceDescription | None = None
@@ -173,7 +158,7 @@ class NativeSerial(SerialCodec):
                     continue
                 bits = -(-shape[0] // 8)
                 part: NDArray[Any] = np.ndarray((1, *shape), _TYPES[head[2]], payload, bits)
-                if head[2] == FORMATS["int16"]:
+                if head[2] == common.FORMATS["int16"]:
                     part = (part * np.array(self._description().scale)).astype(np.float32)
                 parts.append(part)
                 flags += payload[:bits]
@@ -233,15 +218,15 @@ class NativeSerial(SerialCodec):
         for seq, t_ns, values, valid in zip(
             chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
         ):
-            if self._format == FORMATS["int16"]:
-                body = quantise(values, described.scale).astype("<i2").tobytes()
+            if self._format == common.FORMATS["int16"]:
+                body = common.quantise(values, described.scale).astype("<i2").tobytes()
                 valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
             else:
                 body = values.astype("<f4").tobytes()
             packets.append(
                 frame(
                     MessageType.SAMPLE,
-                    pack_valid(valid) + body,
+                    common.pack_valid(valid) + body,
                     format=self._format,
                     status=self.status,
                     seq=seq,
@@ -268,9 +253,9 @@ class NativeSerial(SerialCodec):
                 if np.isfinite(asked).all() and self.may_whisk(*asked):
                     self.whisking = asked
                 else:
-                    error = IMPOSSIBLE
+                    error = common.IMPOSSIBLE
             else:
-                error = UNKNOWN
+                error = common.UNKNOWN
             answer += frame(MessageType.ACK, bytes((kind, error)))
         return answer
 

@@ -21,7 +21,7 @@ __all__ = [
     "UNKNOWN",
     "DeviceDescription",
     "MessageType",
-    "check_ranges",
+    "check_numbers",
     "pack_valid",
     "quantise",
     "unpack_valid",
@@ -133,7 +133,9 @@ def quantise(values: NDArray[np.float32], scale: tuple[float, ...]) -> NDArray[n
     return np.clip(counts, -32767, 32767).astype(np.int16)
 
 
-def check_ranges(*ranges: float) -> None:
-    """Raise a `ConfigError` if one cannot be a range."""
+def check_numbers(form: str, *ranges: float) -> None:
+    """Raise a `ConfigError` if there is no such format, or one cannot be a range."""
     if not all(0 < r <= LARGEST for r in ranges):
         raise ConfigError("range_n, range_nm and range_si must be above 0")
+    if form not in FORMATS:
+        raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {form!r}")

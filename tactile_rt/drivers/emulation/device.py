@@ -6,7 +6,6 @@ with EmulatedSerial(source, "native") as device, open_source(device.url) as driv
 """
 
 from pathlib import Path
-from types import TracebackType
 from typing import Any, ClassVar, Self
 from urllib.parse import quote, urlencode
 
@@ -89,12 +88,7 @@ class EmulatedDevice:
         self.emulator.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

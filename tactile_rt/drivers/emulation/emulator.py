@@ -7,7 +7,6 @@ source --> [fit] --> device's counter and clock --> Codec.encode --> [faults] --
 import threading
 import time
 from collections.abc import Iterator
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -159,12 +158,7 @@ class Emulator:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def unplug(self) -> None:

@@ -6,10 +6,10 @@ Every attender maps features `(batch, step, feature)` to the same shape, causall
 
 from torch import Tensor, nn
 
-from tactile_rt.models.attenders.gpt import BLOCK, GPT, HEADS, LAYERS, MAX_STEPS, TOKENS
-from tactile_rt.models.attenders.mamba import MambaAttender
+from tactile_rt.models.attenders.gpt import GPT, HEADS, TOKENS
+from tactile_rt.models.attenders.mamba import MambaStack
 
-__all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "MambaAttender", "NoAttender"]
+__all__ = ["GPT", "HEADS", "TOKENS", "MambaStack", "NoAttender"]
 
 
 class NoAttender(nn.Module):

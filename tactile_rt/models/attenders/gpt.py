@@ -1,7 +1,5 @@
 """The GPT attender: a causal transformer over a step's features and an action token."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -10,8 +10,6 @@ Two cells differ between Nayebi et al.'s equations, "lstm-ln" and "vanilla", and
 published with the paper, "lstm-ln-published" and "vanilla-elu" or "vanilla-elu-ln".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import ClassVar
@@ -117,20 +115,18 @@ class VanillaCell(Cell):
     """s' = tanh(W*x + U*s + b), h = s' (Nayebi et al. 2022, appendix)."""
 
     gates, norms = 1, 1
+    elu: ClassVar[bool] = False
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
-        s = torch.tanh(self.convolved(x, state[0], drive))
+        gate = self.convolved(x, state[0], drive)
+        s = F.elu(gate) if self.elu else torch.tanh(gate)
         return s, (s,)
 
 
-class VanillaELUCell(Cell):
+class VanillaELUCell(VanillaCell):
     """s' = elu(W*x + U*s + b), h = s': the published code's plain cell, whose default is "-ln"."""
 
-    gates, norms = 1, 1
-
-    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
-        s = F.elu(self.convolved(x, state[0], drive))
-        return s, (s,)
+    elu = True
 
 
 class UGRNNCell(Cell):

@@ -6,8 +6,6 @@ so small a map, integer kernels for it exist, and nothing is multiplied with the
 An even kernel has no centre: 'same' padding falls on the right and the bottom only.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

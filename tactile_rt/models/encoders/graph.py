@@ -21,8 +21,6 @@ what its predecessors put out at step t-1 (nothing at t = 0); only the frame is 
     reads = ["conv1"]
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -173,7 +171,7 @@ class Graph:
             for _, group in sorted(groups.items(), key=lambda g: len(above[g[1][0].name] | g[0]))
         )
 
-    def scaled(self, width: float) -> Graph:
+    def scaled(self, width: float) -> "Graph":
         """The same graph with every node's channel count times `width`."""
         scale = [replace(n, channels=max(round(n.channels * width), 1)) for n in self.nodes]
         return replace(self, nodes=tuple(scale))

@@ -4,8 +4,6 @@ Inside, maps are `(row, column, lane, channel)`, vectors maps of one site; in th
 `(lane, row, column, channel)` and a vector `(lane, channel)`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -98,7 +96,7 @@ class GraphEncoder(nn.Module):
         state = {}
         for node in self.graph.nodes:
             sites = () if node.kind == "dense" else self.sizes[node.name]
-            for key in self._keys(node):
+            for key in self.keys(node):
                 state[key] = zeros(batch, *sites, node.channels)
         return state
 
@@ -110,7 +108,7 @@ class GraphEncoder(nn.Module):
         index does not matter to a network without positions.
         """
         name, now = self.graph.frame.name, _inside(frame)
-        keys = [key for node in self.graph.nodes for key in self._keys(node)]
+        keys = [key for node in self.graph.nodes for key in self.keys(node)]
         old = {key: _from_state(state[key]) for key in keys}
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
@@ -216,7 +214,6 @@ class GraphEncoder(nn.Module):
     def _cell(
         self, node: Node, x: Tensor, memory: tuple[Tensor, ...], drive: Tensor | None = None
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
-        """The node's output and its cell's new memory."""
         if node.cell == "none":
             return F.relu(x), ()
         h, memory = self.cells[node.name](x, tuple(m.expand_as(x) for m in memory), drive)
@@ -230,7 +227,8 @@ class GraphEncoder(nn.Module):
         assert isinstance(cell, Cell)
         return [f"{node.name}_{kind}" for kind in cell.states]
 
-    def _keys(self, node: Node) -> list[str]:
+    def keys(self, node: Node) -> list[str]:
+        """List a node's names in the state: its cell's memory and its output, if heard."""
         return self._memory(node) + [f"{node.name}_h"] * (node.name in self.heard)
 
 

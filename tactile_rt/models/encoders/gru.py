@@ -1,7 +1,5 @@
 """A plain GRU on the whole frame: what the whiskers' layout and the paper's graph must beat."""
 
-from __future__ import annotations
-
 from math import prod
 
 import torch

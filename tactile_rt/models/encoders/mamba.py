@@ -1,7 +1,5 @@
 """Mamba as an encoder: the whole frame, projected, then selective state-space blocks."""
 
-from __future__ import annotations
-
 from math import prod
 
 from torch import Tensor, nn

@@ -6,8 +6,6 @@ is therefore one product with the matrix of its taps that lie inside the map, wh
 nothing else. Maps are `(frame, site * channel)`, sites row by row.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -72,8 +70,7 @@ class ConvNorm(nn.Module):
         """(site out * outputs, site in * inputs)"""
         taps = F.pad(self.weight.flatten(2).permute(2, 0, 1), (0, 0, 0, 0, 0, 1))
         matrix = taps[self.taps]  # (site out, site in, output, input)
-        matrix = matrix.transpose(1, 2).flatten(2).flatten(0, 1)
-        return matrix
+        return matrix.transpose(1, 2).flatten(2).flatten(0, 1)
 
     def folded(self) -> tuple[Tensor, Tensor]:
         """Matrix and bias with the norm's running statistics multiplied in."""
@@ -146,7 +143,7 @@ class ResNet18Encoder(_FrameEncoder):
         self.blocks = nn.ModuleList(blocks)
         self.fc = nn.Linear(inputs, self.features)
 
-    def deployed(self) -> FoldedResNet18:
+    def deployed(self) -> "FoldedResNet18":
         """The same outputs from only the taps that matter, batch norm folded in; for inference."""
         return FoldedResNet18(self)
 

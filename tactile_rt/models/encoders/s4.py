@@ -14,8 +14,6 @@ at 0.1 and AdamW at 1e-2 diverge within ten updates. It takes a clipped gradient
 at most 1e-3 with AdamW (docs/decisions/experiments.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -196,7 +194,7 @@ class S4Encoder(nn.Module):
             x = block.merge(x, (inputs[-1] * kernels[layer].t()).sum(1))
         return self.out(x), {"s4_inputs": torch.stack(inputs, 1)}
 
-    def deployed(self) -> FoldedS4:
+    def deployed(self) -> "FoldedS4":
         """The same outputs from kernels computed once; for inference."""
         return FoldedS4(self)
 

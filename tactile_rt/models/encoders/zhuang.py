@@ -1,16 +1,10 @@
 """Zhuang's recurrent convolutional network on the whisker map, as a graph (Zhuang et al. 2017)."""
 
-from __future__ import annotations
-
-from typing import Any
-
-from torch import nn
-
 from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 
-__all__ = ["EDGES", "GRAPH", "LAG", "ZhuangEncoder", "zhuang_graph"]
+__all__ = ["ZhuangEncoder", "zhuang_graph"]
 
 # Channels and predecessors, in the order of their channels: alphabetical.
 EDGES = {
@@ -42,10 +36,6 @@ def zhuang_graph(cell: str = "intersection-ln", frame: tuple[int, int, int] = MO
     return Graph(Input("frame", *frame), tuple(nodes), readout="fc8")
 
 
-GRAPH = zhuang_graph()
-LAG = GRAPH.lag  # conv1 -> conv2 -> fc7 -> fc8
-
-
 class ZhuangEncoder(GraphEncoder):
     """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`."""
 
@@ -56,12 +46,3 @@ class ZhuangEncoder(GraphEncoder):
         frame: tuple[int, int, int] = MOUSE_FRAME,
     ) -> None:
         super().__init__(zhuang_graph(cell, frame).scaled(width))
-        self.register_load_state_dict_pre_hook(_rename_dense)  # type: ignore[no-untyped-call]
-
-
-def _rename_dense(module: nn.Module, saved: dict[str, Any], prefix: str, *_: object) -> None:
-    """Older checkpoints have fc7 and fc8 beside the convolutions."""
-    for name in ("fc7", "fc8"):
-        for part in ("weight", "bias"):
-            if f"{prefix}{name}.{part}" in saved:
-                saved[f"{prefix}dense.{name}.{part}"] = saved.pop(f"{prefix}{name}.{part}")

@@ -13,8 +13,7 @@ from tactile_rt.classifier.model_file import file_outputs, load_model
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.measures import Floats, Interval, Labels
-from tactile_rt.models.evaluation.windows import stepped
+from tactile_rt.models.evaluation.measures import Floats, Interval, Labels, run_steps
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
 __all__ = [
@@ -184,7 +183,7 @@ def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
 
 def _posteriors(path: Path, test: SweepSet, disturbance: Disturbance) -> Floats:
     """(sweep, step, label) of all labels, refusals last."""
-    run = stepped(*load_model(path), refusals=True)
+    run = run_steps(*load_model(path), refusals=True)
     return measures.predict(test, run, disturbance=disturbance)
 
 

@@ -7,17 +7,17 @@ Predictions are (sweep, step, class) posteriors; a sweep in which no contact was
 decision, and counts as wrong everywhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import onnxruntime as ort
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import fuse
-from tactile_rt.classifier.model_card import kind_columns
+from tactile_rt.classifier.model_card import ModelCard, kind_columns
+from tactile_rt.classifier.model_file import file_outputs
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 
@@ -45,6 +45,7 @@ __all__ = [
     "predict",
     "run_on",
     "run_over",
+    "run_steps",
     "softmax",
     "split_by_class",
 ]
@@ -333,7 +334,7 @@ def macro_accuracy(correct: NDArray[np.bool_], labels: Labels, objects: Names) -
     return bootstrap(mean, objects)
 
 
-def run_on(model: TactileClassifier, output: str = "logits") -> Step:
+def run_on(model: "TactileClassifier", output: str = "logits") -> Step:
     """The function that `predict` wants, of a torch model; or one that gives another output."""
     import torch  # here: a model file is measured without
 
@@ -347,5 +348,26 @@ def run_on(model: TactileClassifier, output: str = "logits") -> Step:
             else:
                 out = model.network.split(model.network.answer(model.inputs(*windows)))[output]
         return np.asarray(out.float().cpu().numpy())
+
+    return run
+
+
+def run_steps(session: ort.InferenceSession, card: ModelCard, refusals: bool = False) -> Step:
+    """Make the function that `predict` wants of a model file, as `load_model` gives it.
+
+    Args:
+        refusals: whether the logits are to have those of the refusals, too. Without, a posterior is
+            what the model would say had it to name a class.
+
+    Returns:
+        (samples, offset, sigma) of windows to (batch, step, class) logits, divided by the
+            temperature.
+    """
+    divisor = np.float32(card.temperature)
+    kept = len(card.labels) if refusals else len(card.classes)
+
+    def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
+        found = file_outputs(session, card, samples, offset, sigma)["logits"]
+        return found[..., :kept] / divisor
 
     return run

@@ -25,10 +25,9 @@ from tactile_rt.models.evaluation.coverage import (
     named_faults,
     score_known,
 )
-from tactile_rt.models.evaluation.measures import Floats, Labels, Names
+from tactile_rt.models.evaluation.measures import Floats, Labels, Names, run_steps
 from tactile_rt.models.evaluation.records import Record, record_count, record_share
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
-from tactile_rt.models.evaluation.windows import stepped
 from tactile_rt.sets.manifest import WITHHELD
 
 __all__ = ["evaluate_model"]
@@ -63,7 +62,7 @@ def evaluate_model(
         SpecMismatch: the model was made for another array than a set's.
     """
     session, card = load_model(model)
-    run = stepped(session, card)
+    run = run_steps(session, card)
     test = _tested_on(data, card, model, quick)
     labels, objects = test.sweeps.labels, test.sweeps.objects
     if _met(card, test):

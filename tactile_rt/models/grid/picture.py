@@ -89,7 +89,8 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
             )  # fmt: skip
         elif row.failed:
             axes.text(1, k + BAR / 2, "training diverged", va="center", fontsize=7.5)
-    axes.set_yticks(range(len(rows)), [_label(row) for row in rows], fontsize=8.5)
+    labels = [r.network + (f", {r.learning}" * (r.learning != SUPERVISED)) for r in rows]
+    axes.set_yticks(range(len(rows)), labels, fontsize=8.5)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.grid(axis="x", alpha=0.25)
     axes.set_axisbelow(True)
@@ -105,9 +106,3 @@ def _bar(axes: Axes, at: float, value: Interval, colour: str, alpha: float) -> N
 
 def _family(row: Row) -> tuple[str, str]:
     return next((f for prefix, f in FAMILIES.items() if row.network.startswith(prefix)), OTHER)
-
-
-def _label(row: Row) -> str:
-    if row.learning == SUPERVISED:
-        return row.network
-    return f"{row.network}, {row.learning}"

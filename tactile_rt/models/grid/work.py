@@ -29,18 +29,8 @@ from tactile_rt.models.evaluation.measures import (
     run_on,
 )
 from tactile_rt.models.evaluation.svm import fit_svm
-from tactile_rt.models.grid.outcomes import (
-    POINT,
-    SUBSET,
-    Outcome,
-    Training,
-    outcome_path,
-    read_outcome,
-    read_point,
-    runs_of,
-    settings_of,
-    training_settings,
-)
+from tactile_rt.models.grid import outcomes
+from tactile_rt.models.grid.outcomes import Outcome, Training
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
@@ -60,7 +50,7 @@ class Workbench:
 
     def __init__(self, grid: Grid, folder: Path, accelerator: str = "cpu") -> None:
         self.grid, self.folder, self.accelerator = grid, folder, accelerator
-        self.data = folder / SUBSET
+        self.data = folder / outcomes.SUBSET
         check_split(self.data, SweepManifest.read(self.data))
         self.splits = SweepSet.read(self.data, "train"), SweepSet.read(self.data, "validation")
         self.test = SweepSet.read(self.data, "test")
@@ -86,7 +76,7 @@ class Workbench:
 
     def do(self, task: Task, report: Report = lambda _: None) -> Outcome:
         """Do a task and keep its outcome; a network that diverges is an outcome too."""
-        found = Outcome(task.name, task.seed, settings_of(self.grid, task))
+        found = Outcome(task.name, task.seed, outcomes.settings_of(self.grid, task))
         try:
             if task.cell is None:
                 found = self._svm(found)
@@ -96,14 +86,16 @@ class Workbench:
                 found = self._trained(found, task, report)
         except DivergedError as error:
             found = msgspec.structs.replace(found, failed=str(error))
-        path = outcome_path(self.folder, task)
+        path = outcomes.outcome_path(self.folder, task)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda file: file.write(msgspec.json.encode(found)))
         return found
 
     def _trained(self, found: Outcome, task: Task, report: Report) -> Outcome:
         if task.seed:
-            first = read_outcome(self.grid, self.folder, msgspec.structs.replace(task, seed=0))
+            first = outcomes.read_outcome(
+                self.grid, self.folder, msgspec.structs.replace(task, seed=0)
+            )
             if first is None or first.chosen is None:
                 raise DivergedError("its first seed diverged, so nothing is known to train it with")
             chosen = self._train(task, first.chosen, report)
@@ -118,7 +110,7 @@ class Workbench:
         assert task.cell is not None
         best = run / ("" if task.cell.objective == SUPERVISED else "probe") / "best.pt"
         if not best.exists():  # where only what its trainings scored was kept
-            (run / POINT).unlink()
+            (run / outcomes.POINT).unlink()
             chosen = self._train(task, chosen, report)
         found = msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds)
         return self._scored(found, best, self.grid.config(task, self.data))
@@ -153,7 +145,7 @@ class Workbench:
         assert cell is not None
         begin = ""
         if cell.begin:
-            begun = read_outcome(self.grid, self.folder, self.grid.begun(task))
+            begun = outcomes.read_outcome(self.grid, self.folder, self.grid.begun(task))
             if begun is None or begun.chosen is None:
                 raise DivergedError(f"{cell.begin!r} diverged, and there is nothing to begin with")
             begin = str(self._run(self.grid.begun(task), begun.chosen) / "best.pt")
@@ -162,7 +154,7 @@ class Workbench:
             begin=begin,
         )  # fmt: skip
         key = self._key(task, config)
-        if (found := read_point(run / POINT, key)) is not None:
+        if (found := outcomes.read_point(run / outcomes.POINT, key)) is not None:
             return found
         if cell.begin:  # where only its outcome was kept
             assert begun is not None and begun.chosen is not None
@@ -184,7 +176,7 @@ class Workbench:
             at.learning_rate, at.warmup, at.updates, score,
             seconds if timed else 0.0, diverged, key,
         )  # fmt: skip
-        write_whole(run / POINT, lambda file: file.write(msgspec.json.encode(done)))
+        write_whole(run / outcomes.POINT, lambda file: file.write(msgspec.json.encode(done)))
         for path in run.rglob("last.pt"):  # what is done needs not go on
             path.unlink()
         return msgspec.structs.replace(done, key="")
@@ -192,11 +184,11 @@ class Workbench:
     def _key(self, task: Task, config: TrainingConfig) -> str:
         """What a training's score depends on, wherever the grid lies."""
         settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(self.grid.sweeps)}
-        settings["config"] = training_settings(config)
+        settings["config"] = outcomes.training_settings(config)
         settings["config"].pop("data")
         if config.begin:
             settings["config"]["begin"] = "/".join(Path(config.begin).parts[-3:-1])
-            settings["begun"] = settings_of(self.grid, self.grid.begun(task))
+            settings["begun"] = outcomes.settings_of(self.grid, self.grid.begun(task))
         assert task.cell is not None
         if task.cell.objective != SUPERVISED:
             settings["probe"] = self.grid.probe
@@ -204,10 +196,10 @@ class Workbench:
 
     def _run(self, task: Task, at: Training) -> Path:
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
-        return runs_of(self.folder, task) / name
+        return outcomes.runs_of(self.folder, task) / name
 
     def _untrained(self, found: Outcome, task: Task) -> Outcome:
-        run, config = runs_of(self.folder, task), self.grid.config(task, self.data)
+        run, config = outcomes.runs_of(self.folder, task), self.grid.config(task, self.data)
         best = initialise(config, run, self.splits)
         best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), splits=self.splits)
         return self._scored(found, best, config)

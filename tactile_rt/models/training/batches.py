@@ -4,8 +4,6 @@ A thread draws and augments them while the network computes. Everything of a bat
 (seed, epoch, index) alone, so that neither threads nor an interruption change it.
 """
 
-from __future__ import annotations
-
 import queue
 import threading
 import time
@@ -233,7 +231,6 @@ class TrainingBatches:
         return tensor.pin_memory().to(self._device, non_blocking=True)
 
     def _normal(self, shape: Sequence[int], rng: np.random.Generator) -> Tensor:
-        """Standard normal numbers on the device."""
         if self._device == "cpu":
             return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
         generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**63)))

@@ -20,11 +20,6 @@ from tactile_rt.sets.splits import read_manifests
 
 __all__ = [
     "AUGMENTATIONS",
-    "LOSSES",
-    "OBJECTIVES",
-    "OPTIMIZERS",
-    "PAIRS",
-    "PRECISIONS",
     "SCHEDULES",
     "TWO_SWEEPS",
     "WINDOWS",

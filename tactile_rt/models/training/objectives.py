@@ -22,8 +22,6 @@ At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
 2025-tactile-whisking).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -63,7 +61,7 @@ OUTSIDE = -1e4  # the logit of a kind that is none of the class
 SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
 
 
-def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
+def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
     """Build the network of a configuration and what it is trained for.
 
     Raises:

@@ -20,25 +20,11 @@ from typing import Any
 
 import msgspec
 
+from tactile_rt.core import settings
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.settings import (
-    SettingNode,
-    convert,
-    hint,
-    make_node,
-    no_such,
-    parse_toml,
-    read_toml,
-    set_keys,
-)
 from tactile_rt.models.training.config import TrainingConfig
 
-__all__ = [
-    "Recipe",
-    "load_recipe",
-    "read_recipe",
-    "shipped_recipes",
-]
+__all__ = ["Recipe", "load_recipe", "read_recipe", "shipped_recipes"]
 
 KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
 
@@ -65,9 +51,9 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Raises:
             ConfigError: a key that there is not, or a value that cannot be.
         """
-        nodes = make_node({**self.train, **overrides, "data": data}, "training", 0, Path())
-        set_keys(nodes, sets, TrainingConfig, KEYS)
-        made: TrainingConfig = convert(nodes, TrainingConfig)
+        nodes = settings.make_node({**self.train, **overrides, "data": data}, "training", 0, Path())
+        settings.set_keys(nodes, sets, TrainingConfig, KEYS)
+        made: TrainingConfig = settings.convert(nodes, TrainingConfig)
         return made
 
 
@@ -84,19 +70,21 @@ def load_recipe(name: str) -> Recipe:
         ConfigError: there is none, or it is damaged; the message names the key.
     """
     if name.endswith(".toml"):
-        nodes = read_toml(Path(name))
+        nodes = settings.read_toml(Path(name))
     elif name in (known := shipped_recipes()):
         shipped = resources.files("tactile_rt.models") / "recipes" / f"{name}.toml"
-        nodes = parse_toml(shipped.read_text(), name)
+        nodes = settings.parse_toml(shipped.read_text(), name)
     else:
-        raise ConfigError(no_such("recipe", name, known))
-    recipe: Recipe = convert(nodes, Recipe)
+        raise ConfigError(settings.no_such("recipe", name, known))
+    recipe: Recipe = settings.convert(nodes, Recipe)
     empty = replace(nodes, value={})
     train, search = (nodes.value.get(table, empty) for table in ("train", "search"))
     for what, table in (("train", train), ("search", search)):
         for key, node in table.value.items():
             if key not in KEYS:
-                raise ConfigError(f"{node.where}: {what} has no key {key!r}; {hint(key, KEYS)}")
+                raise ConfigError(
+                    f"{node.where}: {what} has no key {key!r}; {settings.hint(key, KEYS)}"
+                )
     _check(nodes, train)
     # The first of the values to be tried is not the only one that must be possible.
     for values in product(*(node.value for node in search.value.values())) if search.value else ():
@@ -105,11 +93,11 @@ def load_recipe(name: str) -> Recipe:
     return recipe
 
 
-def _check(nodes: SettingNode, fields: SettingNode) -> None:
+def _check(nodes: settings.SettingNode, fields: settings.SettingNode) -> None:
     """Refuse fields of a training that cannot be, with where they stand."""
-    data = make_node("", nodes.file, 0, nodes.folder)
+    data = settings.make_node("", nodes.file, 0, nodes.folder)
     tree = replace(nodes, value={"train": replace(fields, value={**fields.value, "data": data})})
-    config: TrainingConfig = convert(tree, TrainingConfig, ["train"])
+    config: TrainingConfig = settings.convert(tree, TrainingConfig, ["train"])
     if config.encoder == "graph":  # whose frame is that of an array, which is not known here
         return
     try:

@@ -43,7 +43,6 @@ __all__ = [
     "build_optimizer",
     "build_schedule",
     "log_epoch",
-    "logged_epochs",
     "parameter_groups",
     "replayed",
 ]

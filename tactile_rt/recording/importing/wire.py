@@ -101,7 +101,6 @@ def import_wire(
 
 
 def _count(log: LineLog, decoded: "_Decoded", account: Import) -> None:
-    """Count what the file held, and how much of it was read."""
     account.unit = {"raw": "bytes", "blf": "objects", "db": "frames"}.get(log.form, "lines")
     account.total, account.read = log.total, log.frames
     if log.form == "raw":

@@ -16,7 +16,6 @@ __all__ = [
     "CDR",
     "PACKAGE",
     "SIMPLE",
-    "Field",
     "dds_type",
     "decode",
     "encode",

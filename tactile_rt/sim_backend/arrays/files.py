@@ -38,18 +38,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from tactile_rt.core import packages
+from tactile_rt.core import packages, settings
 from tactile_rt.core.errors import ConfigError, name_some
-from tactile_rt.core.settings import (
-    SettingNode,
-    check_columns,
-    convert,
-    hint,
-    named,
-    parse_toml,
-    read_csv,
-    read_toml,
-)
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
@@ -71,7 +61,6 @@ __all__ = [
     "mouse_whiskers",
     "read_animals",
     "robot_text",
-    "species_array",
 ]
 
 # By name: the options of the serial URL that reads the array.
@@ -220,18 +209,19 @@ def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...
     if path.suffix.lower() == ".csv":
         whiskers = _csv_whiskers(path)
         return (WhiskerArray(path.stem, whiskers, centred_mount(whiskers)),)
-    return _toml_animals(path, read_toml(path) if text is None else parse_toml(text, str(path)))
+    nodes = settings.read_toml(path) if text is None else settings.parse_toml(text, str(path))
+    return _toml_animals(path, nodes)
 
 
 def _csv_whiskers(path: Path) -> tuple[Whisker, ...]:
-    table = read_csv(path)
-    check_columns(table, COLUMNS, REQUIRED)
+    table = settings.read_csv(path)
+    settings.check_columns(table, COLUMNS, REQUIRED)
     whiskers = [(row.where, _whisker(row.where, row.plain())) for row in table.rows]
     return _distinct(path, whiskers)
 
 
-def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
-    file: _File = convert(nodes, _File)
+def _toml_animals(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray, ...]:
+    file: _File = settings.convert(nodes, _File)
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
     if file.animal:
@@ -253,7 +243,7 @@ def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
     for number, values in enumerate(file.whisker):
         at: list[str | int] = ["whisker", number]
         _check_columns(nodes, at)
-        where = f"{nodes.at(at).where}: {named(at)}"
+        where = f"{nodes.at(at).where}: {settings.named(at)}"
         if isinstance(values.get("whisker"), str):
             where += f" ({values['whisker']})"
         whiskers.append((where, _whisker(where, file.defaults | values)))
@@ -290,7 +280,7 @@ def _mount(path: Path, mount: _Mount) -> Mount:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def _sensor(nodes: SettingNode, sensor: _Sensor | None) -> SensorSpec | None:
+def _sensor(nodes: settings.SettingNode, sensor: _Sensor | None) -> SensorSpec | None:
     if sensor is None:
         return None
     try:
@@ -326,10 +316,9 @@ def _distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker,
     return tuple(w for _, w in whiskers)
 
 
-def _check_columns(nodes: SettingNode, path: list[str | int]) -> None:
+def _check_columns(nodes: settings.SettingNode, path: list[str | int]) -> None:
     """Refuse a key of a table that is no column."""
     for key, node in nodes.at(path).value.items():
         if key not in COLUMNS:
-            raise ConfigError(
-                f"{node.where}: {named(path)} has no key {key!r}; {hint(key, COLUMNS)}"
-            )
+            where, hint = f"{node.where}: {settings.named(path)}", settings.hint(key, COLUMNS)
+            raise ConfigError(f"{where} has no key {key!r}; {hint}")

@@ -15,15 +15,13 @@ from tactile_rt.core.errors import ConfigError
 
 __all__ = [
     "DAMPING_RATIO",
-    "DENSITY_BASE",
-    "DENSITY_TIP",
     "FRICTION",
     "OPTIONAL",
     "PLAUSIBLE",
     "REQUIRED",
     "SOFTEST_MOUNT",
     "TURN",
-    "YOUNG_MODULUS_PA",
+    "Floats",
     "Whisker",
     "joint_stiffness",
     "keratin_radii",
@@ -32,8 +30,8 @@ __all__ = [
     "rotation",
 ]
 
+Floats = NDArray[np.float64]
 GAUSS = np.polynomial.legendre.leggauss(5)  # nodes, weights: exact to degree 9
-
 
 YOUNG_MODULUS_PA = 5e9  # Zweifel et al. (2021), PNAS 118(27)
 DENSITY_BASE, DENSITY_TIP = 1260.0, 1690.0  # kg/m^3, Belli et al. (2017)
@@ -210,21 +208,21 @@ class Whisker:
             **fields,
         )
 
-    def radius(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def radius(self, s: Floats) -> Floats:
         """Radius (mm) at arc length s (mm): linear from base to tip."""
         base, tip = self.base_radius, self.tip_radius
         return base + (tip - base) * np.asarray(s) / self.length
 
-    def density(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def density(self, s: Floats) -> Floats:
         """Mass density (kg/m^3) at arc length s (mm): linear from base to tip."""
         base, tip = self.density_base, self.density_tip
         return base + (tip - base) * np.asarray(s) / self.length
 
-    def bending_stiffness(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def bending_stiffness(self, s: Floats) -> Floats:
         """E I (N mm^2) at arc length s (mm), I = pi r^4 / 4."""
         return self.young_modulus * 1e-6 * np.pi * self.radius(s) ** 4 / 4
 
-    def centreline(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def centreline(self, s: Floats) -> Floats:
         """Points (len(s), 3) at arc lengths s (mm) in the whisker frame, mm.
 
         The whisker leaves its base along +x and curves towards +y (-y if negatively curved).
@@ -239,7 +237,7 @@ class Whisker:
         return np.stack([at, a * at**2, np.zeros_like(at)], axis=-1)
 
     @property
-    def orientation(self) -> NDArray[np.float64]:
+    def orientation(self) -> Floats:
         """(3, 3) rotation from the whisker frame to the array frame (Knutsen et al. 2008)."""
         theta, phi, zeta = self.angles
         return (
@@ -247,7 +245,7 @@ class Whisker:
         )
 
 
-def link_nodes(whisker: Whisker, links: int) -> NDArray[np.float64]:
+def link_nodes(whisker: Whisker, links: int) -> Floats:
     """(links + 2,) arc lengths (mm) of the links' ends: base, joints in mid-cell, tip."""
     joints = (np.arange(links) + 0.5) * (whisker.length / links)
     return np.concatenate([[0.0], joints, [whisker.length]])
@@ -280,7 +278,7 @@ def link_inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, fl
     return total, centre, axial, float(mass @ (radius**2 / 4 + (x - centre) ** 2))
 
 
-def rotation(axis: str, angle: float | NDArray[np.float64]) -> NDArray[np.float64]:
+def rotation(axis: str, angle: float | Floats) -> Floats:
     """(..., 3, 3) right-handed rotations by angles (rad) about the x, y or z axis."""
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.zeros((*np.shape(angle), 3, 3))

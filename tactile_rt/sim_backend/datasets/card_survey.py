@@ -153,7 +153,6 @@ def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]
 def _take(
     card: Card, found: _Findings, manifest: SweepManifest, folder: Path, split: str, name: str
 ) -> None:
-    """Add one object's sweeps."""
     values, parameters = read_object(folder, name)
     category, units, limits = manifest.category(name), manifest.spec.units, manifest.limits
     own = {unit: float(limits.clip[units.index(unit)]) for unit in dict.fromkeys(units)}

@@ -259,7 +259,8 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     elements = sum(len(animal.whiskers) for animal in ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    most = 1 if recipe.sweeps.keeps_misses else DRAWS
+    # A sweep that misses the array stays where all combinations are to be there.
+    most = DRAWS if recipe.sweeps.combinations() == [{}] else 1
     for tries in range(most):
         shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)
         sweep = recipe.sweeps.draw(rng, index, shared)

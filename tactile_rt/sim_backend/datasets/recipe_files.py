@@ -10,17 +10,8 @@ from typing import Any
 
 import msgspec
 
+from tactile_rt.core import settings
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.settings import (
-    SettingNode,
-    convert,
-    make_node,
-    no_such,
-    parse_toml,
-    read_toml,
-    refusal,
-    set_keys,
-)
 from tactile_rt.core.stream import STEP_MS, Timing
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.recipes import GENERATED, SweepRecipe
@@ -28,7 +19,7 @@ from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_from_dict", "recipe_of_set", "shipped_recipes"]
+__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_of_set", "shipped_recipes"]
 
 DEFAULT_RECIPE = "wide24"
 
@@ -48,13 +39,13 @@ def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ())
         sets: ``key=value`` each, of which ``objects.test=3`` is one of a table.
     """
     if Path(name).suffix == ".toml":
-        return _recipe(set_keys(read_toml(Path(name)), sets, SweepRecipe), folder)
+        return _recipe(settings.set_keys(settings.read_toml(Path(name)), sets, SweepRecipe), folder)
     if name not in shipped_recipes():
-        known = no_such("recipe", name, shipped_recipes())
+        known = settings.no_such("recipe", name, shipped_recipes())
         raise ConfigError(f"{known} (or give a file that ends in .toml)")
     shipped = resources.files(__package__) / "recipes" / f"{name}.toml"
-    nodes = parse_toml(shipped.read_text(encoding="utf-8"), name)
-    return _recipe(set_keys(nodes, sets, SweepRecipe))
+    nodes = settings.parse_toml(shipped.read_text(encoding="utf-8"), name)
+    return _recipe(settings.set_keys(nodes, sets, SweepRecipe))
 
 
 def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepRecipe:
@@ -63,22 +54,13 @@ def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepReci
     Raises:
         ConfigError: it is not one that this release knows.
     """
-    return _recipe(set_keys(make_node(recipe, "the set's recipe", 0, Path()), sets, SweepRecipe))
+    nodes = settings.make_node(recipe, "the set's recipe", 0, Path())
+    return _recipe(settings.set_keys(nodes, sets, SweepRecipe))
 
 
-def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
-    """Read what a recipe file holds.
-
-    Raises:
-        ConfigError: a key is unknown or of the wrong kind, or a value out of range: one line
-            that says which, where.
-    """
-    return _recipe(make_node(raw, where, 0, Path()))
-
-
-def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
+def _recipe(nodes: settings.SettingNode, folder: Path | None = None) -> SweepRecipe:
     _add_usual_values(nodes, folder)
-    recipe: SweepRecipe = convert(nodes, SweepRecipe)
+    recipe: SweepRecipe = settings.convert(nodes, SweepRecipe)
     objects = recipe.objects
     if Path(recipe.array).suffix:
         recipe = replace(recipe, array=_absolute(recipe.array, folder))
@@ -88,11 +70,11 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
     slip = get_close_matches(objects.source, GENERATED, 1, 0.8)
     if slip and not Path(source).exists():
         why = f"no such folder {objects.source!r}; did you mean {slip[0]}?"
-        raise refusal(nodes, ["objects", "from"], why)
+        raise settings.refusal(nodes, ["objects", "from"], why)
     return replace(recipe, objects=msgspec.structs.replace(objects, source=source))
 
 
-def _add_usual_values(nodes: SettingNode, folder: Path | None) -> None:
+def _add_usual_values(nodes: settings.SettingNode, folder: Path | None) -> None:
     """Add the distance, period and lengths that follow from a recipe's array."""
     written = nodes.plain()
     array, period_ms = written.get("array", SweepRecipe.array), SweepRecipe.period_ms
@@ -110,8 +92,8 @@ def _add_usual_values(nodes: SettingNode, folder: Path | None) -> None:
         nodes.value.setdefault(name, _node(nodes, value))
 
 
-def _node(nodes: SettingNode, value: Any) -> SettingNode:
-    return make_node(value, nodes.file, nodes.line, nodes.folder)
+def _node(nodes: settings.SettingNode, value: Any) -> settings.SettingNode:
+    return settings.make_node(value, nodes.file, nodes.line, nodes.folder)
 
 
 def _usual_lengths(period_ms: float) -> tuple[float, float]:

@@ -45,8 +45,6 @@ from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 
 __all__ = [
     "GENERATED",
-    "PARAMETERS",
-    "SHAPES",
     "VARIED_SHAPES",
     "Choice",
     "ObjectChoice",
@@ -275,11 +273,6 @@ class SweepChoice:
     def __len__(self) -> int:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
-    @property
-    def keeps_misses(self) -> bool:
-        """Whether a sweep that misses the array stays: all combinations are to be there."""
-        return self.combinations() != [{}]
-
     def draw_index(self, index: int) -> int:
         """Which draw of its combination sweep `index` of an object is, from 0."""
         return index % (self.draws + self.held_out_draws)
@@ -389,7 +382,7 @@ class SweepRecipe:
         return [self.seed, zlib.crc32(name.encode()), index, *([stream] if stream else [])]
 
     def to_dict(self) -> dict[str, Any]:
-        """Write it in full as a recipe file has it; `recipe_files.recipe_from_dict` reads it."""
+        """Write it in full as a recipe file has it; `recipe_files.recipe_of_set` reads it."""
         # asdict, as msgspec leaves out what it has decoded from a default
         plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(self)))
         return plain

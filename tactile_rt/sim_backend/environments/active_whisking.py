@@ -282,8 +282,6 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         """A picture (height, width, 3) from above and from the side, or None without a mode."""
         if self.render_mode is None or self._head is None:
             return None
-        from tactile_rt.sim_backend.environments.active_whisking import picture
-
         return picture(self._head)
 
     def _observed(self, felt: Stretch) -> Observation:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import rotation
+from tactile_rt.sim_backend.arrays.whiskers import Floats, rotation
 from tactile_rt.sim_backend.mujoco_world import TOUCHING_SHARE
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
@@ -28,8 +28,6 @@ from tactile_rt.sim_backend.whisking_drive import LAG_S, Drive, Whisking
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile
 
 __all__ = ["Placed", "Stretch", "WhiskingHead", "place_beside"]
-
-Floats = NDArray[np.float64]
 
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 APART_MS = 10  # a whisker that was free for as long touches anew

@@ -108,9 +108,11 @@ def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) 
     if still.sum() < LEAST_BLOCKS:
         return None
     levels += first
-    centre, wander = _centre(levels[still])
+    centre = np.median(levels[still], axis=0)
+    wander = TO_SIGMA * np.median(np.abs(levels[still] - centre), axis=0)
     there = (np.abs(levels - centre) <= AWAY * np.maximum(usual, wander)).all(axis=1)
-    resting = _inside(still & there)
+    beside = np.concatenate([[True], still & there, [True]])
+    resting = beside[:-2] & beside[1:-1] & beside[2:]  # those of which the neighbours rest too
     if resting.sum() < max(LEAST_BLOCKS, LEAST_S * rate_hz / size):
         return None
     freedom = size - 2  # the median of a chi-square distribution (Wilson and Hilferty)
@@ -119,18 +121,6 @@ def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) 
     )
     at_s = np.arange(0.5, len(blocks), dtype=np.float64)[resting] * (size / rate_hz)
     return Rest(at_s, levels[resting], noise, size, size / rate_hz, step)
-
-
-def _centre(levels: Floats) -> tuple[Floats, Floats]:
-    """Median and standard deviation of most levels, (channel,) each."""
-    centre = np.median(levels, axis=0)
-    return centre, TO_SIGMA * np.median(np.abs(levels - centre), axis=0)
-
-
-def _inside(blocks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Those of which the neighbours are the same."""
-    beside = np.concatenate([[True], blocks, [True]])
-    return np.asarray(beside[:-2] & blocks & beside[2:])
 
 
 def drift_likelihood(rest: Rest, channel: int, sizes: Floats) -> Floats:

@@ -24,16 +24,14 @@ from typing import Generic, TypeVar
 import numpy as np
 import trimesh
 from manifold3d import Manifold, OpType
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from tactile_rt.sim_backend.objects.deviation import FACES, TILE, shuffled, surface_of, tiles
-from tactile_rt.sim_backend.objects.polygons import flat
+from tactile_rt.sim_backend.objects.polygons import Floats, flat
 
 __all__ = ["SheetPieces", "SolidPieces"]
 
 P = TypeVar("P")
-Floats = NDArray[np.float64]
 FOLDED = 0.5  # cosine of the angle by which a patch's parts may be turned against it
 ALONG = np.linspace(0, 1, 4, endpoint=False)[:, None, None]  # where an outline is looked at
 DEEP = 0.05  # of a face's piece, in largest extents, at most: 2 mm at 40 mm

@@ -289,7 +289,6 @@ def read_dae(path: Path, content: bytes) -> Meshes:
 
 
 def _make_meshes(geometry: Any) -> Iterator[trimesh.Trimesh]:
-    """Make the meshes of a COLLADA geometry."""
     inputs = (e for e in geometry.xmlnode.iter("{*}input") if e.get("semantic") == "POSITION")
     places = {e.get("source") for e in inputs}
     for source in geometry.xmlnode.iter("{*}source"):

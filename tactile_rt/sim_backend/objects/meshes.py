@@ -208,16 +208,12 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject:
     for solid in solids:
         left -= len(solid)
         corners += solid.corners(spare=max(0, detail.max_pieces - len(corners) - left - len(solid)))
-    pieces = tuple(_piece(c) for c in corners)
+    # Corners that rounding doubled would leave faces without area.
+    rounded = (np.unique(c.round(DIGITS), axis=0) for c in corners)
+    pieces = tuple(map(trimesh.convex.convex_hull, rounded))
     error = deviation(drawn, pieces, bodies)
     made_by = "plates" if sheets else "bodies" if len(pieces) == len(bodies) else "pieces"
     return TactileObject("", "", pieces, error, made_by)
-
-
-def _piece(corners: Floats) -> trimesh.Trimesh:
-    # corners that rounding doubled would leave faces without area
-    piece: trimesh.Trimesh = trimesh.convex.convex_hull(np.unique(corners.round(DIGITS), axis=0))
-    return piece
 
 
 def _mended(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -4,7 +4,7 @@ import numpy as np
 from manifold3d import triangulate
 from numpy.typing import NDArray
 
-__all__ = ["cut_polygons", "flat"]
+__all__ = ["Floats", "cut_polygons", "flat"]
 
 MOST_CORNERS = 10_000
 SLIVER = 1e-9  # of all extents squared: a triangle of less area shows nowhere

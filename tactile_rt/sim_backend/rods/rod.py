@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays.whiskers import (
+    Floats,
     Whisker,
     joint_stiffness,
     link_inertia,
@@ -19,8 +19,6 @@ from tactile_rt.sim_backend.rods.chains import Chain, chain_mass
 from tactile_rt.sim_backend.rods.touching import Segments
 
 __all__ = ["Rod", "make_rod", "matched"]
-
-Floats = NDArray[np.float64]
 
 SAG_MM = 7e-4  # how far the chord of a segment may be from the resting curve
 FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from tactile_rt.core.errors import ConfigError, SourceError
-from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.resting import linearise, settle
 from tactile_rt.sim_backend.rods.rod import Rod, make_rod
@@ -21,8 +21,6 @@ from tactile_rt.sim_backend.rods.touching import Object, Segments, unseen
 from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 
 __all__ = ["Piece", "RodWorld"]
-
-Floats = NDArray[np.float64]
 
 WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
@@ -130,6 +128,7 @@ class RodWorld:
                 answers.append(_answers(_shape_of(whiskers[i]), cells, steps_per_sample))
             self.sag.append(nodes[1] - nodes[0])
         rows = rows._replace(answers=_begins(answers))
+        degrees = [np.bincount(p.edges[:, 0], minlength=len(p.corners)) for p in pieces]
         self.angles = rest.copy()
         self._advance = partial(
             advance,
@@ -144,7 +143,7 @@ class RodWorld:
                 _begins([p.faces for p in pieces]),
                 np.array([p.rounding for p in pieces]),
                 np.concatenate([NO_EDGES, *(p.edges for p in pieces)])[:, 1].copy(),
-                np.cumsum(np.concatenate([[0], *map(_degrees, pieces)])),
+                np.cumsum(np.concatenate([[0], *degrees])),
             ),
             RodState(
                 self.angles,
@@ -267,11 +266,6 @@ def _stacked(each: Sequence[Any]) -> NDArray[Any]:
     if kept := [(0, 0)] * (np.ndim(each[0]) - 1):
         each = [np.pad(rows, (*kept, (0, wide - rows.shape[-1]))) for rows in each]
     return np.concatenate(each)
-
-
-def _degrees(piece: Piece) -> NDArray[np.int64]:
-    """The number of edges at each corner."""
-    return np.bincount(piece.edges[:, 0], minlength=len(piece.corners))
 
 
 def _begins(each: Sequence[Any]) -> NDArray[np.int64]:

@@ -29,7 +29,6 @@ __all__ = [
     "draw_scale",
     "draw_traces",
     "rostral_sign",
-    "round_number",
     "scene_size",
 ]
 

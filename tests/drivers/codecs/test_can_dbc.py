@@ -11,6 +11,9 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.can_dbc import CanDbc, CanDbcOptions
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
+from tests.helpers.dbc_mappings import map_signal
+from tests.helpers.hostile_files import DBCS
+from tests.helpers.measured import measured
 
 DOCS = Path(__file__).parents[3] / "docs" / "codecs"
 
@@ -279,3 +282,12 @@ def test_a_factor_that_no_sensor_has_is_named(folder: Path, factor: str, offset:
     with pytest.raises(ConfigError, match=r"signal X its readings go up to .* as no") as caught:
         CanDbc(CanDbcOptions(str(folder / "patch.toml")))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", DBCS)
+def test_a_hostile_dbc_file_is_refused(name, tmp_path):
+    (tmp_path / "hostile.dbc").write_bytes(DBCS[name]())
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_text(map_signal("hostile.dbc", "fz", "M.S"))
+    url = f"can:virtual:x?codec=can-dbc&mapping={mapping}"
+    measured("hz", url).assert_refused("hostile.dbc")

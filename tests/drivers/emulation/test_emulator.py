@@ -375,13 +375,10 @@ class Asked(SerialCodec):
         pass
 
 
-def numbered(n: int) -> np.ndarray:
-    return np.arange(n, dtype=np.float32)[:, None, None] * np.ones(SPEC.shape, np.float32)
-
-
 @pytest.mark.parametrize("pace", ["fast", "realtime"])
 def test_a_polled_device_answers_polls_only(pace: str) -> None:
-    source = ArraySource(SPEC, cut(numbered(20_000), 1000.0))
+    values = np.arange(20_000, dtype=np.float32)[:, None, None] * np.ones(SPEC.shape, np.float32)
+    source = ArraySource(SPEC, cut(values, 1000.0))
     with Emulator(Asked(), source, SerialEndpoint(), pace=pace) as device:
         fd = os.open(device.endpoint.pty.path, os.O_RDWR | os.O_NOCTTY)
         assert not select.select([fd], [], [], 0.1)[0] and device.log.sent == 0

@@ -1,22 +1,20 @@
 """Mamba is its equations, by a loop over every number; and a stream is the window."""
 
-from __future__ import annotations
-
 import math
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tactile_rt.models.attenders.mamba import MambaAttender, MambaBlock, selective_scan
+from tactile_rt.models.attenders.mamba import MambaBlock, MambaStack, selective_scan
 
 TOLERANCE = 2e-6
 
 
-def build(width: int = 32, seed: int = 1) -> MambaAttender:
+def build(width: int = 32, seed: int = 1) -> MambaStack:
     """In evaluation mode, every parameter off its initial value."""
     torch.manual_seed(seed)
-    attender = MambaAttender(width).eval()
+    attender = MambaStack(width).eval()
     with torch.no_grad():
         for parameter in attender.parameters():
             parameter += 0.1 * torch.randn_like(parameter)

@@ -1,7 +1,5 @@
 """Zhuang's encoder with every cell against the paper's equations, written with convolutions."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -7,7 +7,7 @@ import torch
 
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node, parse_graph
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
-from tactile_rt.models.encoders.zhuang import GRAPH
+from tactile_rt.models.encoders.zhuang import zhuang_graph
 from tests.helpers.refusals import refusal
 from tests.helpers.small_networks import frames, stir
 
@@ -38,11 +38,12 @@ reads = ["up", { source = "down", fusion = "gate" }]
 
 
 def test_zhuangs_graph():
-    assert GRAPH.lag == 3
-    assert GRAPH.sizes["conv6"] == (4, 6)
-    assert [{n.name for n in group} for group in GRAPH.components] == [
+    graph = zhuang_graph()
+    assert graph.lag == 3
+    assert graph.sizes["conv6"] == (4, 6)
+    assert [{n.name for n in group} for group in graph.components] == [
         {"conv1"}, {f"conv{n}" for n in range(2, 7)}, {"fc7"}, {"fc8"}]  # fmt: skip
-    assert [GRAPH.remaining[f"conv{n}"] for n in range(1, 7)] == [3, 2, 3, 2, 3, 2]
+    assert [graph.remaining[f"conv{n}"] for n in range(1, 7)] == [3, 2, 3, 2, 3, 2]
 
 
 def test_a_graph_from_toml():

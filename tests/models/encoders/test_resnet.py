@@ -1,7 +1,5 @@
 """ResNet18 is the published one: counts and convolutions; and a stream is the window."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor, nn

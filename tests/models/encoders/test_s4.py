@@ -1,7 +1,5 @@
 """S4 is its equations, by dense matrices in double precision; and a stream is the window."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

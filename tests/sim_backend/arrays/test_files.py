@@ -251,11 +251,8 @@ def test_a_table_as_a_spreadsheet_writes_it(tmp_path: Path) -> None:
     [
         ("", "a.csv: is empty"),
         (HEADER, "a.csv: has no whiskers"),
-        (HEADER.replace(",", ";"), "a.csv:1: columns are separated by semicolons; use commas"),
         (HEADER.replace(",col", ""), "a.csv:1: no column col; add it"),
         (HEADER.replace("_length", "_lenght"), "no column 'arc_lenght_mm'; did you mean arc_"),
-        (HEADER + ",row", "a.csv:1: column 'row' is there twice"),
-        (f"{HEADER}\n{LINE},3", "a.csv:2: 13 values for 12 columns"),
         (f"#\n{HEADER}\n{LINE.replace('40', 'x')}", "a.csv:3: arc_length_mm is not a number: 'x'"),
         (f"{HEADER}\n{LINE.replace('40', '')}", "a.csv:2: no arc_length_mm; give it a value"),
         (
@@ -294,13 +291,8 @@ def test_a_toml_array_has_a_mount_and_defaults(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("name = \n", r"a.toml:1: not TOML"),
         ("", r"needs \[\[whisker\]\] tables or"),
         ("naem = 'x'" + DEFAULTS + WHISKERS, "the file has no key 'naem'; did you mean name?"),
-        (
-            "[mount]\nposition_mm = [0,0]" + DEFAULTS + WHISKERS,
-            r"a.toml:2: mount.position_mm: expected a list of 3 numbers",
-        ),
         (
             "[mount]\nroll_pitch_yaw_rad = [0,0,-90]" + DEFAULTS + WHISKERS,
             r"a.toml: mount.roll_pitch_yaw_rad must be within a turn, 6.28, not -90: mind the unit",

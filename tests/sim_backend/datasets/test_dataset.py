@@ -480,7 +480,7 @@ def test_kill_minus_nine_at_any_moment_changes_nothing(tmp_path: Path) -> None:
             run.kill()
         run.wait()
         kills += 1
-        found = finished_sweeps(often)
+        found = sum(len(read_object(often, name)[0]) for name in shards(often))
         assert found >= sweeps, "a finished sweep was lost"
         sweeps = found
     assert kills >= 3
@@ -491,11 +491,6 @@ def test_kill_minus_nine_at_any_moment_changes_nothing(tmp_path: Path) -> None:
 def written(folder: Path) -> int:
     """Bytes of sweeps."""
     return sum(path.stat().st_size for path in folder.glob("[!.]*.npz"))
-
-
-def finished_sweeps(folder: Path) -> int:
-    """In whole files, each of which must be sound."""
-    return sum(len(read_object(folder, name)[0]) for name in shards(folder))
 
 
 @pytest.mark.slow

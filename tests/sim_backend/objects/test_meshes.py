@@ -1,3 +1,7 @@
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +16,11 @@ from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object, make_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
-from tactile_rt.sim_backend.objects.meshes import load_mesh
+from tactile_rt.sim_backend.objects.meshes import load_mesh, read_pieces, write_pieces
 from tactile_rt.sim_backend.objects.solids import box
 from tests.helpers import mesh_truth
+from tests.helpers.hostile_files import MESHES
+from tests.helpers.measured import Measured
 from tests.helpers.mesh_truth import inside
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -282,3 +288,84 @@ def test_no_large_face_is_lost_where_small_ones_go(tmp_path: Path) -> None:
     thing = load_mesh(save(cloth, tmp_path / "cloth.ply"))
     assert len(thing.pieces) < 1024
     within(thing, cloth, 0.4)
+
+
+@pytest.fixture
+def pieces():
+    return TactileObject("box", "box", (trimesh.creation.box(),), 0.0, "by hand")
+
+
+@pytest.mark.parametrize("relative", ["", "some/cache"])
+def test_a_relative_folder_is_the_home_s(pieces, tmp_path, monkeypatch, relative):
+    monkeypatch.delenv("TACTILE_RT_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", relative)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    write_pieces("key", pieces)
+    assert (tmp_path / ".cache" / "tactile_rt" / "pieces" / "key.npz").is_file()
+    assert read_pieces("key") is not None
+
+
+@pytest.mark.parametrize("home", ["~", "relative"])
+def test_without_a_home_nothing_is_kept(pieces, tmp_path, monkeypatch, home):
+    monkeypatch.delenv("TACTILE_RT_CACHE", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path.replace("~", home))
+    monkeypatch.chdir(tmp_path)
+    write_pieces("key", pieces)
+    assert read_pieces("key") is None
+    assert os.listdir(tmp_path) == []
+
+
+# The simulator is imported once: every command runs in a child that has it already.
+FORKS = """
+import json, os, sys
+import tactile_rt.sim_backend.objects.catalogue
+import tactile_rt.sim_backend.stimulus_simulation
+from tactile_rt.cli import main
+
+found, (out, *paths) = [], sys.argv[1:]
+for path in paths:
+    reading, writing = os.pipe()
+    child = os.fork()
+    if not child:
+        os.dup2(writing, 2)
+        sys.argv[1:] = ["whisk", out, "--object", path]
+        try:
+            main()
+        except SystemExit as left:
+            sys.stderr.flush()
+            os._exit(left.code)
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading) as told:
+        err = told.read()
+    _, status, used = os.wait4(child, 0)
+    cpu_s = used.ru_utime + used.ru_stime
+    found.append([os.waitstatus_to_exitcode(status), "", err, cpu_s, used.ru_maxrss / 1024])
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory) -> dict[str, Measured]:
+    """What became of each mesh."""
+    folder = tmp_path_factory.mktemp("hostile")
+    paths = []
+    for number, make in enumerate(MESHES.values()):
+        suffix, content = make()
+        paths.append(folder / f"hostile{number}{suffix}")
+        paths[-1].write_bytes(content)
+    out = folder / "out.npz"
+    run = subprocess.run(
+        [sys.executable, "-c", FORKS, str(out), *map(str, paths)],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    return {
+        name: Measured(*told, ("whisk", out, "--object", path))
+        for name, path, told in zip(MESHES, paths, json.loads(run.stdout), strict=True)
+    }
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_a_hostile_mesh_is_refused(name, refused):
+    refused[name].assert_refused("hostile", cpu_s=1.0)

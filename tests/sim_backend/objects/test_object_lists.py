@@ -19,7 +19,7 @@ pytest.importorskip("manifold3d")
 import trimesh
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import ObjectChoice
 from tactile_rt.sim_backend.objects import object_lists
@@ -277,8 +277,8 @@ def test_variants_stay_on_one_side_and_a_source_can_be_left_out(tmp_path: Path) 
     (folder / "objects.csv").write_text("\n".join(rows))
 
     def split(**more: str) -> dict[str, set[str]]:
-        recipe = recipe_from_dict({"objects": {"from": str(folder), **more}})
-        assert recipe_from_dict(recipe.to_dict()).objects == recipe.objects
+        recipe = recipe_of_set({"objects": {"from": str(folder), **more}})
+        assert recipe_of_set(recipe.to_dict()).objects == recipe.objects
         return {k: set(names) for k, names in choose_objects(recipe.objects).split.items()}
 
     for side in split().values():

@@ -26,12 +26,6 @@ G = EARTH * 1e-3  # mm/ms^2
 ROOT = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]  # of a whisker at the origin
 
 
-def alone(name: str, profile: str, gravity: tuple[float, float, float]) -> RodWorld:
-    own = PROFILES[profile]
-    steps = round(1 / own.timestep_ms)
-    return RodWorld((flat(name),), ROOT, (), own.links, steps, np.array(gravity))
-
-
 @pytest.mark.parametrize(("profile", "bar"), [("realtime", 0.03), ("dataset", 0.01)])
 @pytest.mark.parametrize("name", ["B0", "C2", "robot A0"])
 def test_a_tip_let_go_swings_as_in_fine_steps(name: str, profile: str, bar: float) -> None:
@@ -56,9 +50,10 @@ def test_a_touch_that_is_held_keeps_its_friction(profile: str, axis: int) -> Non
 @pytest.mark.parametrize("name", ["C2", "robot A0", "long ABS"])
 @pytest.mark.parametrize("axis", [1, 2])
 def test_a_whisker_sags_as_a_beam(name: str, axis: int) -> None:
-    whisker, down = flat(name), np.zeros(3)
+    whisker, down, finest = flat(name), np.zeros(3), PROFILES["accurate"]
     down[axis] = 1e-3  # so little that a beam's deflection is in proportion
-    world = alone(name, "accurate", tuple(down * G))
+    steps = round(1 / finest.timestep_ms)
+    world = RodWorld((whisker,), ROOT, (), finest.links, steps, down * G)
     tip = world.sag[0][-1] * 1e3
     wanted = beams.sag(whisker, EARTH * 1e3)
     if axis == 2 and whisker.curvature:  # out of its plane a curved one also hangs by its bow
