@@ -307,7 +307,7 @@ class _Drift:
         return True
 
     def leads_to(self, at: float, level: NDArray[Any], sigma: Floats) -> bool:
-        """Return whether the samples lie on a slope on which this level was at that time."""
+        """Return whether the slope of the samples was at this level then."""
         if not (self.found and self.straight):
             return False
         there = self._mean + (at - self._middle) * self.slope

@@ -106,7 +106,10 @@ class SerialLink(Link[bytes]):
         return data, time.monotonic_ns()
 
     def _read(self, fd: int) -> bytes:
-        """Read a backlog as one packet, or its parts are dated as if they came one by one."""
+        """Read a backlog as one packet.
+
+        Its parts would be dated as if they came one by one.
+        """
         data = newest = os.read(fd, READ_BYTES)
         while len(newest) >= TERMINAL_BYTES and len(data) < READ_BYTES and self._poll.poll(0):
             try:

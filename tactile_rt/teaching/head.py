@@ -137,9 +137,9 @@ def fit_classes(
 def count_refused(
     features: Floats, labels: Sequence[str], kinds: Sequence[slice], others: Floats
 ) -> int:
-    """Count the touches of anything else (touch, step, feature) that are refused at the last step.
+    """Count the touches of anything else that are refused at the last step.
 
-    Each is judged by what is learnt without it.
+    Each of `others` (touch, step, feature) is judged by what is learnt without it.
     """
     told, refused = leave_one_out(features, labels, kinds), 0
     for k in range(len(others)):

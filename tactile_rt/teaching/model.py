@@ -167,7 +167,7 @@ class Enrolment:
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
         """Count the touches of anything else that are of none of the objects."""
-        found = self._enrolled(features, labels)
+        found = self._enrol(features, labels)
         assert self.card.identity is not None
         names = [identify(self.card.identity, found, [other[-1]])[0] for other in others]
         return names.count(NONE_OF_THESE)
@@ -187,13 +187,13 @@ class Enrolment:
             self.card,
             name=name,
             provenance={**self.card.provenance, **_made_by(), **told},
-            enrolled=self._enrolled(features, labels),
+            enrolled=self._enrol(features, labels),
         )
         data = with_metadata(self._data, METADATA_KEY, msgspec.json.encode(card).decode())
         write_whole(path, lambda file: file.write(data))
         return card
 
-    def _enrolled(self, features: Floats, labels: Sequence[str]) -> tuple[EnrolledObject, ...]:
+    def _enrol(self, features: Floats, labels: Sequence[str]) -> tuple[EnrolledObject, ...]:
         own = np.asarray(labels)
         return tuple(
             EnrolledObject.of(one, features[own == one, -1]) for one in dict.fromkeys(labels)
