@@ -530,9 +530,8 @@ def test_zeros_are_a_fault_where_the_tare_found_noise_and_else_foreseen(robot, t
         line = "stuck-at fault: source.a: all zeros: the device hangs"
         until(lambda: line in daemon.snapshot().degraded)
         until(lambda: daemon.snapshot().soon)
-        assert [t.line.split(": ")[:2] for t in daemon.snapshot().soon] == [
-            ["all zeros", "source.b"]
-        ]
+        (soon,) = daemon.snapshot().soon
+        assert soon.line.startswith("all zeros: source.b: ")
 
 
 def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):

@@ -214,6 +214,12 @@ def test_a_line_does_not_change_as_long_as_what_it_says_is_true():
     assert few == many
 
 
+def test_what_is_wrong_with_the_daemon_itself_is_told():
+    assert told(clock_stepped=True) == ["UTC has jumped: daemon: the wall clock was set"]
+    (line,) = told(refused="no such codec")
+    assert line.startswith("old configuration: daemon: ") and "no such codec" in line
+
+
 def test_a_diagnostic_says_since_when_it_lasts_and_what_to_do():
     onsets, utc = DiagnosticOnsets(), 1_700_000_000 * S
     lost = Diagnostic("source.a", "no samples", "fails: no port", "recording goes on")
@@ -285,17 +291,11 @@ def detector(after_s):
     return made
 
 
-def judged(values, after_s):
-    judge, found = detector(after_s), []
-    for chunk in chunks(values):
-        judge.add(chunk)
-        found.append(judge.seconds)
-    return found
-
-
 def test_no_number_is_equal_to_itself_and_zero_to_less_than_zero():
-    assert any(judged(np.full((900, 3, 2), np.nan), 0.05))
-    assert any(judged(np.resize([0.0, -0.0], (900, 3, 1)), 0.05))
+    for two, same in (((np.nan, np.nan), True), ((0.0, -0.0), True), ((1e-9, 2e-9), False)):
+        judge = detector(0.05)
+        judge.add(*chunks(np.resize(two, (900, 3, 1))))
+        assert bool(judge.seconds) == same
 
 
 @given(
@@ -355,9 +355,7 @@ def test_another_array_is_not_stuck():
     (100.0, (1, 6), 10.0, 0.0), (100.0, (1, 6), 0.2, 0.1),  # FT 300
     (100.0, (5, 3), 3.0, 0.3), (100.0, (5, 3), 0.2, 0.3),  # AnySkin
 ])  # fmt: skip
-def test_no_sensor_is_stuck_in_an_hour_of_rest_but_one_whose_noise_shows_and_stops_is(
-    rate, shape, noise, drift
-):
+def test_nothing_is_stuck_in_an_hour_of_rest_until_noise_stops(rate, shape, noise, drift):
     """Noise, and what it wanders by in a second, in steps that it is rounded to."""
     rng, size, fine = np.random.default_rng(0), (int(3600 * rate), *shape), noise > 1
     wander = np.cumsum(rng.normal(scale=drift / np.sqrt(rate), size=size), axis=0)
@@ -371,8 +369,8 @@ def test_no_sensor_is_stuck_in_an_hour_of_rest_but_one_whose_noise_shows_and_sto
 
 
 def test_who_hangs_again_and_again_is_told_each_time_until_it_turns_out_to_be_at_rest():
-    values = np.random.default_rng(0).normal(size=(40_000, 3, 2))
-    for k in range(31_000, 40_000, 1000):
+    values = np.random.default_rng(0).normal(size=(70_000, 3, 2))
+    for k in range(31_000, 70_000, 1000):
         values[k : k + 500] = values[k]
     values[-500] = values[-501]
     values[-500:, 1, 1] += 1.0  # the last time one value makes a step
@@ -380,8 +378,9 @@ def test_who_hangs_again_and_again_is_told_each_time_until_it_turns_out_to_be_at
     for chunk in chunks(values):
         judge.after_s = 0.25 if judge.noisy else float("inf")
         judge.add(chunk)
+        assert chunk.seq[-1] > 29_000 or not judge.noisy
         told.append(judge.seconds > 0)
-    assert np.diff(told).sum() == 18 and not judge.noisy and not judge.zeros
+    assert np.diff(told).sum() == 78 and not judge.noisy and not judge.zeros
 
 
 def sensor(noise, resolution):
@@ -397,6 +396,7 @@ def test_from_when_on_equal_samples_are_impossible_follows_from_the_noise():
     assert derive_stuck_at_s(spec, fine, each=True) == 2.0
     assert derive_stuck_at_s(spec, sensor(0.0, 1e-3)) == float("inf")
     assert derive_stuck_at_s(spec, sensor(1e-3, 0.0)) == 0.25
+    assert derive_stuck_at_s(spec, None, noisy=True) == 0.263
 
 
 def test_from_when_on_is_as_many_pairs_as_make_it_impossible():
@@ -407,21 +407,6 @@ def test_from_when_on_is_as_many_pairs_as_make_it_impossible():
     # twice the elements, half the pairs; and never fewer than three
     assert derive_stuck_at_s(small_spec(elements=2, rate_hz=1.0), sensor(1.0, np.sqrt(0.5))) == 11.0
     assert derive_stuck_at_s(spec, sensor(1.0, 1e-15)) == 3.0
-
-
-@given(ratio=st.floats(0.05, 3.0), seed=st.integers(0, 1000))
-def test_no_sensor_of_a_known_noise_is_taken_for_stuck(ratio, seed):
-    """White noise, rounded to steps of so many standard deviations: never so long the same."""
-    rate, density = 200.0, 1e-3
-    sigma = density * np.sqrt(rate / 2)
-    spec = small_spec(rate_hz=rate)
-    after_s = derive_stuck_at_s(spec, sensor(density, sigma / ratio))
-    noise = np.random.default_rng(seed).normal(scale=sigma, size=(2000, 3, 1))
-    rounded = (np.round(noise / (sigma / ratio)) * (sigma / ratio)).astype(np.float32)
-    judge = detector(after_s)
-    for chunk in cut(rounded, rate, 7):
-        judge.add(chunk)
-        assert judge.seconds == 0.0
 
 
 @pytest.mark.parametrize("resolution", [0.25, 0.5, 1.0])  # standard deviations of the noise

@@ -107,6 +107,16 @@ def test_what_is_urgent_does_not_wait_for_what_is_gathered():
     assert len(taken) == 3
 
 
+def test_every_item_has_a_class():
+    opened = Opened("a", SPEC, "u", ArraySource(SPEC, []), 1, 2)
+    others = (opened, Closed("a", 1), Contact("a", "m", "f", True, 1, 2), Control("x"), event())
+    items = (*others, samples(4), Packet("a", b"x", 0), decision())
+    box = Mailbox({type(item) for item in items}, 100, 1 << 20)
+    for item in items:
+        box.put(item)
+    assert box.state.waiting == {"samples": 4, "packets": 1, "decisions": 1, "events": len(others)}
+
+
 def test_who_joins_late_hears_of_open_streams_once_and_of_closed_ones_not_at_all():
     hub = Hub()
     for name in ("a", "b"):
