@@ -19,6 +19,7 @@ from bench.daemon.process import free_port
 from tests.helpers.hostile_models import GREEDY, no_number, write_burdened
 
 STUCK_AT_S = 0.3
+LEARNT_S, UNLIKE_S = 45.0, 2.4  # a stream's noise is known; 263 samples of ``finger``
 DISK_MB, SPARE_MB = 96, 24  # of the recordings' file system; that must be free
 STEP_S = 3600.0
 STOPPED_S, STARVED_S = 3.0, 10.0
@@ -63,6 +64,7 @@ class FaultScene(DisturbedDaemon):
 
     Attributes:
         disk: The folder of that disk.
+        began: The time just before the daemon was started, CLOCK_MONOTONIC, s.
     """
 
     def __init__(self) -> None:
@@ -70,6 +72,7 @@ class FaultScene(DisturbedDaemon):
         self._mounted: Path | None = None
 
     def _mount(self, model: Path) -> None:
+        self.began = time.monotonic()
         self.disk = model.parent / "disk"
         self.disk.mkdir()
         if may_mount():
@@ -147,6 +150,12 @@ def _mood(array: str, mood: str, effect_s: float = 0.0) -> Callable[[FaultScene]
         scene.arrays[array].ask("mood well")
 
     return cause
+
+
+def _stuck_by_its_noise(scene: FaultScene) -> Iterator[float]:
+    """Nobody describes the noise of the shipped model's sensor: the stream has to show it."""
+    time.sleep(max(0.0, LEARNT_S - (time.monotonic() - scene.began)))
+    yield from _mood("finger", "stuck", UNLIKE_S + 0.064)(scene)
 
 
 def _unplugged(array: str) -> Callable[[FaultScene], Iterator[float]]:
@@ -458,7 +467,9 @@ KINDS: dict[str, FaultKind] = {
     "device_stuck": FaultKind(
         _mood("whiskers", "stuck", STUCK_AT_S + 0.064), (("source.whiskers", "stuck-at fault"),)
     ),
-    "coarse_sensor_at_rest": FaultKind(_mood("finger", "stuck")),
+    "undescribed_device_stuck": FaultKind(
+        _stuck_by_its_noise, (("source.finger", "stuck-at fault"),)
+    ),
     "device_slow": FaultKind(  # two seconds are given to see it
         _mood("whiskers", "slow", 1.0 + 0.064), (("source.whiskers", "slow"),)
     ),

@@ -113,6 +113,7 @@ class Calibration:
         gain: (channel,) output unit per raw unit, of elements without a matrix; empty: none.
         tare: (channel,) offset in raw units by raw element; none: 0.
         noise: (channel,) standard deviation in raw units by raw element, when tared.
+        changes: share of readings that differed from the one before then; see `taring.Tare`.
         matrices: (output channel, channel) output unit per raw unit, by raw element.
         mapping: Raw element by output element, in the order of the output; empty if the elements
             come out as the device sends them.
@@ -135,6 +136,7 @@ class Calibration:
     gain: Row = ()
     tare: dict[str, Row] = field(default_factory=dict)
     noise: dict[str, Row] = field(default_factory=dict)
+    changes: float = 0.0
     matrices: dict[str, tuple[Row, ...]] = field(default_factory=dict)
     mapping: dict[str, str] = field(default_factory=dict)
     mirror: Mirror | None = None

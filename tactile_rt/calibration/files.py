@@ -46,6 +46,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     gain: tuple[float, ...] = ()
     tare: dict[str, Row] = {}
     noise: dict[str, Row] = {}
+    changes: float = 0.0
     matrices: dict[str, tuple[Row, ...]] = msgspec.field(name="matrix", default_factory=dict)
     mapping: dict[str, str] = {}
     mirror: Mirror | None = None
@@ -112,7 +113,7 @@ def _calibration(nodes: SettingNode) -> Calibration:
         )
     file: _File = convert(nodes, _File)
     raw, out = msgspec.structs.asdict(file.raw), file.output
-    parts = ("history", "gain", "tare", "noise", "matrices", "mapping", "mirror")
+    parts = ("history", "gain", "tare", "noise", "changes", "matrices", "mapping", "mirror")
     rest = {name: getattr(file, name) for name in parts}
     try:
         return Calibration(
@@ -129,6 +130,7 @@ def _written(c: Calibration) -> str:
         "# Of every element: output = matrix @ (raw - tare); then mapped, then mirrored.",
         f"version = {VERSION}",
         f"device = {_toml(c.device)}",
+        f"changes = {_toml(c.changes)}  # share of readings that differ from the one before, tared",
         "history = [",
         *(f"  {_toml(line)}," for line in c.history),
         "]",

@@ -40,6 +40,7 @@ class Tare:
     Attributes:
         offset: (element, channel) median, raw units; 0 of an element without enough valid samples.
         noise: (element, channel) standard deviation of a sample, raw units; 0 likewise.
+        changes: share of readings unlike the one before, where an element's channels repeat most.
         samples: (element,) valid samples that these rest on.
         seconds: Time from the first sample to the last one, s.
     """
@@ -47,6 +48,7 @@ class Tare:
     spec: ArraySpec
     offset: NDArray[np.float64]
     noise: NDArray[np.float64]
+    changes: float
     samples: NDArray[np.int64]
     seconds: float
 
@@ -84,19 +86,20 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
             f"{source.spec.name}: {samples.max()} valid samples in {t_s[-1]:.2g} s, and a tare "
             f"needs {LEAST_SAMPLES}: take {max(needed, np.ceil(seconds) + 1):g} s or more"
         )
-    troubles = []
+    troubles, changes = [], 1.0
     for i, element in enumerate(source.spec.elements):
         if samples[i] < LEAST_SAMPLES:
             continue
         quiet = whole.valid[:, i]
         values = whole.values[quiet, i].astype(np.float64)
         offset[i], noise[i] = _rest(values)
+        changes = min(changes, float((values[1:] != values[:-1]).mean(axis=0).max()))
         if trouble := _trouble(values, offset[i], noise[i], t_s[quiet], source.spec):
             troubles.append(f"element {element} {trouble}")
     if troubles:
         more = f" (and {len(troubles) - 1} more elements)" if len(troubles) > 1 else ""
         raise ConfigError(f"{source.spec.name}: {troubles[0]}{more}")
-    return Tare(source.spec, offset, noise, samples.astype(np.int64), float(t_s[-1]))
+    return Tare(source.spec, offset, noise, changes, samples.astype(np.int64), float(t_s[-1]))
 
 
 def record(source: Source, seconds: float) -> list[Chunk]:

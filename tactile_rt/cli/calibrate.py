@@ -67,6 +67,7 @@ def tare(
         f"{_now()} tare: {measured.seconds:.3g} s, {measured.samples.max()} samples",
         tare={**known.tare, **new},
         noise={**known.noise, **noise},
+        changes=round(measured.changes, 4),
     )
     save_calibration(known, path if out else None)
     told = {

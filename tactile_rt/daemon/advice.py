@@ -25,6 +25,7 @@ ADVICE = {
     "lost samples": "Look at cable, connectors, baud rate and bus load: `tactile-rt hz URL`.",
     "bad samples": "Look at the wiring, and at the scale and codec in the source's URL.",
     "stuck-at fault": "Touch it. If still nothing changes, turn the device off and on.",
+    "all zeros": "Touch it. If still nothing changes, look at the sensor's power and cable.",
     "slow": "Compare the device's rate with the one that it is described by; look at its load.",
     "device fault": "See its manual on what it says; what touches a broken sensor is not felt.",
     "another array": "Plug in the one that was there, or accept the new one by SIGHUP.",

@@ -52,7 +52,7 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
         array: A file of the array that the source is, as `tactile-rt describe` writes it, or an
             ``.onnx`` model, whose array it then is; empty if it is what the URL says.
         stuck_at_s: Time without any change of any value that is a stuck-at fault: the device hangs,
-            s; 0 for what follows from the sensor's noise, where a model on the source tells it,
+            s; 0 for what follows from the noise, where the model, the tare or the stream tells it,
             else for ever: a coarse sensor at rest does not change either.
     """
 

@@ -6,8 +6,12 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from tactile_rt.core.files import replaced
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.admission import file_stamp, model_path
@@ -21,9 +25,10 @@ from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
-from tactile_rt.daemon.part import Part
+from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
+from tactile_rt.drivers.health import Identity
 
 __all__ = ["Daemon"]
 
@@ -61,6 +66,9 @@ class Daemon:
         self._freeze = freeze
         self._hub = Hub()
         self._lines = Acquisition()
+        folder = os.environ.get("STATE_DIRECTORY")  # the service's, by systemd
+        self._memory = Path(folder, "arrays.json") if folder else None
+        self._arrays: dict[str, Identity] = {}  # that were accepted, by URL
         self._sources: dict[str, SourcePart] = {}
         self._models: dict[str, tuple[Any, ModelPart]] = {}
         self._consumers: dict[str, tuple[Any, ConsumerPart]] = {}
@@ -87,6 +95,7 @@ class Daemon:
         with self._changing:
             for wanted, consumer in ready:
                 self._add_consumer(wanted, consumer)
+            self._recall()
             self._reconcile()
         self.report("daemon", "starting", f"{self._loaded.path}")
         self._watcher.start()
@@ -178,6 +187,8 @@ class Daemon:
         utc = self._clock.utc_ns()
         found = self._onsets.explain(found, now, utc)
         soon = [Diagnostic(c.part.name, "disk full soon", c.soon) for c in consumers if c.soon]
+        zeros = [s.part.name for s in sources if s.zeros and not s.stuck_at_s]
+        soon += [Diagnostic(name, "all zeros", "at rest, or the device hangs") for name in zeros]
         state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(
@@ -248,12 +259,12 @@ class Daemon:
             elif key != new[0]:
                 self._models[name] = (new[0], running)
                 running.exchange(new[1])
-        old += [
-            self._sources.pop(name)
-            for name, part in list(self._sources.items())
-            # a file that one has failed of may be another by now; another array is accepted
-            if sources.get(name) != part.config or part.state.state == "failed" or part.another
-        ]
+        for name, part in list(self._sources.items()):
+            if part.another:  # it is accepted
+                self._arrays.pop(part.config.url, None)
+            elif sources.get(name) == part.config and part.state.state != "failed":
+                continue  # of what one has failed of the file may be another by now
+            old.append(self._sources.pop(name))
         self._end(old)
         for name, (key, model) in models.items():
             if name not in self._models:
@@ -266,6 +277,7 @@ class Daemon:
                 self._sources[name].limits = limits
             else:
                 part = SourcePart(source, self._hub, self.report, limits, self._clock, self._lines)
+                part.accepted = self._arrays.get(source.url)
                 self._sources[name] = part
                 part.start()
 
@@ -289,6 +301,7 @@ class Daemon:
         while not self._unwatch.wait(WATCH_S):
             self._notice_starving()
             self._hold_devices()
+            self._remember()
             self.turned("watch")
             for name, source in self._sources.copy().items():
                 on_it = (p for _, p in self._models.copy().values() if p.config.source == name)
@@ -316,6 +329,25 @@ class Daemon:
                 done, self._on_over = self._on_over, None
                 if done is not None:
                     done()
+
+    def _recall(self) -> None:
+        if self._memory is None or not self._memory.exists():
+            return
+        try:
+            self._arrays = msgspec.json.decode(self._memory.read_bytes(), type=dict[str, Identity])
+        except Exception as error:  # whatever is wrong with it
+            self.report("daemon", "memory", f"delete {self._memory}: {reason_of(error)}", "warning")
+
+    def _remember(self) -> None:
+        known = {p.config.url: p.accepted for p in self._sources.copy().values() if p.accepted}
+        if self._memory is None or (arrays := {**self._arrays, **known}) == self._arrays:
+            return
+        self._arrays = arrays
+        try:
+            with replaced(self._memory) as file:
+                file.write(msgspec.json.encode(arrays))
+        except OSError as error:
+            self.report("daemon", "memory", reason_of(error), "warning")
 
     def _hold_devices(self) -> None:
         """A link to a device that was plugged in again leads to another one: that is held now, and

@@ -135,7 +135,7 @@ def _of_source(
             why = f"when they come they are older than {most:g} s"
             found.append(Diagnostic(name, "late samples", why))
     if source.stuck_at_s:
-        why = "the values do not change at all, as no sensor's do: the device hangs"
+        why = f"{'all zeros' if source.zeros else 'no value changes'}: the device hangs"
         found.append(Diagnostic(name, "stuck-at fault", why))
     elif source.stuck:
         why = f"no value of {name_some(source.stuck)} changes: it hangs, or is out of range"

@@ -107,6 +107,7 @@ class SourceState:
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some
     stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
+    zeros: bool = False  # nothing else has come
     another: str = ""  # why the array is another one than the source began with
     # what the device measured within the newest second, lost or not; 0: unknown
     measured_hz: float = 0.0

@@ -16,6 +16,7 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
+from tactile_rt.calibration import CalibratedSource
 from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.core.errors import SourceError, SpecMismatch
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
@@ -28,7 +29,7 @@ from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.rate_meter import RateMeter
-from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
+from tactile_rt.daemon.stuck_at import OFTEN, StuckAtDetector, derive_stuck_at_s
 from tactile_rt.drivers.device_source import ArrayChanged, DeviceSource, device_of
 from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.reader import Reader
@@ -131,7 +132,7 @@ class SourcePart(Part):
         self._stuck_at = StuckAtDetector()
         self._losses, self._bads = LossWindow(), LossWindow()
         self._rate = RateMeter()
-        self._accepted: Identity | None = None  # the array that it began with
+        self.accepted: Identity | None = None  # the array that it began with
         self.another = ""  # why the one that is there now is not that one
         self._offset_ns = 0
         self._look_ns = self._pause_ns = 0
@@ -152,7 +153,7 @@ class SourcePart(Part):
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
             bad_samples=self._bad, bad=self._bads.add(self._bad), stuck_at_s=self._stuck_at.seconds,
-            another=self.another,
+            zeros=self._stuck_at.zeros, another=self.another,
         )  # fmt: skip
         if spec is None:
             return about
@@ -174,8 +175,8 @@ class SourcePart(Part):
         """Say what the sensor of a model on this source is, if there is one that tells."""
         spec, device = self._spec, self._device
         after_s, each_s = self.config.stuck_at_s, math.inf
-        if not after_s and spec is not None and device is not None and sensor is not None:
-            after_s = derive_stuck_at_s(spec, sensor)
+        if not after_s and spec is not None and device is not None:
+            after_s = derive_stuck_at_s(spec, sensor, noisy=self._stuck_at.noisy)
             each_s = derive_stuck_at_s(spec, sensor, each=True)
         self._stuck_at.after_s, self._stuck_at.each_after_s = after_s or math.inf, each_s
 
@@ -219,18 +220,21 @@ class SourcePart(Part):
         try:
             stream = self._open()
         except SpecMismatch as error:
-            if self._accepted is None:
+            if self._spec is None:
                 raise
             raise SourceError(str(error)) from None  # the array may be exchanged again
         self._stream, self._spec, self._device = stream, stream.spec, device_of(stream)
         if self._device is not None:
             found = self._device.identity
-            self._accepted = self._accepted or found
-            self.another = found.difference(self._accepted)
-            if found.serial_number and not self.another:
-                self._accepted = found
+            known = self.accepted or found
+            if not self._device.describes:  # then its file is what may have changed
+                known = dataclasses.replace(known, spec=found.spec)
+            self.another = found.difference(known)
+            self.accepted = found if found.serial_number and not self.another else known
         if self._stop.is_set():
             return
+        noisy = isinstance(stream, CalibratedSource) and stream.calibration.changes > OFTEN
+        self._stuck_at, self._held = StuckAtDetector(stream.spec.rate_hz, noisy), list[Chunk]()
         self._announced = True
         self._busy_ns = time.monotonic_ns()
         self._announce(stream)
@@ -264,7 +268,7 @@ class SourcePart(Part):
         good, bad = without_bad_samples(chunk)
         useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
-        self._stuck_at.add(good)
+        self._held.append(good)
         if self._device is not None:
             self._rate.add(*self._device.measured)
         spec, accepted = stream.spec, not self.another
@@ -328,6 +332,9 @@ class SourcePart(Part):
     def _look(self, now: int) -> None:
         """Tell what has changed about the device."""
         self._look_ns = now + LOOK_NS
+        if self._held:
+            self._stuck_at.add(*self._held)
+            self._held = []
         self._offset_ns = self._clock.utc_offset_ns()
         if self._device is None:
             return

@@ -3,6 +3,10 @@
 A sensor whose noise is above its resolution cannot give the same values twice; one that is coarse
 gives the same ones for as long as it rests. So equal samples are a fault only where the noise is
 known, or somebody says for how long is too long.
+
+Where no description tells it, readings do that differ from the one before in three cases of four,
+in the tare or in each half minute of the stream: noise above a step does so, and a quarter of it,
+once motors stop, still changes one of ten at any level.
 """
 
 import math
@@ -10,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 
 __all__ = ["StuckAtDetector", "derive_stuck_at_s"]
@@ -19,74 +23,81 @@ LEAST_S = 0.25  # a hiccup of a driver that repeats a sample is no device that h
 LEAST_EACH_S = 2.0  # of one element: a firm touch may hold it at the end of its range
 LEAST_PAIRS = 3
 IMPOSSIBLE = 1e-12  # probability
+OFTEN, SELDOM = 0.75, 0.1  # shares of readings that differ from the one before: see above
+WINDOW_S, WINDOW_SAMPLES = 30.0, 2000  # in which they are counted, at least
 
 
 class StuckAtDetector:
     """Measures for how long the values have been the same.
 
     Attributes:
-        after_s: The time for which they may be, s; infinite: for ever, and nothing is looked at.
+        after_s: The time for which they may be, s; infinite: for ever.
         each_after_s: The same of one element, while others change.
+        noisy: Whether some values change often, at rest, too, as the tare or the stream says.
         seconds: The time for which no value has changed, s; 0 unless that is longer than it may be.
         elements: The numbers of elements of which no value has changed for too long.
+        zeros: Whether all values have been 0 since the first sample, for two seconds or more.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, rate_hz: float = 1000.0, noisy: bool = False) -> None:
         self.after_s = self.each_after_s = math.inf
-        self._last: NDArray[np.float32] | None = None
-        self._since_ns = 0
-        self._each_ns: NDArray[np.int64] | None = None  # since when, of each element
-        self.seconds, self.elements = 0.0, tuple[int, ...]()
+        self.noisy, self._window = noisy, max(WINDOW_SAMPLES, WINDOW_S * rate_hz)
+        self._last: NDArray[np.uint32] | None = None
+        self._began_ns = self._since_ns = self._counted = 0
+        self.seconds, self.elements, self.zeros = 0.0, tuple[int, ...](), False
 
-    def add(self, chunk: Chunk) -> None:
+    def add(self, *chunks: Chunk) -> None:
         """Take the next samples of the stream; those without any valid element say nothing."""
-        if math.isinf(self.after_s):
-            self._last, self._each_ns, self.seconds, self.elements = None, None, 0.0, ()
-            return
-        values = chunk.values.view(np.uint32)  # bits: what is no number is equal to itself, too
+        chunk = concatenate(list(chunks))
+        values = (chunk.values + 0.0).view(np.uint32)  # bits: NaN is equal to NaN, and -0 to 0
         last, self._last = self._last, values[-1]
-        useless = np.asarray(~chunk.valid.any(axis=1))
-        changed = useless[1:] | (values[1:] != values[:-1]).any(axis=(1, 2))
-        first = last is None or last.shape != values[0].shape or bool((values[0] != last).any())
-        if changed.any():
-            self._since_ns = int(chunk.t_ns[1 + int(np.flatnonzero(changed)[-1])])
-        elif first or useless[0]:
-            self._since_ns = int(chunk.t_ns[0])
+        if last is None or last.shape != values[0].shape:
+            self._began_ns, last = int(chunk.t_ns[0]), ~values[0]
+            self._each_ns = np.zeros(len(last), np.int64)  # since when, of each element
+            self._differed, self._changes = np.zeros(last.shape, np.int64), np.ones(last.shape)
+        differs = (values != np.concatenate([last[None], values[:-1]])) & chunk.valid[..., None]
+        moved, useful = differs.any(axis=2), chunk.valid.any(axis=1)
+        if (new := np.flatnonzero(moved.any(axis=1) | ~useful)).size:
+            self._since_ns = int(chunk.t_ns[new[-1]])
         same_s = (int(chunk.t_ns[-1]) - self._since_ns) / NS_PER_S
-        self.seconds = same_s if same_s > self.after_s else 0.0
-        if last is None or last.shape != values[0].shape or self._each_ns is None:
-            self._each_ns = np.full(values.shape[1], chunk.t_ns[0], dtype=np.int64)
-            last = values[0]
-        before = np.concatenate([last[None], values[:-1]])
-        moved = (values != before).any(axis=2) | ~chunk.valid
-        newest = np.where(moved, chunk.t_ns[:, None], self._each_ns).max(axis=0)
+        before_s, self.seconds = self.seconds, same_s if same_s > self.after_s else 0.0
+        newest = np.where(moved | ~chunk.valid, chunk.t_ns[:, None], self._each_ns).max(axis=0)
         self._each_ns = np.maximum(self._each_ns, newest)
-        still_s = (int(chunk.t_ns[-1]) - self._each_ns) / NS_PER_S
-        stuck = () if self.seconds else np.flatnonzero(still_s > self.each_after_s)
-        self.elements = tuple(map(int, stuck))
+        still = (int(chunk.t_ns[-1]) - self._each_ns) / NS_PER_S > self.each_after_s
+        self.elements = () if self.seconds else tuple(map(int, np.flatnonzero(still)))
+        first = self._since_ns == self._began_ns and same_s > LEAST_EACH_S
+        self.zeros = first and not chunk.values[-1].any()
+        if before_s and not self.seconds:
+            noisy = self._changes > OFTEN
+            if (differs[moved.any(axis=1).argmax()] & noisy).sum() < noisy.sum() / 2:
+                self._changes[:], self.noisy = 0.0, False  # one step of one: it was at rest
+        self._counted += int(useful.sum())
+        self._differed += differs.sum(axis=0)
+        if self._counted >= self._window and not self.seconds:
+            self._changes = np.minimum(self._changes, self._differed / self._counted)
+            self.noisy = bool((self._changes > OFTEN).any())
+        if self._counted >= self._window or self.seconds:  # a fault says nothing of the noise
+            self._counted, self._differed[:] = 0, 0
 
 
-def derive_stuck_at_s(spec: ArraySpec, sensor: SensorSpec, each: bool = False) -> float:
+def derive_stuck_at_s(
+    spec: ArraySpec, sensor: SensorSpec | None, each: bool = False, noisy: bool = False
+) -> float:
     """Derive from the noise for how long samples may be equal, s; infinite: for ever.
 
     Args:
         each: of one element, not of all together.
+        noisy: whether some values change often, where no sensor tells more.
 
     Two readings of a channel with white noise of standard deviation s, rounded to steps of q, are
     equal with a probability of about q / (2 s sqrt(pi)), and at most 1; channels are independent.
     """
-    log_p = 0.0
-    for channel in sensor.channels:
-        s = channel.noise_density * math.sqrt(spec.rate_hz / 2)
-        if not s:
-            continue
-        if not channel.resolution:
-            log_p = -math.inf
-            break
-        log_p += (1 if each else len(spec.elements)) * min(
-            0.0, math.log(channel.resolution / (2 * s * math.sqrt(math.pi)))
-        )
-    if not log_p:
+    p = 1 - SELDOM if noisy and sensor is None else 1.0
+    for channel in sensor.channels if sensor is not None else ():
+        if s := channel.noise_density * math.sqrt(spec.rate_hz / 2):
+            p *= min(1.0, channel.resolution / (2 * s * math.sqrt(math.pi)))
+    if p == 1:
         return math.inf
+    log_p = math.log(max(p, IMPOSSIBLE)) * (1 if each or sensor is None else len(spec.elements))
     pairs = max(LEAST_PAIRS, math.ceil(math.log(IMPOSSIBLE) / log_p))
     return max(LEAST_EACH_S if each else LEAST_S, pairs / spec.rate_hz)

@@ -103,7 +103,7 @@ class DeviceSource(Source):
         self._poll_at = 0.0
         self._looked_ns = 0  # when nothing had come
         self._asked_ns, self._resets = 0, 0  # when it was last asked again; its counter's then
-        self._describes = codec.describes and codec.spec is None
+        self.describes = codec.describes and codec.spec is None
         self._early: list[Samples] = []  # that came while the device was being started
         try:
             self._open()
@@ -247,14 +247,14 @@ class DeviceSource(Source):
             return None
         if found is None:
             self._looked_ns = time.monotonic_ns()
-            if self._describes:
+            if self.describes:
                 self._ask_again(self._looked_ns)
             return None
         packet, t_ns = found
         if self._tap is not None:
             self._tap(packet, t_ns)
         samples = self.codec.feed(packet, t_ns)
-        if self._describes:
+        if self.describes:
             self._ask_again(t_ns)
             if self.codec.spec is not self._described:
                 self._compare()
@@ -334,7 +334,7 @@ class DeviceSource(Source):
             self._do(step)
         if self._stamper is not None:  # it was there before
             end = time.monotonic() + DESCRIBED_S
-            while self._describes and self.codec.spec is self._described and time.monotonic() < end:
+            while self.describes and self.codec.spec is self._described and time.monotonic() < end:
                 self._listen(0.01, None)
             self._compare()
 

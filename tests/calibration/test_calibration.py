@@ -62,6 +62,7 @@ def whole_calibration(rng: np.random.Generator) -> Calibration:
         gain=(1e-6, 2e-6, 3e-6, 1e-9, 2e-9, 3e-9),
         tare={"A0": tuple(rng.normal(size=6).tolist()), "A2": (1.0, -2.0, 0.0, 1e-300, 3.5, 1e22)},
         noise={"A0": (0.1,) * 6},
+        changes=0.875,
         matrices={"A2": rows(rng.normal(size=(6, 6)))},
         mapping={"C2": "A2", "weird name\n\"'\\ü\x7f": "A0"},
         mirror=Mirror("y", "x", {"fx": 1}),
@@ -494,6 +495,7 @@ def test_a_tare_is_the_median_and_its_noise_the_standard_deviation() -> None:
     expected = 8e6 + 1000 * np.arange(6)
     np.testing.assert_allclose(measured.offset - expected, 0, atol=0.8)  # float32 counts by 0.5
     np.testing.assert_allclose(measured.noise, 5, rtol=0.12)
+    assert 0.9 < measured.changes < 1
     assert measured.samples.tolist() == [2000] * 4
     assert measured.seconds == pytest.approx(1.999)
     assert measured.untared == ()

@@ -500,6 +500,40 @@ def test_another_array_is_told_and_nothing_is_decided_of_it_until_it_is_accepted
             until(lambda: any(d.sample_ns > since_ns for d in spy.of(Decision)))
 
 
+def test_which_array_was_accepted_outlives_the_daemon(robot, tmp_path, monkeypatch):
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    memory, link = tmp_path / "arrays.json", str(tmp_path / "w")
+    memory.write_text('{"')
+    found = []
+    for number, accepts in (("A", False), ("B", True), ("B", False), ("A", False)):
+        options = {"serial_number": number}
+        with FakeSerial(touching(60_000), spec=SPEC, link=link, options=options) as array:
+            text = source("w", array.url.partition("&")[0])
+            daemon, spy = robot(text)
+            until(lambda spy=spy: spy.of(SourceChunk))
+            found.append(daemon.snapshot().sources[0].another)
+            if accepts:
+                daemon.reload(configured(tmp_path, text))
+            kept = f'"serial_number":"{"A" if len(found) == 1 else "B"}"'
+            until(lambda kept=kept: kept in memory.read_text())
+            assert len(spy.told("daemon", "memory")) == (len(found) == 1)
+            daemon.stop()
+    assert found == ["", "its serial number is B, not A", "", "its serial number is A, not B"]
+
+
+def test_zeros_are_a_fault_where_the_tare_found_noise_and_else_foreseen(robot, tmp_path):
+    save_calibration(replace(Calibration.of("pad", SPEC), changes=0.9), tmp_path / "pad.toml")
+    zeros = np.zeros((60_000, *SPEC.shape))
+    with FakeSerial(zeros, spec=SPEC) as tared, FakeSerial(zeros, spec=SPEC) as other:
+        tables = source("a", tared.url) + 'calibration = "pad.toml"\n', source("b", other.url)
+        daemon, _ = robot("".join(tables))
+        line = "stuck-at fault: source.a: all zeros: the device hangs"
+        until(lambda: line in daemon.snapshot().degraded)
+        until(lambda: daemon.snapshot().soon)
+        (soon,) = daemon.snapshot().soon
+        assert soon.line.startswith("all zeros: source.b: ")
+
+
 def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):
     base, port = source("a", "synthetic:"), tmp_path / "tty"
     daemon, _ = robot(base, locks=Locks())

@@ -1,6 +1,5 @@
 """Numbers in messages: as few digits as numpy's own shortest text of a float32, and no fewer."""
 
-import json
 import re
 
 import numpy as np
@@ -8,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.daemon.messages import encode, message_of, shortest
-from tactile_rt.testing import small_spec
-from tests.helpers.published import samples
+from tactile_rt.daemon.messages import shortest
 
 
 def digits(text):
@@ -44,10 +41,3 @@ def test_the_shape_stays_and_so_does_what_is_no_number(shape):
     odd = np.array([np.nan, np.inf, -np.inf, -0.0], np.float32)
     assert repr(shortest(odd).tolist()) == "[nan, inf, -inf, -0.0]"
     assert shortest(np.array([[0.1, 0.2], [0.3, 0.4]], np.float32).T)[0, 1] == 0.3
-
-
-def test_samples_are_published_so():
-    line = encode(message_of(samples(small_spec(2), [[0.1, -1 / 3], [1e-9, 12.5]])))
-    assert b'"values":[[[0.1,-0.33333334],[1e-9,12.5]]]' in line
-    values = np.array(json.loads(line)["values"], np.float32)
-    assert np.array_equal(values[0], np.array([[0.1, -1 / 3], [1e-9, 12.5]], np.float32))

@@ -31,13 +31,7 @@ def test_the_unit_opens_folders_of_the_services_own_and_nothing_else(tmp_path):
     )
     check_config(load_config(file))  # a folder that systemd will make need not be there
     lines = unit_text([sys.executable, "run", str(file)], config, "tactile").splitlines()
-    for line in (
-        "Type=notify", "NoNewPrivileges=yes", "ProtectSystem=strict", "DevicePolicy=closed",
-        "DeviceAllow=char-ttyACM rw", "WatchdogSec=15", "RestartPreventExitStatus=2 3",
-        "User=tactile", "CapabilityBoundingSet=", "StateDirectory=tactile-rt",
-        "LogsDirectory=tactile-rt",
-    ):  # fmt: skip
-        assert line in lines
+    assert {"StateDirectory=tactile-rt", "LogsDirectory=tactile-rt"} <= {*lines}
     assert not any(x.startswith(("ReadWritePaths", "RuntimeDirectory")) for x in lines)
 
 

@@ -444,7 +444,8 @@ def test_the_documents_frames_and_description_are_the_codecs() -> None:
     samples = codec.feed(bytes.fromhex("".join(pairs)), T0)
     assert samples.values[:, 0].tolist() == [[1.5, -2.0], pytest.approx([0.1, -1e-3])]
     assert samples.count.tolist() == [7, 8] and samples.status.tolist() == [0, 1]
-    assert codec.stats.intact == 7 and codec.stats.corrupt == codec.stats.skipped == 0
+    assert (codec.serial_number, codec.spec) == ("A1", described.spec)
+    assert codec.stats.intact == 8 and codec.stats.corrupt == codec.stats.skipped == 0
     bus = NativeCan(NativeCanOptions(base=0x100))
     bus.spec = described.spec
     lines = re.findall(r"^(10\d) ((?: [0-9A-F]{2})+)", can, re.M)
