@@ -16,7 +16,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from tactile_rt.calibration import CalibratedSource
 from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.core.errors import SourceError, SpecMismatch
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
@@ -30,7 +29,12 @@ from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.rate_meter import RateMeter
 from tactile_rt.daemon.stuck_at import OFTEN, StuckAtDetector, derive_stuck_at_s
-from tactile_rt.drivers.device_source import ArrayChanged, DeviceSource, device_of
+from tactile_rt.drivers.device_source import (
+    ArrayChanged,
+    DeviceSource,
+    device_of,
+    share_of_changes,
+)
 from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
@@ -233,7 +237,7 @@ class SourcePart(Part):
             self.accepted = found if found.serial_number and not self.another else known
         if self._stop.is_set():
             return
-        noisy = isinstance(stream, CalibratedSource) and stream.calibration.changes > OFTEN
+        noisy = share_of_changes(stream) > OFTEN
         self._stuck_at, self._held = StuckAtDetector(stream.spec.rate_hz, noisy), list[Chunk]()
         self._announced = True
         self._busy_ns = time.monotonic_ns()

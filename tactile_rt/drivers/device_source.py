@@ -19,7 +19,7 @@ from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.links import Link
 
-__all__ = ["ArrayChanged", "DeviceOptions", "DeviceSource", "Tap", "device_of"]
+__all__ = ["ArrayChanged", "DeviceOptions", "DeviceSource", "Tap", "device_of", "share_of_changes"]
 
 # Called with each packet as it came and its arrival (host time, ns), and with None whenever the
 # line has been opened. It must be quick: the device is not read meanwhile.
@@ -445,3 +445,8 @@ def device_of(source: Source) -> DeviceSource | None:
     while isinstance(source, CalibratedSource):
         source = source.source
     return source if isinstance(source, DeviceSource) else None
+
+
+def share_of_changes(source: Source) -> float:
+    """Return the share of readings that changed while its tare was taken; 0: unknown."""
+    return source.calibration.changes if isinstance(source, CalibratedSource) else 0.0
