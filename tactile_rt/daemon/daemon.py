@@ -301,7 +301,6 @@ class Daemon:
         while not self._unwatch.wait(WATCH_S):
             self._notice_starving()
             self._hold_devices()
-            self._remember()
             self.turned("watch")
             for name, source in self._sources.copy().items():
                 on_it = (p for _, p in self._models.copy().values() if p.config.source == name)
@@ -354,6 +353,7 @@ class Daemon:
         the one before is free for others."""
         if self._changing.acquire(blocking=False):
             try:
+                self._remember()
                 with suppress(AlreadyRunning):  # then opening it fails, and says so
                     self._hold(self._loaded, self._configured)
             finally:
