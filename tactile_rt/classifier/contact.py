@@ -135,6 +135,11 @@ class ContactDetector:
         """Whether the baseline is complete."""
         return len(self._baseline) >= MIN_BASELINE_SAMPLES
 
+    @property
+    def drift(self) -> NDArray[np.float64]:
+        """(element, channel) slope of the baseline, SI per sample; 0: none that is certain."""
+        return np.broadcast_to(self._drift.slope, self.offset.shape)
+
     def update(self, sample: Floats, valid: NDArray[np.bool_]) -> bool:
         """Take one sample; return True when contact begins with it.
 

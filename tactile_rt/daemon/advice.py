@@ -41,6 +41,7 @@ ADVICE = {
     "no metrics": "Free its port, or name another one.",
     "no log": "Look at the file's folder and disk; of stderr, at the program that reads it.",
     "no systemd": "Look at the unit: NotifyAccess and WatchdogSec.",
+    "offset drifts": "Let the sensor warm up, then tare; keep draughts and heat off it.",
     "disk full soon": "Move or delete recordings, or record less (see [recorder]).",
 }
 

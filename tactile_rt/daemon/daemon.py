@@ -189,6 +189,8 @@ class Daemon:
         soon = [Diagnostic(c.part.name, "disk full soon", c.soon) for c in consumers if c.soon]
         zeros = [s.part.name for s in sources if s.zeros and not s.stuck_at_s]
         soon += [Diagnostic(name, "all zeros", "at rest, or the device hangs") for name in zeros]
+        drifts = [(m.part.name, m.drift) for m in models if m.drift]
+        soon += [Diagnostic(name, "offset drifts", drift) for name, drift in drifts]
         state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(

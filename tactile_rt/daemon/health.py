@@ -143,6 +143,7 @@ class ModelState:
     object: str = ""  # enrolled one that the newest decision's touch is of, or "none of these"
     bad_steps: int = 0  # whose answer was no number, so that there was no decision
     undecided: bool = False  # the newest step was one of them
+    drift: str = ""  # which reading moves while nothing is touched, and how fast
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from tactile_rt.classifier.model_card import sensor_of
 from tactile_rt.classifier.model_file import hash_of
 from tactile_rt.classifier.trial import Trial
 from tactile_rt.core.errors import ConfigError, SpecMismatch, TactileError
-from tactile_rt.core.stream import NS_PER_S, Chunk, Source, concatenate
+from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, Source, concatenate
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
@@ -80,6 +80,7 @@ class ModelPart(Part):
     def model_state(self) -> ModelState:
         """For the snapshot."""
         newest, queue, classifier = self._newest, self.box.state, self._classifier
+        opened = self._opened
         return ModelState(
             self.state, self.config.source, str(self.file), self._sha256, self._labels,
             queue, self._decisions, self._final, self._touching,
@@ -90,6 +91,7 @@ class ModelPart(Part):
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
             self.refused, classifier is not None and classifier.implausible, self._object,
             self._bad_steps, classifier is not None and classifier.undecided,
+            _find_drift(classifier, opened.spec) if classifier and opened else "",
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -376,3 +378,14 @@ class ModelPart(Part):
         if not frame and self._opened is not None:
             frame, offset = self._opened.spec.frame, self._clock.utc_offset_ns()
         self._hub.post(Contact(self.config.source, self.config.name, frame, touching, t_ns, offset))
+
+
+def _find_drift(classifier: Classifier, spec: ArraySpec) -> str:
+    """Say which reading moves most, untouched; empty: none by its noise in 1 s."""
+    detector, period_s = classifier.detector, classifier.card.period_ns / NS_PER_S
+    moves = np.abs(detector.drift) / detector.sigma / period_s
+    at = np.unravel_index(moves.argmax(), moves.shape)
+    if moves[at] < 1:
+        return ""
+    where, minute = spec.elements[at[0]], 60 * float(detector.drift[at]) / period_s
+    return f"{where} {spec.channels[at[1]]} moves by {minute:.2g} {spec.units[at[1]]} a minute"

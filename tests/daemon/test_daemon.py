@@ -534,6 +534,18 @@ def test_zeros_are_a_fault_where_the_tare_found_noise_and_else_foreseen(robot, t
         assert soon.line.startswith("all zeros: source.b: ")
 
 
+def test_a_drift_is_foreseen_and_says_which_reading(robot, tmp_path):
+    values = np.random.default_rng(0).normal(scale=0.1, size=(60_000, *SPEC.shape))
+    values[:, 1, 0] += 0.4 * np.arange(60_000) / 1000  # a second
+    with FakeSerial(values.astype(np.float32), spec=SPEC) as array:
+        model = model_of(write_model(tmp_path / "m.onnx"), source="w")
+        daemon, _ = robot(source("w", array.url) + model)
+        until(lambda: daemon.snapshot().soon)
+        (soon,) = daemon.snapshot().soon
+    where = f"{SPEC.elements[1]} {SPEC.channels[0]}"
+    assert soon.line.startswith(f"offset drifts: model.w: {where} moves by 2")  # 24 N a minute
+
+
 def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):
     base, port = source("a", "synthetic:"), tmp_path / "tty"
     daemon, _ = robot(base, locks=Locks())
