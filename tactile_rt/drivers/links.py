@@ -2,6 +2,7 @@
 
 import abc
 import errno
+import math
 import os
 import select
 import time
@@ -16,6 +17,7 @@ __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
 
 READ_BYTES = 65_536
 TERMINAL_BYTES = 4095  # that Linux's terminals give at most at a time
+STALLED_S = 0.15  # for so long nobody looked: what has come meanwhile is one packet
 MOST_FRAMES = 512  # taken from a bus at a time
 WAIT_S = 0.05  # how soon a line without a descriptor looks for the end of the wait
 
@@ -79,6 +81,7 @@ class SerialLink(Link[bytes]):
         except (OSError, ValueError, AttributeError) as error:
             raise SourceError(f"{port}: {_why(port, error)}") from None
         self.usb_number = _usb_number(os.path.realpath(port))
+        self._looked_s = math.inf
         try:
             self._fd: int | None = self._port.fileno()
             self._terminal, self._blocks = os.isatty(self._fd), os.get_blocking(self._fd)
@@ -88,31 +91,36 @@ class SerialLink(Link[bytes]):
             self._fd = None
 
     def receive(self, timeout_s: float) -> tuple[bytes, int] | None:
+        stalled = time.monotonic() - self._looked_s > STALLED_S
         try:
             if self._fd is None:
                 return self._receive_slowly(timeout_s)
             if timeout_s > 0 or self._blocks:
                 if not self._poll.poll(1e3 * max(timeout_s, 0.0)):
                     return None
-            data = self._read(self._fd)
+            data = self._read(self._fd, stalled)
             if not data and timeout_s <= 0 and self._terminal and not self._hung_up():
                 return None  # a terminal that has nothing gives nothing; it may have by now
         except BlockingIOError:
             return None
         except (OSError, ValueError, TypeError) as error:  # closed meanwhile, or unplugged
             raise SourceError(f"{self.name}: the line is gone ({_reason(error)})") from None
+        finally:
+            self._looked_s = time.monotonic()
         if not data:
             raise SourceError(f"{self.name}: the line is gone (unplugged, or hung up)")
         return data, time.monotonic_ns()
 
-    def _read(self, fd: int) -> bytes:
-        """Read a backlog as one packet.
+    def _read(self, fd: int, whole: bool) -> bytes:
+        """Read what has come, or a part of it.
 
-        Its parts would be dated as if they came one by one.
+        The parts of a backlog, after nobody looked, would be dated as if they came one by one.
         """
         data = newest = os.read(fd, READ_BYTES)
-        while len(newest) >= TERMINAL_BYTES and len(data) < READ_BYTES and self._poll.poll(0):
+        while whole and len(newest) >= TERMINAL_BYTES and len(data) < READ_BYTES:
             try:
+                if not self._poll.poll(0):
+                    break
                 newest = os.read(fd, READ_BYTES)
             except OSError:
                 break  # the next call meets it, too
