@@ -303,11 +303,12 @@ class _Drift:
         left = means - self._mean - t[:, None, None] * slope
         noise = sigma**2 / BLOCK_SAMPLES
         variance = np.square(left).sum(axis=0) / (len(t) - 2)
-        self.straight = not (variance > STRAIGHT * noise).any()
+        lines = variance <= STRAIGHT * noise  # a step is none, steep as its slope may be
+        self.straight = bool((lines | np.isnan(variance)).all())
         if not self.straight and len(self._blocks) > FEWEST_BLOCKS:
             self._blocks.popleft()  # it began later: look back less far
         self._error = np.sqrt(np.maximum(variance, noise) / np.square(t).sum())  # of the slope
-        certain = np.abs(slope) > DRIFTS * self._error
+        certain = lines & (np.abs(slope) > DRIFTS * self._error)
         self.slope, self.found = np.where(certain, slope, 0.0), bool(certain.any())
         return True
 
