@@ -104,7 +104,7 @@ class Lesson:
     touches: list[TaughtTouch] = field(default_factory=list)
     lost: int = 0
     unfelt: list[str] = field(default_factory=list)
-    _listeners: list[Listener] = field(default_factory=list)  # to all that was felt
+    _largest: list[NDArray[np.float32]] = field(default_factory=list)  # of each listener
 
     @classmethod
     def begun(cls, folder: Path, spec: ArraySpec, floor: NDArray[np.float32]) -> "Lesson":
@@ -198,7 +198,7 @@ class Lesson:
         recording = Recording(path)
         # which of them counted, the labels tell
         listener = Listener(model, recording.spec, self.taught.describe, hasty_ns=0)
-        self._listeners.append(listener)
+        self._largest.append(listener.largest)
         found = []
         for chunk in recording:
             found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
@@ -206,8 +206,9 @@ class Lesson:
 
     def listener(self, spec: ArraySpec) -> Listener:
         """That finds touches in a stream of an array."""
-        self._listeners.append(Listener(self.folder / FEATURES, spec, self.taught.describe))
-        return self._listeners[-1]
+        listener = Listener(self.folder / FEATURES, spec, self.taught.describe)
+        self._largest.append(listener.largest)
+        return listener
 
     def next_recording(self) -> Path:
         """The path of the recording that goes on with the lesson."""
@@ -304,7 +305,7 @@ class Lesson:
             self._features(used),
             names,
             self._others(),
-            np.max([one.largest for one in self._listeners], axis=0, initial=0.0),
+            np.max(self._largest, axis=0, initial=0.0),
             self.folder.resolve().name,
             told,
         )

@@ -73,7 +73,7 @@ class Listener:
         if detector.ready and detector.has_baseline.any():
             load = np.abs(self.classifier.deviation)
             if detector.contact:
-                self.largest = np.maximum(self.largest, load.max(axis=0))
+                np.maximum(self.largest, load.max(axis=0), out=self.largest)
             now = load / detector.sigma
             element, channel = np.unravel_index(now.argmax(), now.shape)
             if now[element, channel] > self._strongest:

@@ -348,7 +348,7 @@ print(json.dumps(found))
 
 @pytest.fixture(scope="module")
 def refused(tmp_path_factory) -> dict[str, Measured]:
-    """What became of each mesh."""
+    """Return how reading each mesh ended."""
     folder = tmp_path_factory.mktemp("hostile")
     paths = []
     for number, make in enumerate(MESHES.values()):
