@@ -227,6 +227,7 @@ class ContactDetector:
         """Let all but the latest `guard` waiting samples into the baseline."""
         if len(self._pending) <= guard:
             return
+        before = self._count.copy()
         while len(self._pending) > guard:
             if len(self._baseline) == BASELINE_SAMPLES:
                 _, oldest, was_valid = self._baseline.popleft()
@@ -239,8 +240,9 @@ class ContactDetector:
             self._count += is_valid
             self._sum += newest
             self._sum_of_squares += newest**2
-        self.has_baseline = self._count >= MIN_BASELINE_SAMPLES
-        self._onset_z2 = onset_z2(self._count)
+        if (self._count != before).any():
+            self.has_baseline = self._count >= MIN_BASELINE_SAMPLES
+            self._onset_z2 = onset_z2(self._count)
         if not self.has_baseline.any():
             return
         n = np.maximum(self._count, 2)[:, None]

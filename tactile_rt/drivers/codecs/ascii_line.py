@@ -26,7 +26,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     parse_columns,
     read_mapping,
 )
-from tactile_rt.drivers.codecs.ascii_text import Names, fields, number, quoted
+from tactile_rt.drivers.codecs.ascii_text import Names, fields, is_text, number, quoted
 
 __all__ = ["AsciiLine", "AsciiLineOptions"]
 
@@ -34,6 +34,8 @@ TICK_NS: Final = {"s": 1e3, "iso": 1e3, "ms": 1e6, "us": 1e3, "ns": 1.0}
 NEVER_WRAPS: Final = 62  # bits, for a time in seconds
 EXACT: Final = 2.0**53  # whole numbers up to here are exact
 NAN: Final = float("nan")
+NO_TEXT: Final = "what comes is not text: wrong baud rate?"
+SCRAP: Final = 8  # characters that binary data may hold between two line ends
 
 _SPACES: Final = bytes.maketrans(b",;\t", b"   ")
 _WORDS: Final = re.compile(r"[^:=]*[\w\0][^:=]*")  # no other label, no ruled line
@@ -142,8 +144,10 @@ class AsciiLine(SerialCodec):
         if len(self._data) > self._longest:
             self.stats.skipped += len(self._data)
             self._overlong = True
+            without = f"{self._longest} bytes came without a line end"
+            text = self._data.decode("utf-8", "replace")
+            self.complaint = without if is_text(text) else NO_TEXT
             self._data.clear()
-            self.complaint = f"{self._longest} bytes came without a line end"
         self.unfinished = len(self._data) + (self._open_bytes if self._open else 0)
         self.stats.intact += len(self._rows)
         return self._samples() if self._rows else None
@@ -324,7 +328,7 @@ class AsciiLine(SerialCodec):
         """Count a line that is no sample as what it is, and say why it is none."""
         words = fields(text)
         numbers = [w for w in words if number(w) is not None and w.strip("-")]
-        if words:
+        if words and (len(text) > SCRAP or self.complaint != NO_TEXT):
             self.complaint = self._why(text, words)
         if 2 * len(numbers) < len(words):  # mostly words: not meant as a sample
             self.stats.skipped += len(text)
@@ -333,8 +337,8 @@ class AsciiLine(SerialCodec):
             self._refuse()
 
     def _why(self, text: str, words: list[str]) -> str:
-        if sum(not c.isprintable() or c == "\ufffd" for c in text) * 8 > len(text):
-            return "what comes is not text: wrong baud rate?"
+        if not is_text(text):
+            return NO_TEXT
         line = f"line {quoted(text.strip())}"
         for k, (column, word) in enumerate(zip(self._columns, words, strict=False)):
             if number(word) is None and column.kind != "-":

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import msgspec
 
-__all__ = ["Names", "fields", "in_seconds", "number", "quoted"]
+__all__ = ["Names", "fields", "in_seconds", "is_text", "number", "quoted"]
 
 NAN: Final = float("nan")
 # What boards print in place of a number; ovf is Arduino's for what is over 4e9.
@@ -42,6 +42,11 @@ _SEPARATORS: Final = re.compile(r"[\s,;]+")
 _ARROW: Final = re.compile(r"[-=]>")
 _BETWEEN: Final = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"  # a name and its number
 _SIGNS: Final = frozenset("=:/~#*")
+
+
+def is_text(line: str) -> bool:
+    """Return whether at most an eighth of the characters are none that a board prints."""
+    return 8 * sum(not (c.isprintable() or c == "\t") or c == "\ufffd" for c in line) <= len(line)
 
 
 def number(word: Any) -> float | None:

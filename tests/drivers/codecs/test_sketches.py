@@ -133,7 +133,18 @@ def test_times_are_the_boards() -> None:
         ("A0.fx,A0.fy", "1", "line '1' has 1 columns, 2 are described; column 1 is '1'"),
         ("X=A0.fx", "Y: 5", "line 'Y: 5' has none of 'X'"),
         ("count,A0.fx", "1.5,2", "column 1 (count) is 1.5"),
+        (
+            "A0.fx,A0.fy",
+            "1\t2\t3",
+            r"line '1\t2\t3' has 3 columns, 2 are described; column 3 is '3'",
+        ),
         ("A0.fx,A0.fy", "\x01\x80\x12\x7f\x03\x90", "what comes is not text: wrong baud rate?"),
+        ("A0.fx,A0.fy", "\x01\x80\x12\n3", "what comes is not text: wrong baud rate?"),
+        (
+            "A0.fx,A0.fy",
+            "\x01\x80\x12\n" + 99 * "ab\0c",
+            "what comes is not text: wrong baud rate?",
+        ),
     ],
 )
 def test_what_does_not_fit_is_told_with_its_line_and_column(columns, line, complaint) -> None:
