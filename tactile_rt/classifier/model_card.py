@@ -90,6 +90,8 @@ class ModelCard(msgspec.Struct, frozen=True):
             verify` tells whether another machine computes the same.
         embedding: The number of units of the output ``embedding``.
         sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
+        changes: The share of readings at rest that differ from the one before, of the element that
+            repeats most; 0 if it is not known.
         unknown: The rule by which an object is of no known class; None if there is none.
         candidates: The rules of prediction sets, each for another noise or coverage.
         kinds: The kinds that the model tells apart within a class, by the names of the classes that
@@ -125,6 +127,7 @@ class ModelCard(msgspec.Struct, frozen=True):
     probe: tuple[tuple[float, ...], ...] = ()
     embedding: int = 0
     sensor: dict[str, Any] = {}
+    changes: float = 0.0
     refusals: tuple[str, ...] = ()
     unknown: OpenSetRule | None = None
     candidates: tuple[PredictionSetRule, ...] = ()

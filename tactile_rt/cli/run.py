@@ -65,8 +65,12 @@ def run(
     import msgspec
 
     from tactile_rt.classifier.classifier import Classifier
+    from tactile_rt.classifier.model_card import sensor_of
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.classifier.session import Session
+    from tactile_rt.core.errors import name_some
+    from tactile_rt.daemon.stuck_at import StuckAtDetector
+    from tactile_rt.drivers.device_source import device_of, share_of_changes
     from tactile_rt.sources.opening import check_model, is_made_up
 
     file = model or shipped_model()
@@ -79,10 +83,21 @@ def run(
             raise SpecMismatch(f"{source}: {error}") from None
         if is_made_up(source):
             typer.echo(f"{source} is made up: what is decided on it means nothing", err=True)
-        session = Session(opened, classifier)
+        session, card = Session(opened, classifier), classifier.card
+        stuck_at, stuck = StuckAtDetector(opened.spec.rate_hz), tuple[int, ...]()
+        if device_of(opened) is not None:
+            changes = max(card.changes, share_of_changes(opened))
+            stuck_at.expect(opened.spec, sensor_of(card), changes)
         with leaving(seconds), session:
             for chunk, decisions in session:
                 samples += len(chunk)
+                stuck_at.add(chunk)
+                if set(stuck_at.elements) - set(stuck):
+                    names = name_some([opened.spec.elements[k] for k in stuck_at.elements])
+                    typer.echo(
+                        f"no value of {names} changes: it hangs, or is out of range", err=True
+                    )
+                stuck = stuck_at.elements
                 for d in decisions:
                     if final_only and not d.final:
                         continue

@@ -321,7 +321,8 @@ def _address(given: str) -> tuple[str, int]:
 def _begun(folder: Path, source: "Source") -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
     from tactile_rt.teaching.lesson import Lesson
-    from tactile_rt.teaching.listener import find_motion, measured_floor
+    from tactile_rt.teaching.listener import find_motion, measure_changes, measured_floor
+    from tactile_rt.teaching.model import FewShot
 
     chunks: list[Chunk] = []
     for _ in range(RESTS):
@@ -332,7 +333,8 @@ def _begun(folder: Path, source: "Source") -> "Lesson":
         typer.echo(f"that was no rest: {moved} moved")
     else:
         typer.echo("going on without a rest: light touches will be missed")
-    return Lesson.begun(folder, source.spec, measured_floor(chunks))
+    taught = FewShot(source.spec, measured_floor(chunks), measure_changes(chunks))
+    return Lesson.begun(folder, taught)
 
 
 def _take_rest(source: "Source") -> "list[Chunk]":

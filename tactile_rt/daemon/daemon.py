@@ -306,7 +306,9 @@ class Daemon:
             self.turned("watch")
             for name, source in self._sources.copy().items():
                 on_it = (p for _, p in self._models.copy().values() if p.config.source == name)
-                source.judge(next((p.sensor for p in on_it if p.sensor is not None), None))
+                told = [(p.sensor, p.changes) for p in on_it]
+                sensor = next((found for found, _ in told if found is not None), None)
+                source.expect(sensor, max((changes for _, changes in told), default=0.0))
             for part in self._parts():
                 part.watch()
             step = self._clock.stepped_ns()

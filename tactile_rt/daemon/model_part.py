@@ -68,6 +68,7 @@ class ModelPart(Part):
             self._sha256 = hash_of(self.file)  # a recording tells it from its first byte
         self._labels: tuple[str, ...] = ()
         self.sensor: SensorSpec | None = None  # what the model was made for, if it tells
+        self.changes = 0.0  # share of readings at rest, likewise
         self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
         self._object = ""  # that the touch of the newest decision is of
@@ -203,8 +204,8 @@ class ModelPart(Part):
         self._sha256, self.refused = admission.trial.sha256, ""
         self._opened = opened
         self._labels = self._classifier.card.labels
-        self.sensor = sensor_of(self._classifier.card)
         card = self._classifier.card
+        self.sensor, self.changes = sensor_of(card), card.changes
         self._half_ns = max(card.period_ns, round(NS_PER_S / opened.spec.rate_hz))
         step_ns = card.substeps * card.period_ns
         self._deadline_ns = round(1e6 * self.config.deadline_ms) or step_ns

@@ -28,7 +28,7 @@ from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.rate_meter import RateMeter
-from tactile_rt.daemon.stuck_at import OFTEN, StuckAtDetector, derive_stuck_at_s
+from tactile_rt.daemon.stuck_at import StuckAtDetector
 from tactile_rt.drivers.device_source import (
     ArrayChanged,
     DeviceSource,
@@ -175,14 +175,12 @@ class SourcePart(Part):
         """As of every part; but to wait for a device that is away is no silence."""
         return 0.0 if self._away else super().silent_s
 
-    def judge(self, sensor: SensorSpec | None) -> None:
-        """Say what the sensor of a model on this source is, if there is one that tells."""
-        spec, device = self._spec, self._device
-        after_s, each_s = self.config.stuck_at_s, math.inf
-        if not after_s and spec is not None and device is not None:
-            after_s = derive_stuck_at_s(spec, sensor, noisy=self._stuck_at.noisy)
-            each_s = derive_stuck_at_s(spec, sensor, each=True)
-        self._stuck_at.after_s, self._stuck_at.each_after_s = after_s or math.inf, each_s
+    def expect(self, sensor: SensorSpec | None, changes: float) -> None:
+        """Take what the model on this source tells of its sensor, see `StuckAtDetector.expect`."""
+        judge, tared = self._stuck_at, self._tared_changes
+        judge.after_s, judge.each_after_s = self.config.stuck_at_s or math.inf, math.inf
+        if self._spec is not None and self._device is not None and not self.config.stuck_at_s:
+            judge.expect(self._spec, sensor, max(changes, tared))
 
     def stop(self) -> None:
         self._stopped_s = self._stopped_s or time.monotonic()
@@ -237,8 +235,8 @@ class SourcePart(Part):
             self.accepted = found if found.serial_number and not self.another else known
         if self._stop.is_set():
             return
-        noisy = share_of_changes(stream) > OFTEN
-        self._stuck_at, self._held = StuckAtDetector(stream.spec.rate_hz, noisy), list[Chunk]()
+        self._tared_changes = share_of_changes(stream)
+        self._stuck_at, self._held = StuckAtDetector(stream.spec.rate_hz), list[Chunk]()
         self._announced = True
         self._busy_ns = time.monotonic_ns()
         self._announce(stream)

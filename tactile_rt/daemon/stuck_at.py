@@ -5,8 +5,8 @@ gives the same ones for as long as it rests. So equal samples are a fault only w
 known, or somebody says for how long is too long.
 
 Where no description tells it, readings do that differ from the one before in three cases of four,
-in the tare or in each half minute of the stream: noise above a step does so, and a quarter of it,
-once motors stop, still changes one of ten at any level.
+in the tare, at rest before a lesson or in each half minute of the stream: noise above a step does
+so, and a quarter of it, once motors stop, still changes one of ten at any level.
 """
 
 import math
@@ -33,18 +33,30 @@ class StuckAtDetector:
     Attributes:
         after_s: The time for which they may be, s; infinite: for ever.
         each_after_s: The same of one element, while others change.
-        noisy: Whether some values change often, at rest, too, as the tare or the stream says.
+        noisy: Whether some values change often, at rest, too, as the stream says.
         seconds: The time for which no value has changed, s; 0 unless that is longer than it may be.
         elements: The numbers of elements of which no value has changed for too long.
         zeros: Whether all values have been 0 since the first sample, for two seconds or more.
     """
 
-    def __init__(self, rate_hz: float = 1000.0, noisy: bool = False) -> None:
+    def __init__(self, rate_hz: float = 1000.0) -> None:
         self.after_s = self.each_after_s = math.inf
-        self.noisy, self._window = noisy, max(WINDOW_SAMPLES, WINDOW_S * rate_hz)
+        self.noisy = self._rested = False
+        self._window = max(WINDOW_SAMPLES, WINDOW_S * rate_hz)
         self._last: NDArray[np.uint32] | None = None
         self._began_ns = self._since_ns = self._counted = 0
         self.seconds, self.elements, self.zeros = 0.0, tuple[int, ...](), False
+
+    def expect(self, spec: ArraySpec, sensor: SensorSpec | None, changes: float) -> None:
+        """Derive for how long readings may be equal from what is known of the sensor.
+
+        Args:
+            changes: share of readings at rest that differ from the one before, where an element
+                repeats most; 0: not known.
+        """
+        noisy = changes > OFTEN and not self._rested
+        self.after_s = derive_stuck_at_s(spec, sensor, noisy=noisy or self.noisy)
+        self.each_after_s = derive_stuck_at_s(spec, sensor, each=True, noisy=noisy)
 
     def add(self, *chunks: Chunk) -> None:
         """Take the next samples of the stream; those without any valid element say nothing."""
@@ -71,6 +83,7 @@ class StuckAtDetector:
             noisy = self._changes > OFTEN
             if (differs[moved.any(axis=1).argmax()] & noisy).sum() < noisy.sum() / 2:
                 self._changes[:], self.noisy = 0.0, False  # one step of one: it was at rest
+                self._rested = True
         self._counted += int(useful.sum())
         self._differed += differs.sum(axis=0)
         if self._counted >= self._window and not self.seconds:

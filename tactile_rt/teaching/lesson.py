@@ -107,16 +107,10 @@ class Lesson:
     _largest: list[NDArray[np.float32]] = field(default_factory=list)  # of each listener
 
     @classmethod
-    def begun(cls, folder: Path, spec: ArraySpec, floor: NDArray[np.float32]) -> "Lesson":
-        """A new lesson.
-
-        Args:
-            folder: where to; made if it is not there.
-            floor: (channel,) the smallest noise that the contact detector is to assume.
-        """
+    def begun(cls, folder: Path, taught: FewShot) -> "Lesson":
+        """Begin a lesson that makes a model by itself, in a folder; made if it is not there."""
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        taught = FewShot(spec, floor)
         write_features(folder / FEATURES, taught)
         return cls(folder, taught)
 
@@ -148,7 +142,8 @@ class Lesson:
         card = load_model(path)[1]
         few = card.labels == (TOUCH,)
         floor = np.array(card.floor, dtype=np.float32)
-        lesson = cls(folder, FewShot(card.array, floor) if few else Enrolment(path))
+        taught = FewShot(card.array, floor, card.changes) if few else Enrolment(path)
+        lesson = cls(folder, taught)
         lesson._read_touches(path)
         return lesson
 

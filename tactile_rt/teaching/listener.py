@@ -10,7 +10,7 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["Listener", "find_motion", "measured_floor"]
+__all__ = ["Listener", "find_motion", "measure_changes", "measured_floor"]
 
 HASTY_NS = 200_000_000  # after the end of a contact, within which another is not a touch of its own
 FELT = 6.0  # times the noise, for two samples running, is felt
@@ -144,6 +144,12 @@ def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
             if apart[element, channel] > max(MOVED * noise[element, channel], 2 * step):
                 return f"{spec.elements[element]} {spec.channels[channel]}"
     return ""
+
+
+def measure_changes(chunks: Sequence[Chunk]) -> float:
+    """Measure the share of readings that differ from the one before, of the most even element."""
+    values = np.concatenate([c.values for c in chunks])
+    return float((values[1:] != values[:-1]).mean(axis=0).max(axis=1).min())
 
 
 def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:

@@ -71,10 +71,13 @@ class FewShot:
     Attributes:
         floor: (channel,) The smallest noise that the contact detector assumes, in the channel's
             unit.
+        changes: The share of readings at rest that differ from the one before, of the element that
+            repeats most; 0: not known.
     """
 
     spec: ArraySpec
     floor: NDArray[np.float32]
+    changes: float = 0.0
     each = 10  # touches of a class that are worth their time
     few = ENOUGH  # fewer are told
     note = ""  # for the user, before the first touch
@@ -275,6 +278,7 @@ def _write(
         state=tuple(StateTensor(n, s, "float32") for n, s in network.state().items()),
         scale=floor,
         floor=floor,
+        changes=taught.changes,
         embedding=network.size,
         opset=OPSET,
     )  # fmt: skip

@@ -4,10 +4,14 @@ import json
 import signal
 import time
 
+import msgspec
+import numpy as np
 import pytest
 
-from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model
 from tactile_rt.core.packages import install_extra
+from tactile_rt.teaching.onnx_bytes import with_metadata
+from tactile_rt.testing import FakeSerial
 from tests.helpers.processes import PROGRAM, start_program
 
 pytest.importorskip("mujoco")
@@ -76,6 +80,21 @@ def test_a_closed_pipe_ends_run_cleanly():
     assert process.returncode == 0
     assert err.endswith(" dropped\n")
     assert err.count("\n") == 1
+
+
+def test_an_element_of_a_device_that_hangs_is_named(tmp_path):
+    """The model says that every element's readings change at rest."""
+    card = msgspec.structs.replace(load_model(shipped_model())[1], changes=0.9)
+    data, told = shipped_model().read_bytes(), msgspec.json.encode(card).decode()
+    (tmp_path / "m.onnx").write_bytes(with_metadata(data, METADATA_KEY, told))
+    values = np.random.default_rng(0).normal(scale=1e-6, size=(30_000, *card.array.shape))
+    values[:, 3] = 0.0
+    with FakeSerial(values, spec=card.array, pace="realtime") as fake:
+        options = ("--source", fake.url, "--model", tmp_path / "m.onnx", "--seconds", "300")
+        with start_program("run", *options) as process:
+            said = process.stderr.readline()
+            process.terminate()
+    assert said == "no value of A3 changes: it hangs, or is out of range\n"
 
 
 @pytest.fixture

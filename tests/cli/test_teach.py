@@ -22,6 +22,7 @@ from tactile_rt.core.locks import alone_in
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.sources.opening import open_source
 from tactile_rt.teaching.lesson import Lesson
+from tactile_rt.teaching.model import FewShot
 from tactile_rt.teaching.page import TeachingPage
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, FakeSerial, cut
@@ -241,7 +242,9 @@ def tapped(live):  # for 0.1 s, which is looked at for 0.9 s
 
 
 def taught_tap(folder, source, say):
-    teacher = Teacher(Lesson.begun(folder, source.spec, np.float32(0.3 * NOISE)), ["tap"], 9)
+    teacher = Teacher(
+        Lesson.begun(folder, FewShot(source.spec, np.float32(0.3 * NOISE))), ["tap"], 9
+    )
     _teach(teacher, source, "", SimpleNamespace(listen=lambda: None, next=say))
     return teacher
 

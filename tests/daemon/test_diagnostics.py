@@ -360,12 +360,25 @@ def test_nothing_is_stuck_in_an_hour_of_rest_until_noise_stops(rate, shape, nois
     rng, size, fine = np.random.default_rng(0), (int(3600 * rate), *shape), noise > 1
     wander = np.cumsum(rng.normal(scale=drift / np.sqrt(rate), size=size), axis=0)
     rounded = np.round(rng.normal(scale=noise, size=size) + wander).astype(np.float32)
-    spec, judge = small_spec(shape[0], rate_hz=rate), StuckAtDetector(rate, noisy=fine)
+    spec, judge = small_spec(shape[0], rate_hz=rate), StuckAtDetector(rate)
     for chunk in cut(np.concatenate([rounded, rounded[-1:].repeat(4 * rate, 0)]), rate, 20):
-        judge.after_s = derive_stuck_at_s(spec, None, noisy=judge.noisy)
+        judge.expect(spec, None, changes=0.9 * fine)
         judge.add(chunk)
-        assert not judge.seconds or (fine and chunk.seq[-1] > len(rounded))
+        assert not (judge.seconds or judge.elements) or (fine and chunk.seq[-1] > len(rounded))
     assert bool(judge.seconds) == judge.noisy == fine
+
+
+def test_an_element_that_hangs_is_told_where_rest_is_known_to_change():
+    values = np.random.default_rng(0).normal(size=(12_000, 3, 2))
+    values[4000:9000, 1] = values[4000, 1]
+    for changes, expected in ((0.9, (6.0, 9.0)), (0.0, (np.inf, -np.inf))):
+        judge, told = StuckAtDetector(1000.0), []
+        judge.expect(small_spec(elements=3), None, changes)
+        for chunk in chunks(values):
+            judge.add(chunk)
+            told += [chunk.t_ns[-1] / 1e9] if judge.elements == (1,) else []
+        found = min(told, default=np.inf), max(told, default=-np.inf)
+        assert found == pytest.approx(expected, abs=0.2)
 
 
 def test_who_hangs_again_and_again_is_told_each_time_until_it_turns_out_to_be_at_rest():

@@ -16,7 +16,8 @@ from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.teaching.head import count_refused, fit_classes, leave_one_out
 from tactile_rt.teaching.lesson import ANYTHING_ELSE, MODEL, ORDERS, Lesson
-from tactile_rt.teaching.listener import find_motion, measured_floor
+from tactile_rt.teaching.listener import find_motion, measure_changes, measured_floor
+from tactile_rt.teaching.model import FewShot
 from tactile_rt.teaching.onnx_bytes import OnnxGraph, with_metadata
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -25,7 +26,7 @@ from tests.helpers.refusals import refusal
 
 EACH = 6
 TAUGHT = [kind for kind in KINDS for _ in range(EACH)]
-FLOOR = (0.3 * NOISE).astype(np.float32)
+FEW = FewShot(wrench_spec(), (0.3 * NOISE).astype(np.float32), changes=0.9)
 
 
 def teach(lesson: Lesson, labels: list[str], seed: int, kinds: list[str] | None = None) -> None:
@@ -45,7 +46,7 @@ def teach(lesson: Lesson, labels: list[str], seed: int, kinds: list[str] | None 
 
 @pytest.fixture(scope="module")
 def taught(tmp_path_factory):
-    lesson = Lesson.begun(tmp_path_factory.mktemp("lesson") / "a", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path_factory.mktemp("lesson") / "a", FEW)
     teach(lesson, TAUGHT, seed=1)
     lesson.learn()
     return lesson
@@ -89,7 +90,7 @@ def test_a_lesson_that_is_read_again_has_felt_the_same(taught):
 
 
 def test_a_lesson_goes_on(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teach(lesson, ["press", "press", "slide"], seed=4)
     assert lesson.taught_enough == ("press",)
     lesson = Lesson.read(tmp_path / "b")
@@ -100,7 +101,7 @@ def test_a_lesson_goes_on(taught, tmp_path):
 
 
 def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teach(lesson, ["press"] * 3, seed=6)
     path, recording = tmp_path / "b" / LABELS, tmp_path / "b" / "session-1.mcap"
     path.write_text(path.read_text() + "session-1.mcap,99.5,100.5,press,\nsession-1.mcap,12")
@@ -112,7 +113,7 @@ def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
 
 
 def test_a_touch_is_taken_back_by_its_own_line(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teach(lesson, ["press", "slide"], seed=6)
     path = tmp_path / "b" / LABELS
     whole = path.read_text().splitlines(keepends=True)
@@ -134,7 +135,7 @@ def test_a_touch_is_taken_back_by_its_own_line(taught, tmp_path):
 
 
 def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teach(lesson, ["press"] * 2, seed=6)
     path = tmp_path / "b" / LABELS
     whole = path.read_bytes()
@@ -185,7 +186,7 @@ def test_odd_files_beside_are_one_line(taught, tmp_path):
 
 def test_a_page_may_look_at_any_moment(taught, tmp_path):
     """It looks from a thread of its own: also between a touch that goes and what is made of it."""
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teach(lesson, ["press"] * 4, seed=8)
     teacher = Teacher(lesson, ["press"], 9)
     teacher.progress = replace(teacher.progress, odd=((4, "press"),))
@@ -196,7 +197,7 @@ def test_a_page_may_look_at_any_moment(taught, tmp_path):
 
 
 def test_one_touch_of_a_class_is_told_to_be_too_few(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teach(lesson, ["press", "press", "slide"], seed=8)
     assert Teacher(lesson, [], 2).summary()[-1] == "slide: one touch is too few, and was not learnt"
     teach(lesson, ["slide"] * 5, seed=9)
@@ -241,7 +242,7 @@ def test_a_rest_in_which_something_moved_is_named(levels):
 
 
 def test_two_classes_that_are_the_same_are_named(tmp_path):
-    lesson = Lesson.begun(tmp_path / "lesson", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "lesson", FEW)
     teach(lesson, ["press", "slide"] * 8, seed=3, kinds=["press"] * 16)
     assert Teacher(lesson, [], 8).progress.same == (("press", "slide"),)
     assert "press and slide feel the same: make them one" in Teacher(lesson, [], 8).summary()
@@ -251,10 +252,10 @@ def test_what_cannot_be_is_one_line(taught, tmp_path):
     (tmp_path / "others").mkdir()
     (tmp_path / "others" / LABELS).touch()
     with pytest.raises(ConfigError, match=r"holds labels\.csv, but no features\.onnx"):
-        Lesson.begun(tmp_path / "others", wrench_spec(), FLOOR)
-    assert "holds a lesson already" in refusal(Lesson.begun, taught.folder, wrench_spec(), FLOOR)
+        Lesson.begun(tmp_path / "others", FEW)
+    assert "holds a lesson already" in refusal(Lesson.begun, taught.folder, FEW)
     assert "holds no lesson: there is no features.onnx" in refusal(Lesson.read, tmp_path)
-    empty = Lesson.begun(tmp_path / "c", wrench_spec(), FLOOR)
+    empty = Lesson.begun(tmp_path / "c", FEW)
     assert "no class has 2 touches yet" in refusal(empty.learn)
     with pytest.raises(SpecMismatch):
         empty.listener(small_spec())
@@ -273,6 +274,9 @@ def test_the_floor_is_that_of_the_noise_or_of_the_steps():
     assert floor[1] == pytest.approx(0.3 * 5.1, rel=0.1)
     still = measured_floor(cut(np.full((400, 3, 2), 235.0), 100.0))
     assert (still > 0).all() and (still < 1).all()
+    assert measure_changes(cut(values, 100.0)) > 0.9
+    values[:, 1] = 3.0
+    assert measure_changes(cut(values, 100.0)) == 0
 
 
 def test_a_class_of_two_touches_does_not_let_strangers_through(taught):
@@ -316,7 +320,7 @@ def test_a_touch_is_odd_under_a_wrong_name_and_not_by_chance(taught):
 
 
 def test_who_teaches_is_led_and_obeyed(tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teacher = Teacher(lesson, ["press", "slide"], 2)
     rng = np.random.default_rng(0)
     size = lesson.taught.network.size
@@ -353,7 +357,7 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert (state["right"], state["of"], state["label"]) == (4, 4, "rub")
     teacher.obey("done")
     assert teacher.done
-    quiet = Teacher(Lesson.begun(tmp_path / "c", wrench_spec(), FLOOR), [], 2)
+    quiet = Teacher(Lesson.begun(tmp_path / "c", FEW), [], 2)
     assert quiet.prompt() == "what is touched next? name it, or choose its number"
     assert "nothing was learnt" in quiet.take("", np.zeros((22, size), "f"), "x", (0, 1))
     assert quiet.obey("undo") == "there is no touch to take back"
@@ -368,7 +372,7 @@ def test_how_it_ended_is_what_a_page_shows(taught):
 
 
 def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teacher = Teacher(lesson, ["press"], 4)
     rng = np.random.default_rng(0)
     for k in range(4):
@@ -381,7 +385,7 @@ def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
 
 
 def test_a_class_may_be_a_number_and_none_is_made_of_one(tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    lesson = Lesson.begun(tmp_path / "b", FEW)
     teacher = Teacher(lesson, ["press", "2", "1"], 2)
     assert teacher.obey("1") == "touch it: 1 (1 of 2)", "its name comes before a number"
     assert teacher.obey("press") == "touch it: press (1 of 2)"

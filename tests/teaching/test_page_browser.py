@@ -13,6 +13,7 @@ pytest.importorskip(
 from playwright.sync_api import sync_playwright
 
 from tactile_rt.teaching.lesson import Lesson
+from tactile_rt.teaching.model import FewShot
 from tactile_rt.teaching.page import TeachingPage
 from tactile_rt.teaching.teacher import Teacher
 from tests.helpers.made_up_touches import NOISE, wrench_spec
@@ -29,7 +30,7 @@ pytestmark = [
 
 
 def test_buttons_are_orders_and_what_is_said_is_shown(tmp_path):
-    lesson = Lesson.begun(tmp_path / "a", wrench_spec(), (0.3 * NOISE).astype(np.float32))
+    lesson = Lesson.begun(tmp_path / "a", FewShot(wrench_spec(), np.float32(0.3 * NOISE)))
     teacher = Teacher(lesson, ["press", "slide"], 2)
     shown, orders = [None], []
     rng = np.random.default_rng(0)
