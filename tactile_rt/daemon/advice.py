@@ -42,6 +42,8 @@ ADVICE = {
     "no log": "Look at the file's folder and disk; of stderr, at the program that reads it.",
     "no systemd": "Look at the unit: NotifyAccess and WatchdogSec.",
     "offset drifts": "Let the sensor warm up, then tare; keep draughts and heat off it.",
+    "jitter grows": "Look at the load of host and bus; lower the USB adapter's latency timer.",
+    "memory full soon": "Start it again when nobody needs it, and tell its makers what it ran.",
     "disk full soon": "Move or delete recordings, or record less (see [recorder]).",
 }
 

@@ -28,6 +28,7 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
+from tactile_rt.daemon.trends import Trends, read_resident_bytes
 from tactile_rt.drivers.health import Identity
 
 __all__ = ["Daemon"]
@@ -79,6 +80,7 @@ class Daemon:
         self._reloads = self._clock_steps = 0
         self._turns = Turns()
         self._onsets, self._foreseen = DiagnosticOnsets(), DiagnosticOnsets()
+        self._trends = Trends()
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -191,6 +193,7 @@ class Daemon:
         soon += [Diagnostic(name, "all zeros", "at rest, or the device hangs") for name in zeros]
         drifts = [(m.part.name, m.drift) for m in models if m.drift]
         soon += [Diagnostic(name, "offset drifts", drift) for name, drift in drifts]
+        soon += self._trends.foresee()
         state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(
@@ -311,6 +314,8 @@ class Daemon:
                 source.expect(sensor, max((changes for _, changes in told), default=0.0))
             for part in self._parts():
                 part.watch()
+            late_s = {name: source.late_s for name, source in self._sources.copy().items()}
+            self._trends.look(time.monotonic(), read_resident_bytes() or 0, late_s)
             step = self._clock.stepped_ns()
             if step:
                 self._clock_steps += 1

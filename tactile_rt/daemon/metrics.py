@@ -5,7 +5,6 @@ base units, ``_total`` for what only grows. Only GET; at most 8 KiB a request, i
 at a time, of which the newest are answered.
 """
 
-import os
 import resource
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,6 +20,7 @@ from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message
+from tactile_rt.daemon.trends import read_resident_bytes
 from tactile_rt.drivers.health import State
 
 __all__ = ["ALERTS", "Metrics", "exposition"]
@@ -162,13 +162,6 @@ def _read_cpu_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _read_resident_bytes() -> int | None:
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return None  # not Linux
-
-
 def _list_queue_rows(name: str) -> tuple[Row, ...]:
     return (
         (f"{name}_put_total", "class", "Items for it.", lambda x, _: x.queue.put),
@@ -192,7 +185,7 @@ DAEMON: tuple[Row, ...] = (
     ("config_reloads_total", "", "Times it was reloaded.", lambda s, _: s.reloads),
     ("clock_steps_total", "", "Jumps of the wall clock.", lambda s, _: s.clock_steps),
     ("cpu_seconds_total", "", "Processor time of the daemon.", lambda s, _: _read_cpu_s()),
-    ("resident_memory_bytes", "", "Memory of the daemon.", lambda s, _: _read_resident_bytes()),
+    ("resident_memory_bytes", "", "Memory of the daemon.", lambda s, _: read_resident_bytes()),
 )  # fmt: skip
 DIAGNOSTIC: tuple[Row, ...] = (
     ("diagnostic", "", "1 for each thing that does not work.", lambda t, _: 1),

@@ -171,6 +171,11 @@ class SourcePart(Part):
         )  # fmt: skip
 
     @property
+    def late_s(self) -> float:
+        """How old the newest sample was when it was read, s; 0 where nothing tells."""
+        return max(0, self._read_ns - self._newest_ns) / NS_PER_S
+
+    @property
     def silent_s(self) -> float:
         """As of every part; but to wait for a device that is away is no silence."""
         return 0.0 if self._away else super().silent_s
