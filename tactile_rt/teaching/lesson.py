@@ -108,7 +108,7 @@ class Lesson:
 
     @classmethod
     def begun(cls, folder: Path, taught: FewShot) -> "Lesson":
-        """Begin a lesson that makes a model by itself, in a folder; made if it is not there."""
+        """Begin a lesson of a model of its own, in a folder that is made."""
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_features(folder / FEATURES, taught)

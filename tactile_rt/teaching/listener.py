@@ -147,7 +147,7 @@ def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
 
 
 def measure_changes(chunks: Sequence[Chunk]) -> float:
-    """Measure the share of readings that differ from the one before, of the most even element."""
+    """Measure which share of readings differs from the one before, of the steadiest element."""
     values = np.concatenate([c.values for c in chunks])
     return float((values[1:] != values[:-1]).mean(axis=0).max(axis=1).min())
 
