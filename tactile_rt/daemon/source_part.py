@@ -133,7 +133,7 @@ class SourcePart(Part):
         self._spec: ArraySpec | None = None
         self._before = SourceStats()  # of all streams before this one
         self._samples = self._newest_ns = self._read_ns = self._flowing_ns = self._bad = 0
-        self._stuck_at = StuckAtDetector()
+        self._stuck_at, self._tared_changes = StuckAtDetector(), 0.0
         self._losses, self._bads = LossWindow(), LossWindow()
         self._rate = RateMeter()
         self.accepted: Identity | None = None  # the array that it began with
@@ -182,10 +182,11 @@ class SourcePart(Part):
 
     def expect(self, sensor: SensorSpec | None, changes: float) -> None:
         """Take what the model on this source tells of its sensor, see `StuckAtDetector.expect`."""
-        judge, tared = self._stuck_at, self._tared_changes
-        judge.after_s, judge.each_after_s = self.config.stuck_at_s or math.inf, math.inf
-        if self._spec is not None and self._device is not None and not self.config.stuck_at_s:
-            judge.expect(self._spec, sensor, max(changes, tared))
+        judge, given_s = self._stuck_at, self.config.stuck_at_s
+        if given_s or self._spec is None or self._device is None:
+            judge.after_s, judge.each_after_s = given_s or math.inf, math.inf
+        else:
+            judge.expect(self._spec, sensor, max(changes, self._tared_changes))
 
     def stop(self) -> None:
         self._stopped_s = self._stopped_s or time.monotonic()
