@@ -58,6 +58,7 @@ ABSURD = 1e9
 IMPLAUSIBLE = 10.0
 IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
 ENDLESS_S = 10.0
+JOINING_S = 5.0  # for so long a first baseline that moves is put off
 ENDLESS = "contact for 10 s without an end: something is held, or readings drift: let go to see"
 TOUCHES = 256
 FUSED = 8  # touches, at most, that are judged together
@@ -260,7 +261,7 @@ class Classifier:
         self._decided = False  # the episode has had its final decision
         self._touched_ns, self._endless = 0, False  # the latest change of contact
         self._skipping = False
-        self._next_seq = 0
+        self._next_seq = self._joined_ns = 0
         self._rated = rated_noise(self.card)
         self._plausible = IMPLAUSIBLE * np.array(self.card.clip, dtype=np.float32)
         self.implausible = self.undecided = False
@@ -293,11 +294,14 @@ class Classifier:
 
     def forget(self) -> None:
         """Be as if no sample had come: find the baseline anew."""
+        self._renew_detector()
+        self._resampler = Resampler(self.card.period_ns, self._rate_hz)
+        self._onset_ns, self._next_seq, self._joined_ns = None, 0, 0
+        self._felt.clear()
+
+    def _renew_detector(self) -> None:
         shape, floor = self.detector.offset.shape, self.detector.floor
         self.detector = ContactDetector((shape[0], shape[1]), floor)
-        self._resampler = Resampler(self.card.period_ns, self._rate_hz)
-        self._onset_ns, self._next_seq = None, 0
-        self._felt.clear()
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
@@ -322,7 +326,12 @@ class Classifier:
 
     def _sample(self, t_ns: int, sample: Floats, valid: NDArray[np.bool_]) -> Classification | None:
         touched = self.detector.contact
+        ready = self.detector.ready
         begins = self.detector.update(sample, valid)
+        self._joined_ns = self._joined_ns or t_ns
+        if self.detector.ready and not ready and t_ns - self._joined_ns < JOINING_S * NS_PER_S:
+            if self.detector.moves:  # a stream that is joined within a touch: wait for its end
+                self._renew_detector()
         if self.detector.contact != touched:
             self.touches.append((t_ns, not touched))
             self._touched_ns = t_ns

@@ -19,6 +19,7 @@ BASELINE_SAMPLES = 100  # the baseline is the mean of at most this many of the l
 # been found. The first baseline waits for fewer, or a robot would be numb for longer.
 GUARD_SAMPLES = 15
 FIRST_GUARD_SAMPLES = 5
+MOVES = 9.0  # times the variance that neighbours tell: no first baseline is as unsteady
 RELEASE_SAMPLES = 20
 # A level to which the signal returns so often within one contact is that of rest: the baseline
 # was taken while something was touched.
@@ -134,6 +135,15 @@ class ContactDetector:
     def ready(self) -> bool:
         """Whether the baseline is complete."""
         return len(self._baseline) >= MIN_BASELINE_SAMPLES
+
+    @property
+    def moves(self) -> bool:
+        """Whether the samples of the baseline wander, as those of a touch: noise does not."""
+        samples = np.array([sample for _, sample, _ in self._baseline])
+        steps = np.square(np.diff(samples, axis=0)).mean(axis=0) / 2  # in noise, its variance
+        known = self._count == len(samples)
+        wander = samples.var(axis=0) > MOVES * np.maximum(steps, self.floor**2)
+        return bool(wander[known].any())
 
     @property
     def drift(self) -> NDArray[np.float64]:

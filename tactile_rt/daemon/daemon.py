@@ -1,6 +1,7 @@
 """The daemon: parts made from a configuration, watched, exchanged and closed."""
 
 import gc
+import logging
 import os
 import threading
 import time
@@ -23,6 +24,7 @@ from tactile_rt.daemon.diagnostics import diagnose
 from tactile_rt.daemon.health import Diagnostic, Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
+from tactile_rt.daemon.log import EventHandler
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part, reason_of
@@ -34,6 +36,7 @@ from tactile_rt.drivers.health import Identity
 __all__ = ["Daemon"]
 
 WATCH_S = 0.25
+LOGGER = logging.getLogger("tactile_rt.classifier")
 STARTED_S = 5.0  # what has not started by then is told as degraded instead
 LATELY_NS = 1_000_000_000  # how long it is told that the wall clock has jumped
 
@@ -80,7 +83,7 @@ class Daemon:
         self._reloads = self._clock_steps = 0
         self._turns = Turns()
         self._onsets, self._foreseen = DiagnosticOnsets(), DiagnosticOnsets()
-        self._trends = Trends()
+        self._trends, self._warnings = Trends(), EventHandler(self.report)
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -101,6 +104,7 @@ class Daemon:
             self._reconcile()
         self.report("daemon", "starting", f"{self._loaded.path}")
         self._watcher.start()
+        LOGGER.addHandler(self._warnings)
 
     def reload(self, loaded: Loaded) -> None:
         """Reconcile the parts with a configuration: what is the same in it goes on undisturbed.
@@ -148,6 +152,7 @@ class Daemon:
         until = time.monotonic() + self._loaded.config.limits.stop_s
         self.report("daemon", "stopping", "")
         self._unwatch.set()
+        LOGGER.removeHandler(self._warnings)
         late: list[Part] = []
         with self._changing:
             groups: list[list[Part]] = [

@@ -1,10 +1,12 @@
 """One line per event, on stderr or in a file; a storm of the same line is counted instead."""
 
+import logging
 import os
 import time
 from collections import OrderedDict
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from io import FileIO
 
@@ -14,7 +16,7 @@ from tactile_rt.daemon.config import LogConfig
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Event, Item
 
-__all__ = ["Log"]
+__all__ = ["EventHandler", "Log"]
 
 LEVELS = ("info", "warning", "error")
 REMEMBERED = 256  # different lines
@@ -110,7 +112,8 @@ class Log(Consumer):
     def _sum_up(self, key: tuple[str, str, str]) -> None:
         seen = self._seen.pop(key)
         if seen.again:
-            self._write(seen.event, seen.again)
+            now_ns = round(1e9 * time.monotonic())  # lines are in the order of their times
+            self._write(replace(seen.event, t_ns=now_ns), seen.again)
 
     def _write(self, event: Event, repeated: int) -> None:
         if self._unwritten is None and self._pass_on(self._form(event, repeated)):
@@ -141,8 +144,23 @@ class Log(Consumer):
             }  # fmt: skip
             return msgspec.json.encode(fields).decode()
         said = f": {event.reason}" if event.reason else ""
-        again = f" (repeated {repeated} times)" if repeated else ""
+        again = f" (repeated {repeated} times since)" if repeated else ""
         return f"{when} {event.level} {event.part} {event.state}{said}{again}"
+
+
+class EventHandler(logging.Handler):
+    """Makes an event of each warning of a Python logger.
+
+    Args:
+        report: takes an event, see `Daemon.report`.
+    """
+
+    def __init__(self, report: Callable[[str, str, str, str], None]) -> None:
+        super().__init__(logging.WARNING)
+        self._report = report
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._report("model", "warns", record.getMessage(), "warning")
 
 
 def _rank(level: str) -> int:

@@ -2,6 +2,7 @@
 
 import io
 import json
+import logging
 import threading
 import time
 from dataclasses import replace
@@ -206,6 +207,12 @@ def received(daemon):
     """Of the first source: what came, and what is known not to have come."""
     s = daemon.snapshot().sources[0].stats
     return s.delivered + s.corrupt + s.missing + s.dropped + s.duplicates
+
+
+def test_what_a_classifier_warns_of_is_an_event(robot):
+    _, spy = robot('[[source]]\nname = "a"\nurl = "synthetic:2x2"\n')
+    logging.getLogger("tactile_rt.classifier.classifier").warning("hand: %s", "contact for 10 s")
+    until(lambda: spy.told("model", "warns"))
 
 
 def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):

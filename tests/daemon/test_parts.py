@@ -211,11 +211,12 @@ def logged(path, *batches, **options):
 def test_a_storm_is_written_once_and_counted(tmp_path):
     storm = [event("no route") for _ in range(1000)]
     lines = logged(tmp_path / "log", storm[:600], [event("other")], storm[600:])
-    assert lines == [
+    assert lines[:2] == [
         "2023-11-14T22:13:21.500Z warning source.a waiting: no route",
         "2023-11-14T22:13:21.500Z warning source.a waiting: other",
-        "2023-11-14T22:13:21.500Z warning source.a waiting: no route (repeated 999 times)",
     ]
+    assert lines[2].endswith("Z warning source.a waiting: no route (repeated 999 times since)")
+    assert sorted(lines) == lines  # the count has the time at which it is written
 
 
 def test_no_event_is_lost_among_very_many_different_ones(tmp_path):
@@ -238,7 +239,7 @@ def test_what_comes_again_later_is_written_again(tmp_path, monkeypatch):
         log.handle([event("again")])
     log.close()
     ends = [line.rpartition(": ")[2] for line in (tmp_path / "log").read_text().splitlines()]
-    assert ends == ["again", "again (repeated 3 times)", "again"]
+    assert ends == ["again", "again (repeated 3 times since)", "again"]
 
 
 def test_the_level_is_the_least_that_is_written(tmp_path):
