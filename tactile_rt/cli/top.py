@@ -98,7 +98,7 @@ def snapshot_at(url: str) -> "Snapshot":
     except (OSError, http.client.HTTPException) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise SourceError(
-            f"no daemon at http://{host}:{port}: {why}; does its configuration have [metrics]?"
+            f"no daemon at http://{host}:{port}: {why}; is that the port of its [metrics]?"
         ) from None
     finally:
         connection.close()

@@ -136,5 +136,5 @@ def test_whatever_is_there_instead_is_one_line():
             with pytest.raises(error, match=at):
                 snapshot_at(at)
             thread.join()
-    with pytest.raises(SourceError, match="Connection refused; does its configuration have"):
+    with pytest.raises(SourceError, match="Connection refused; is that the port of its"):
         snapshot_at(at)
