@@ -147,7 +147,7 @@ class Sheet:
         draw_traces(traces, footage.times_ms, scale.per_si * footage.sizes, spec.elements)
         traces.set_ylabel(f"{'force' if what == 'force' else 'size'} at base ({scale.unit})")
         self._cursor = traces.axvline(0, color=INK, lw=1.3)
-        self._clock = figure.text(0.985, 0.945, "", color=INK, fontsize=14, family="monospace")
+        self._clock = figure.text(0.985, 0.905, "", color=INK, fontsize=14, family="monospace")
         self._clock.set(ha="right", va="center")
         for artist in (self._scene, *self._legend, self._cursor, self._clock):
             artist.set_animated(True)
