@@ -51,19 +51,17 @@ def top(
     if once:
         found = next(_looks(where))
         if not told_as_json(found, json):
-            for part in picture(found, None).renderables:
+            for part in picture(found).renderables:
                 if isinstance(part, Table):
                     print_table(part, console)
                 else:
                     console.print(part, soft_wrap=True)
         return
-    before = None
     with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
         for snapshot in _looks(where):
-            parts = picture(snapshot, before).renderables
+            parts = picture(snapshot).renderables
             fit = [fitting(p, console) if isinstance(p, Table) else p for p in parts]
             live.update(Group(*fit), refresh=True)
-            before = snapshot
 
 
 def snapshot_at(url: str) -> "Snapshot":
@@ -135,18 +133,11 @@ def _looks(where: str) -> "Iterator[Snapshot]":
             continue  # it is being restarted; what was true last stays on the screen
 
 
-def picture(now: "Snapshot", before: "Snapshot | None") -> Group:
-    """Draw a state as lines and tables, one below the other.
-
-    Args:
-        now: what to show.
-        before: an earlier one of the same daemon; None: rates are not known.
-    """
-    if before is not None and (before.pid != now.pid or before.t_ns >= now.t_ns):
-        before = None
+def picture(now: "Snapshot") -> Group:
+    """Draw a state as lines and tables, one below the other."""
     parts: list[RenderableType] = [_draw_head(now)]
     parts += [Text(f"  {line}", style="red", overflow="ellipsis") for line in now.degraded]
-    for table in (_draw_sources(now, before), _draw_models(now), _draw_consumers(now)):
+    for table in (_draw_sources(now), _draw_models(now), _draw_consumers(now)):
         if table.row_count:
             parts += [Text(), table]
     return Group(*parts)
@@ -177,15 +168,12 @@ def _make_table(headings: str) -> Table:
     return table
 
 
-def _draw_sources(now: "Snapshot", before: "Snapshot | None") -> Table:
+def _draw_sources(now: "Snapshot") -> Table:
     table = _make_table(
         "SOURCE, STATE, >HZ, >OF, >SAMPLES, >MISS, >BAD, >DROP, >DUP, >LOST/MIN, >AGE MS, ARRAY"
     )
-    old = {s.part.name: s.samples for s in before.sources} if before is not None else {}
     for s in now.sources:
-        rate = "-"  # of one look it is not known
-        if before is not None and s.part.name in old:
-            rate = f"{(s.samples - old[s.part.name]) / ((now.t_ns - before.t_ns) / 1e9):.0f}"
+        rate = f"{s.measured_hz:.0f}" if s.measured_hz else "-"
         state = _draw_state(s.part)
         if s.part.state == "running" and s.device is not None:
             state = Text(str(s.device.state), style=COLOURS.get(str(s.device.state), ""))

@@ -337,7 +337,7 @@ def test_a_model_of_another_array_has_failed_and_is_not_tried_again(robot, tmp_p
         states = [x for x in metrics.splitlines() if x.startswith("tactile_part_state")]
         assert sum('part="model.a"' in x and x.endswith(" 1") for x in states) == 1
         console = Console(file=io.StringIO(), width=1000)
-        console.print(picture(daemon.snapshot(), None))
+        console.print(picture(daemon.snapshot()))
         lines = console.file.getvalue().splitlines()
         shown = next(line for line in lines if line.split()[:2] == ["a", "failed"])
         assert event.reason in shown

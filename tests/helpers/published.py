@@ -104,6 +104,7 @@ def busy_snapshot(seconds=0, state="degraded"):
                 ("B1", "C2"), ("fx", "fy", "fz"), ("N", "N", "N"),
                 Health(State.STREAMING, 1, connections=3, drift_ppm=12.5),
                 SourceStats(5000, 4, 3, 2, 1), 5000 + 1000 * seconds, at - 4_000_000,
+                measured_hz=998.0,
             ),
             SourceState(
                 part("source.finger", failures=2), "can:slcan:/dev/ttyUSB0", 'fi"ng\\er', "tip",
