@@ -63,6 +63,16 @@ FILES = {
         lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
         "--columns Zeit=time:s,Fx=S.fx:mN",
     ),
+    "units below, one of them odd": (
+        lambda: b"Zeit;Kraft;Weg;Temp\ns;kip;cm;\xb0C\n" + b"".join(
+            b"%d,5;%d;0,5;21\n" % (k, k * k % 7) for k in range(40)
+        ),
+        "--columns Zeit=time:s,Kraft=S.kraft:1,Weg=S.weg:cm,Temp=S.temperature:degC",
+    ),
+    "units below, of one column": (
+        lambda: b"Zeit;Kraft;Weg\n;kN;\n" + b"".join(b"%d,5;%d;9\n" % (k, k) for k in range(40)),
+        "--columns Zeit=time:s,Kraft=S.kraft:kN,Weg=S.weg:1",
+    ),
     "labels with units, one a line": (
         lambda: b"".join(
             b"Force [N]:\t%d\r\nTemp (C):\t%d.5\r\n" % (k % 7, k * k % 5) for k in range(40)

@@ -30,7 +30,7 @@ import msgspec
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.settings import convert, read_toml
+from tactile_rt.core.settings import convert, nearest, read_toml
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.column_words import expand_columns
 
@@ -53,15 +53,20 @@ _G: Final = 9.80665  # m/s^2
 # unit on the wire: (SI unit, SI units in it, offset)
 UNITS: Final[dict[str, tuple[str, float, float]]] = {
     "N": ("N", 1.0, 0.0), "mN": ("N", 1e-3, 0.0), "uN": ("N", 1e-6, 0.0),
+    "kN": ("N", 1e3, 0.0), "daN": ("N", 10.0, 0.0),
     "gf": ("N", 1e-3 * _G, 0.0), "kgf": ("N", _G, 0.0),
     "N m": ("N m", 1.0, 0.0), "Nm": ("N m", 1.0, 0.0), "mNm": ("N m", 1e-3, 0.0),
-    "uNm": ("N m", 1e-6, 0.0), "kgfm": ("N m", _G, 0.0),
-    "Pa": ("Pa", 1.0, 0.0), "kPa": ("Pa", 1e3, 0.0),
-    "T": ("T", 1.0, 0.0), "mT": ("T", 1e-3, 0.0), "uT": ("T", 1e-6, 0.0),
+    "uNm": ("N m", 1e-6, 0.0), "kNm": ("N m", 1e3, 0.0), "kgfm": ("N m", _G, 0.0),
+    "Nmm": ("N m", 1e-3, 0.0), "Ncm": ("N m", 1e-2, 0.0),
+    "Pa": ("Pa", 1.0, 0.0), "hPa": ("Pa", 1e2, 0.0), "kPa": ("Pa", 1e3, 0.0),
+    "MPa": ("Pa", 1e6, 0.0), "bar": ("Pa", 1e5, 0.0), "mbar": ("Pa", 1e2, 0.0),
+    "T": ("T", 1.0, 0.0), "mT": ("T", 1e-3, 0.0), "uT": ("T", 1e-6, 0.0), "nT": ("T", 1e-9, 0.0),
     "K": ("K", 1.0, 0.0), "degC": ("K", 1.0, 273.15), "rad": ("rad", 1.0, 0.0),
     "deg": ("rad", np.pi / 180, 0.0), "m": ("m", 1.0, 0.0), "mm": ("m", 1e-3, 0.0),
-    "um": ("m", 1e-6, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
-    "F": ("F", 1.0, 0.0), "pF": ("F", 1e-12, 0.0), "m/s2": ("m/s2", 1.0, 0.0),
+    "cm": ("m", 1e-2, 0.0), "um": ("m", 1e-6, 0.0),
+    "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0), "uV": ("V", 1e-6, 0.0),
+    "F": ("F", 1.0, 0.0), "nF": ("F", 1e-9, 0.0), "pF": ("F", 1e-12, 0.0),
+    "mrad": ("rad", 1e-3, 0.0), "m/s2": ("m/s2", 1.0, 0.0),
     "g": ("m/s2", _G, 0.0), "1": ("1", 1.0, 0.0),
 }  # fmt: skip
 # SI units of channels whose names say what they are
@@ -191,7 +196,7 @@ def parse_column(word: str, where: str) -> Column:
         )
     element, channel, scale, unit = found.groups()
     if unit and unit not in UNITS:
-        raise ConfigError(f"{where}: unknown unit {unit!r}; there are {', '.join(UNITS)}")
+        raise ConfigError(f"{where}: unknown unit {unit!r}; {nearest(unit, UNITS)}")
     return Column.measured(element, channel, unit or "", _scale(scale, where))
 
 

@@ -29,7 +29,8 @@ Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
-    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value)"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value"
+    r"|(?:uhr)?zeit|datum)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
@@ -43,8 +44,9 @@ _TIME_UNIT: Final = re.compile(
 _UNITS_OF_TIME: Final = {"sec": "s", "secs": "s", "µs": "us", "nsec": "ns", "nsecs": "ns"}
 _IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
+_OTHER_UNIT: Final = re.compile(r"\[[^\d\]]")  # which keeps to its own column
 _TAIL_UNIT: Final = re.compile(
-    r"_(mN|uN|N|Nm|mNm|gf|kgf|kPa|Pa|uT|mT|T|degC|C|K|rad|deg|mV|V|mm|um|pF)$"
+    r"_(mN|uN|kN|N|[mk]?Nm|Nmm|gf|kgf|[hkM]?Pa|mbar|[unm]?T|degC|C|K|rad|deg|mV|V|[cmu]m|pF)$"
 )
 _BEGIN, _END = r"(?:^|[\W_])", r"(?:$|[\W_]|(?=\d))"
 _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
@@ -281,7 +283,7 @@ def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())
     others = [unit for _, channel, unit in parsed.values() if not channel]
-    if others and (len({*others} - {""}) > 1 or 2 * len(known) >= len(parsed)):
+    if others and (len({*others}) > 1 or 2 * len(known) >= len(parsed)):
         # quantities of one place, such as force and temperature, each in its own unit
         told = {k: p[1] or p[0].lower() for k, p in parsed.items()}
         alone = all(p[0] == "S" and p[1] in ALONE for p in known.values())
@@ -325,4 +327,5 @@ def _parsed(name: str) -> tuple[str, str, str]:
         element = _PLAIN.sub("_", rest).strip("_-") or "S"
         element = f"S{element}" if element.isdecimal() else element
         return element, channel.format(axis), unit or usual
+    unit = unit or ("1" if _OTHER_UNIT.search(name) else "")
     return _PLAIN.sub("_", bare).strip("_-") or "S", "", unit
