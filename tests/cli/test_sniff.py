@@ -99,6 +99,12 @@ FILES = {
         lambda: b"".join(b"%d %d\n" % (k % 5, k * k % 17) for k in range(60)),
         "--columns T{0..1}.value --rate 100",
     ),
+    "a minus of typographers": (
+        lambda: b"t;Fz\n" + b"".join(
+            b"%d,5;\xe2\x88\x92%d,5\n" % (k, k * k % 7) for k in range(20)
+        ),
+        "--columns t=time:s,Fz=S.fz:N",
+    ),
     "one bad cell": (
         lambda: b"time_s,Fx_N\n" + b"".join(
             b"0.%02d,%s\n" % (k, b"?!" if k == 7 else b"%d" % k) for k in range(20)
@@ -132,6 +138,14 @@ def test_what_cannot_be_read_is_told_and_not_proposed(call, cwd):
     code, said, _ = call("sniff", "a.csv")
     assert code == 0 and "'16/9/23 12:00:10' in column 1 is no time that is read" in said
     assert "t=time" not in said and "--rate" in said
+    (cwd / "a.csv").write_text("t,Fz\n" + "".join(f"0.{k},ca.{k * k}x\n" for k in range(10, 40)))
+    code, said, _ = call("sniff", "a.csv")
+    assert code == 1 and said.endswith("it is read: no number of a measurement in Fz\n")
+    (cwd / "a.csv").write_text(
+        "Zeit;Kraft;Weg;Tag\n" + "".join(f"{k};2;1.200,5;5.3.24\n" for k in range(9))
+    )
+    _, said, _ = call("sniff", "a.csv")
+    assert "(left out: Weg,Tag)" in said and said.endswith("=time:ms,Kraft=Kraft.value:1\n")
     (cwd / "b.csv").write_text("a,b,a\n" + "".join(f"{k},[{k},x],{k * k}\n" for k in range(40)))
     code, said, _ = call("sniff", "b.csv")
     assert code == 1 or call(*next_command(said))[0] == 0

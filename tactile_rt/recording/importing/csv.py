@@ -142,6 +142,7 @@ def _joined(text: TextIOWrapper, skip: int, lines: int) -> Iterator[str]:
     begun: list[str] = []
     # a line ends as anybody ends lines; one that does not end is cut
     for line in islice(iter(lambda: text.readline(LONGEST), ""), skip, None):
+        line = re.sub(r"\u2212(?=[.,]?\d)", "-", line)  # a minus of typographers
         for part in line.rstrip("\r\n").split("\r"):
             begun.append(part)
             if len(begun) == lines:

@@ -10,11 +10,16 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
-from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, guess_line_columns
-from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.drivers.codecs.column_guess import (
+    LOOKED_AT,
+    guess_columns,
+    guess_line_columns,
+    names_time,
+)
+from tactile_rt.drivers.codecs.column_words import compress_columns, expand_columns
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
-from tactile_rt.recording.importing.table import read_samples
+from tactile_rt.recording.importing.table import read_samples, shown_names
 
 __all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line_columns"]
 
@@ -73,8 +78,10 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
         proposed = _of_table(path, form)
         if proposed is not None and proposed.columns:
             return proposed
-    if told is None or labelled:
-        return told or _of_table(path, form)
+    places = () if told is None or labelled else expand_columns(told.columns, "columns")
+    readings = [n for n, w in zip(form.names, places, strict=False) if "." in w]
+    if told is None or labelled or any(map(names_time, readings)):
+        return told if labelled else _of_table(path, form)
     tried = _try_import(path, form, replace(told, table=True))
     return tried if tried.columns else _of_table(path, form) or tried
 
@@ -93,9 +100,12 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     if form.units:  # said as names say them
         names = tuple(f"{n} [{u}]" if u else n for n, u in zip(names, form.units, strict=True))
     words, timed = guess_columns(names, cells, clocks)
-    if not any("." in word for word in words if not word.startswith("time")):
-        return None
     said = f"{path} is a table of {form.width} columns"
+    left = [n for n, word in zip(form.names, words, strict=False) if word == "-"]
+    said += f" (left out: {shown_names(left)})" if left else ""
+    if not any("." in word for word in words if not word.startswith("time")):
+        none = f"no number of a measurement in {shown_names(left)}"
+        return ProposedColumns("", True, timed, none) if left and timed else None
     for k, order in clocks.items():
         if words[k] == "time:iso" and order != "iso":
             words[k] = f"time:{order}"
