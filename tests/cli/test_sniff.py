@@ -105,6 +105,10 @@ FILES = {
         ),
         "--columns t=time:s,Fz=S.fz:N",
     ),
+    "days of a spreadsheet": (
+        lambda: b"Time,Fz\n" + b"".join(b"%.9f,%d\n" % (45356.5 + k / 864e4, k) for k in range(20)),
+        "--columns Time=time:days,Fz=S.fz:N",
+    ),
     "one bad cell": (
         lambda: b"time_s,Fx_N\n" + b"".join(
             b"0.%02d,%s\n" % (k, b"?!" if k == 7 else b"%d" % k) for k in range(20)

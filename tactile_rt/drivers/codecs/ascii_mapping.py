@@ -6,6 +6,7 @@ A column is written in one word:
     count[:BITS]                      the sample's number, which wraps at 2^BITS (32)
     time[*SCALE]:s                    seconds, with decimals
     time:ms|us|ns[:BITS]              whole milli-, micro- or nanoseconds, wrapping at 2^BITS (32)
+    time:days                         days since 30 December 1899, as spreadsheets have them
     time:iso                          2024-05-10 09:48:16.222, or a time of day, also with AM, PM
     time:mdy, time:dmy                05/10/2024 09:48:16, of May or of October
     ELEMENT.CHANNEL[*SCALE][:UNIT]    a measurement
@@ -186,6 +187,8 @@ def parse_column(word: str, where: str) -> Column:
         if not 1 <= bits <= MOST_BITS:
             raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
         return Column(found[1].removeprefix("time:"), bits=bits)
+    if word == "time:days":
+        return Column("s", scale=86_400.0, offset=-86_400.0 * 25_569)  # of 1970
     if found := _SECONDS.fullmatch(word):
         return Column("s", scale=_scale(found[1], where))
     found = _MEASUREMENT.fullmatch(word)

@@ -24,6 +24,8 @@ LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
 PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
+FASTEST_HZ: Final = 50_000  # of readings of touch
+DAYS: Final = (25_569, 80_000)  # of a spreadsheet: 1970 to 2119
 SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
 Rows = Sequence[Sequence[float | None]]
 
@@ -262,10 +264,10 @@ def _time_unit(name: str, v: NDArray[np.float64]) -> str:
     for least, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s")):
         if size > least:
             return unit
-    if (v % 1 != 0).any():
-        return "s"
     steps = np.diff(v)
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    if (v % 1 != 0).any():
+        return "days" if DAYS[0] < size < DAYS[1] and step < 1 / FASTEST_HZ else "s"
     return "ms" if step < 200 else "us" if step < 500_000 else "ns"
 
 

@@ -36,6 +36,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     read_mapping,
 )
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
+from tactile_rt.drivers.codecs.column_guess import FASTEST_HZ
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
@@ -152,6 +153,9 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         t_ns, told = _strictly(times - zero, rate_hz, account)
         if rate_hz and not 0.8 < told / rate_hz < 1.2:
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
+        if told > FASTEST_HZ:
+            odd = f"{told:.4g} Hz by its times is beyond any sensor: are they in another unit?"
+            account.notes.append(f"{odd} Days of a spreadsheet are time:days")
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     session = {"imported": table.path.name, "columns": columns}
@@ -263,7 +267,8 @@ def _time(cell: Any, column: Column) -> int:
     if column.kind == "iso":
         text = in_seconds(text, column.unit)
     try:
-        ns = Decimal(text) * NS[column.kind] * Decimal(column.scale)
+        of_unit = Decimal(text) * Decimal(column.scale) + Decimal(column.offset)
+        ns = of_unit * NS[column.kind]
         if abs(ns) < 1 << 62:
             return round(ns)
     except InvalidOperation:  # it is no number
