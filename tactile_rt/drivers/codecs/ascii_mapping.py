@@ -51,25 +51,23 @@ VERSION: Final = 1
 MOST_BITS: Final = 53  # of a counter: what a float64 holds
 
 _G: Final = 9.80665  # m/s^2
-# unit on the wire: (SI unit, SI units in it, offset)
-UNITS: Final[dict[str, tuple[str, float, float]]] = {
-    "N": ("N", 1.0, 0.0), "mN": ("N", 1e-3, 0.0), "uN": ("N", 1e-6, 0.0),
-    "kN": ("N", 1e3, 0.0), "daN": ("N", 10.0, 0.0),
-    "gf": ("N", 1e-3 * _G, 0.0), "kgf": ("N", _G, 0.0),
-    "N m": ("N m", 1.0, 0.0), "Nm": ("N m", 1.0, 0.0), "mNm": ("N m", 1e-3, 0.0),
-    "uNm": ("N m", 1e-6, 0.0), "kNm": ("N m", 1e3, 0.0), "kgfm": ("N m", _G, 0.0),
-    "Nmm": ("N m", 1e-3, 0.0), "Ncm": ("N m", 1e-2, 0.0),
-    "Pa": ("Pa", 1.0, 0.0), "hPa": ("Pa", 1e2, 0.0), "kPa": ("Pa", 1e3, 0.0),
-    "MPa": ("Pa", 1e6, 0.0), "bar": ("Pa", 1e5, 0.0), "mbar": ("Pa", 1e2, 0.0),
-    "T": ("T", 1.0, 0.0), "mT": ("T", 1e-3, 0.0), "uT": ("T", 1e-6, 0.0), "nT": ("T", 1e-9, 0.0),
-    "K": ("K", 1.0, 0.0), "degC": ("K", 1.0, 273.15), "rad": ("rad", 1.0, 0.0),
-    "deg": ("rad", np.pi / 180, 0.0), "m": ("m", 1.0, 0.0), "mm": ("m", 1e-3, 0.0),
-    "cm": ("m", 1e-2, 0.0), "um": ("m", 1e-6, 0.0),
-    "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0), "uV": ("V", 1e-6, 0.0),
-    "F": ("F", 1.0, 0.0), "nF": ("F", 1e-9, 0.0), "pF": ("F", 1e-12, 0.0),
-    "mrad": ("rad", 1e-3, 0.0), "m/s2": ("m/s2", 1.0, 0.0),
-    "g": ("m/s2", _G, 0.0), "1": ("1", 1.0, 0.0),
+_SCALES: Final[dict[str, dict[str, float]]] = {  # SI unit: units on the wire, and SI units in each
+    "N": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "kN": 1e3, "daN": 10.0, "gf": 1e-3 * _G, "kgf": _G},
+    "N m": {
+        "N m": 1.0, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "kNm": 1e3, "Nmm": 1e-3, "Ncm": 1e-2,
+        "kgfm": _G,
+    },
+    "Pa": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "mbar": 1e2},
+    "T": {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9}, "K": {"K": 1.0, "degC": 1.0},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}, "V": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},
+    "F": {"F": 1.0, "nF": 1e-9, "pF": 1e-12}, "m/s2": {"m/s2": 1.0, "g": _G}, "1": {"1": 1.0},
 }  # fmt: skip
+UNITS: Final = {  # unit on the wire: (SI unit, SI units in it, offset)
+    unit: (si, scale, 273.15 if unit == "degC" else 0.0)
+    for si, scales in _SCALES.items()
+    for unit, scale in scales.items()
+}
 # SI units of channels whose names say what they are
 _KNOWN: Final = {
     **dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my", "mz"), "N m"),

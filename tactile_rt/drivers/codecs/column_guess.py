@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
 from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 
-__all__ = ["guess_columns", "guess_line_columns", "names_time"]
+__all__ = ["guess_columns", "guess_line_columns"]
 
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
@@ -95,7 +95,7 @@ def guess_columns(
     if (count := _place_count(names, series, kinds)) is not None:
         kinds[count] = "count"
     for k, name in enumerate(names):  # times and counts beside those
-        if not kinds[k] and (names_time(name) or _counts(name)):
+        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _counts(name)):
             kinds[k] = "-"
     measured = [k for k, kind in enumerate(kinds) if not kind]
     plain = {k: f"T{i}.value" for i, k in enumerate(measured)}
@@ -181,6 +181,9 @@ def _of_places(lines: list[str]) -> list[str] | None:
         if len(clocks) == len(same[:20]) and all(c[k] not in line for line, c in clocks)
     }
     words, _ = guess_columns((), rows, dated)
+    heads = [c for c in cut if not any(number(word) is not None for word in c)]
+    times = {k for c in heads for k, word in enumerate(c) if _TIME.fullmatch(word)}
+    words = ["-" if k in times and "." in w else w for k, w in enumerate(words)]
     if not _measures(words):
         return None
     varied = {tuple(row) for row in rows}
@@ -219,11 +222,6 @@ def _bare(name: str) -> str:
     return _BRACKET.sub("", name).strip().strip('"')
 
 
-def names_time(name: str) -> bool:
-    """Return whether a name is that of a time."""
-    return _TIME.fullmatch(_bare(name)) is not None
-
-
 def _counts(name: str) -> bool:
     """Return whether a name is that of a count; Fx_N is none."""
     return _COUNT.fullmatch(_TAIL_UNIT.sub("", _bare(name))) is not None
@@ -234,7 +232,7 @@ def _place_time(
 ) -> tuple[int, str] | None:
     if dated:
         return min(dated), "time:iso"
-    known = [k for k, name in enumerate(names) if names_time(name)]
+    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))]
     known = known or [k for k, name in enumerate(names) if _IN_SECONDS.search(name)]
     for k in [*known, *(() if known else range(len(series)))]:
         v = series[k]

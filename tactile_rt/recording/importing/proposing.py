@@ -10,19 +10,15 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
-from tactile_rt.drivers.codecs.column_guess import (
-    LOOKED_AT,
-    guess_columns,
-    guess_line_columns,
-    names_time,
-)
-from tactile_rt.drivers.codecs.column_words import compress_columns, expand_columns
+from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, guess_line_columns
+from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 from tactile_rt.recording.importing.table import read_samples, shown_names
 
 __all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line_columns"]
 
+_DELTA = re.compile(r"Delta_X\W+([\d.,]+(?:E[+-]\d+)?)")  # LabVIEW's step, s
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
 DATED = 0.9  # of the cells of a column of dates
@@ -36,6 +32,7 @@ class ProposedColumns:
     Attributes:
         columns: The columns in words; empty where none were found with which the file is read.
         table: Whether the file is to be read as a table; else as what a board prints.
+        rate_hz: Rate that the header tells, Hz; 0: it tells none.
     """
 
     columns: str
@@ -43,6 +40,7 @@ class ProposedColumns:
     timed: bool
     said: str
     samples: int = 0
+    rate_hz: float = 0.0
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
@@ -78,10 +76,8 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
         proposed = _of_table(path, form)
         if proposed is not None and proposed.columns:
             return proposed
-    places = () if told is None or labelled else expand_columns(told.columns, "columns")
-    readings = [n for n, w in zip(form.names, places, strict=False) if "." in w]
-    if told is None or labelled or any(map(names_time, readings)):
-        return told if labelled else _of_table(path, form)
+    if told is None or labelled:
+        return told or _of_table(path, form)
     tried = _try_import(path, form, replace(told, table=True))
     return tried if tried.columns else _of_table(path, form) or tried
 
@@ -115,7 +111,15 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
             said += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
     if form.names:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    return _try_import(path, form, ProposedColumns(compress_columns(words), True, timed, said))
+    told = ProposedColumns(compress_columns(words), True, timed, said, rate_hz=_find_rate(form))
+    return _try_import(path, form, told)
+
+
+def _find_rate(form: CsvForm) -> float:
+    steps = {m[1].replace(",", ".") for head in form.heads if (m := _DELTA.match(head))}
+    of_time = all("Time" in x for x in form.heads if x.startswith("X_Dimension"))
+    step_s = number(steps.pop()) if of_time and len(steps) == 1 else None
+    return float(f"{1 / step_s:.6g}") if step_s else 0.0
 
 
 def _find_order(cells: Sequence[str]) -> str:
