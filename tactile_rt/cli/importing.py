@@ -122,7 +122,7 @@ def import_file(
                 )
         if rate and not decoded_as:
             made.said_hz = rate
-            if made.found_hz == rate:
+            if abs((made.found_hz or 0) - rate) < 1e-9 * rate:
                 made.found_hz = None  # no column is a time
         odd = _list_odd(made)
         for note in made.notes:

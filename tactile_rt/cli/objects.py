@@ -88,13 +88,15 @@ def check(
     found = []
     for kind in dict.fromkeys(opened.categories.values()):
         names = [name for name in opened.names if opened.categories[name] == kind]
-        errors = [usable[n].surface_error for n in names if n in usable]
-        worst = SIZE_MM * max(errors) if errors else None
+        mm = {n: SIZE_MM * usable[n].surface_error for n in names if n in usable}
+        worst = max(mm, key=mm.__getitem__, default="")
         found.append(
-            {"kind": kind, "objects": len(names), "usable": len(errors), "worst_mm": worst}
-        )
+            {"kind": kind, "objects": len(names), "usable": len(mm), "worst_mm": mm.get(worst),
+             "worst": worst}
+        )  # fmt: skip
     headings = {
         "kind": "kind", "objects": "objects", "usable": "usable", "worst_mm": "worst, mm of 40",
+        "worst": "which",
     }  # fmt: skip
     show_table(found, headings, json)
     if plates := [thing for thing in usable.values() if thing.made_by == "plates"]:

@@ -1,6 +1,7 @@
 """`tactile-rt sniff`: which codec, speed or columns fit a port, a bus, or a file."""
 
 import shlex
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -229,7 +230,11 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     fits = sniff_frames(begun, further) if of_bus else sniff_bytes(data, further)
     if fits:
         _show(fits, told)
-        _import(path, fits[0], told)
+        fields = fits[0].fields
+        if not fits[0].described:
+            told.say("it did not describe its array: array=FILE.json of `tactile-rt describe` does")
+            fields["array"] = "FILE.json"
+        told.go_on("import", path, "--as", _query(fields))
     elif of_bus:
         _show_identifiers(begun, told)
         for note in log.notes:
@@ -238,14 +243,6 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         told.nothing(f"no codec fits {path}", hint)
     elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, told):
         told.nothing(f"nothing fits {path}", DESCRIBE)
-
-
-def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
-    fields = fit.fields
-    if not fit.described:
-        told.say("it has not described its array: array=FILE.json, by `tactile-rt describe`, does")
-        fields["array"] = "FILE.json"
-    told.go_on("import", path, "--as", _query(fields))
 
 
 def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
@@ -262,8 +259,9 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     if not proposed.table:
         options = ["--as", _query({"codec": "ascii_line", "columns": proposed.columns})]
     elif not proposed.timed:
-        told.say(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
-        options += ["--rate", GUESSED_HZ]
+        of = "the header's" if proposed.rate_hz else f"not {GUESSED_HZ}"
+        told.say(f"no column is a time: --rate says how many came in a second, {of}")
+        options += ["--rate", f"{proposed.rate_hz or GUESSED_HZ:g}"]
     told.go_on("import", path, *options)
     return True
 
@@ -318,8 +316,6 @@ def _show(fits: "list[CodecFit]", told: _Told, speeds: Sequence[int] = ()) -> No
 
 
 def _show_identifiers(frames: "list[Any]", told: _Told) -> None:
-    from collections import Counter
-
     counts = Counter((f.id, f.extended, len(f.data)) for f in frames)
     for (number, extended, length), n in counts.most_common(12):
         told.say(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")

@@ -36,13 +36,19 @@ FILES = {
         ).encode(),
         "--as codec=xela",
     ),
-    "table": (
-        lambda: b"time;Fx [N];Fy [N]\n" + b"".join(b"%d,25;%d;0,5\n" % (k, k) for k in range(20)),
-        "--columns time=time:s,Fx [N]=S.fx:N,Fy [N]=S.fy:N",
+    "table, with a minus of typographers": (
+        lambda: b"t;Fx [N];Fy [N]\n" + b"".join(b"%d,5;7;\xe2\x88\x923,5\n" % k for k in range(20)),
+        "--columns t=time:s,Fx [N]=S.fx:N,Fy [N]=S.fy:N",
     ),
     "table without a time": (
         lambda: b"Fx,Fy\n" + b"".join(b"%d,%d.5\n" % (k * k, k) for k in range(20)),
         "--columns Fx=S.fx:N,Fy=S.fy:N --rate 100",
+    ),
+    "LabVIEW without times": (
+        lambda: b"Separator\tTab\nX_Columns\tNo\n***End_of_Header***\nChannels\t2\n"
+        b"X_Dimension\tTime\tTime\nDelta_X\t0,002000\t0,002000\n***End_of_Header***\n"
+        b"X_Value\tFx\tFy\tComment\n" + b"".join(b"\t%d,5\t0,5\n" % k for k in range(20)),
+        "--columns Fx=S.fx:N,Fy=S.fy:N --rate 500",
     ),
     "lines": (
         lambda: b"".join(b"%d %d %d.5\r\n" % (10 * k, k * k % 7, k % 5) for k in range(40)),
@@ -62,6 +68,16 @@ FILES = {
     "units below": (
         lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
         "--columns Zeit=time:s,Fx=S.fx:mN",
+    ),
+    "units below, one of them odd": (
+        lambda: b"Zeit;Kraft;Weg;Temp\ns;kip;cm;\xb0C\n" + b"".join(
+            b"%d,5;%d;0,5;21\n" % (k, k * k % 7) for k in range(40)
+        ),
+        "--columns Zeit=time:s,Kraft=S.kraft:1,Weg=S.weg:cm,Temp=S.temperature:degC",
+    ),
+    "units below, of one column": (
+        lambda: b"Zeit;Kraft;Weg\n;kN;\n" + b"".join(b"%d,5;%d;9\n" % (k, k) for k in range(40)),
+        "--columns Zeit=time:s,Kraft=S.kraft:kN,Weg=S.weg:1",
     ),
     "labels with units, one a line": (
         lambda: b"".join(
@@ -88,6 +104,10 @@ FILES = {
     "a reading that goes round": (
         lambda: b"".join(b"%d %d\n" % (k % 5, k * k % 17) for k in range(60)),
         "--columns T{0..1}.value --rate 100",
+    ),
+    "days of a spreadsheet": (
+        lambda: b"Time,Fz\n" + b"".join(b"%.9f,%d\n" % (45356.5 + k / 864e4, k) for k in range(20)),
+        "--columns Time=time:days,Fz=S.fz:N",
     ),
     "one bad cell": (
         lambda: b"time_s,Fx_N\n" + b"".join(
@@ -122,6 +142,12 @@ def test_what_cannot_be_read_is_told_and_not_proposed(call, cwd):
     code, said, _ = call("sniff", "a.csv")
     assert code == 0 and "'16/9/23 12:00:10' in column 1 is no time that is read" in said
     assert "t=time" not in said and "--rate" in said
+    (cwd / "a.csv").write_text("t,Fz\n" + "".join(f"0.{k},ca.{k * k}x\n" for k in range(10, 40)))
+    code, said, _ = call("sniff", "a.csv")
+    assert code == 1 and said.endswith("it is read: no number of a measurement in Fz\n")
+    (cwd / "a.csv").write_text("Zeit;Kraft;Weg\n" + "".join(f"{k};2;1.200,5\n" for k in range(9)))
+    _, said, _ = call("sniff", "a.csv")
+    assert "(left out: Weg)" in said and said.endswith("=time:ms,Kraft=Kraft.value:1\n")
     (cwd / "b.csv").write_text("a,b,a\n" + "".join(f"{k},[{k},x],{k * k}\n" for k in range(40)))
     code, said, _ = call("sniff", "b.csv")
     assert code == 1 or call(*next_command(said))[0] == 0

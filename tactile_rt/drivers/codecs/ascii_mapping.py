@@ -6,6 +6,7 @@ A column is written in one word:
     count[:BITS]                      the sample's number, which wraps at 2^BITS (32)
     time[*SCALE]:s                    seconds, with decimals
     time:ms|us|ns[:BITS]              whole milli-, micro- or nanoseconds, wrapping at 2^BITS (32)
+    time:days                         days since 30 December 1899, as spreadsheets have them
     time:iso                          2024-05-10 09:48:16.222, or a time of day, also with AM, PM
     time:mdy, time:dmy                05/10/2024 09:48:16, of May or of October
     ELEMENT.CHANNEL[*SCALE][:UNIT]    a measurement
@@ -30,7 +31,7 @@ import msgspec
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.settings import convert, read_toml
+from tactile_rt.core.settings import convert, nearest, read_toml
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.column_words import expand_columns
 
@@ -50,20 +51,23 @@ VERSION: Final = 1
 MOST_BITS: Final = 53  # of a counter: what a float64 holds
 
 _G: Final = 9.80665  # m/s^2
-# unit on the wire: (SI unit, SI units in it, offset)
-UNITS: Final[dict[str, tuple[str, float, float]]] = {
-    "N": ("N", 1.0, 0.0), "mN": ("N", 1e-3, 0.0), "uN": ("N", 1e-6, 0.0),
-    "gf": ("N", 1e-3 * _G, 0.0), "kgf": ("N", _G, 0.0),
-    "N m": ("N m", 1.0, 0.0), "Nm": ("N m", 1.0, 0.0), "mNm": ("N m", 1e-3, 0.0),
-    "uNm": ("N m", 1e-6, 0.0), "kgfm": ("N m", _G, 0.0),
-    "Pa": ("Pa", 1.0, 0.0), "kPa": ("Pa", 1e3, 0.0),
-    "T": ("T", 1.0, 0.0), "mT": ("T", 1e-3, 0.0), "uT": ("T", 1e-6, 0.0),
-    "K": ("K", 1.0, 0.0), "degC": ("K", 1.0, 273.15), "rad": ("rad", 1.0, 0.0),
-    "deg": ("rad", np.pi / 180, 0.0), "m": ("m", 1.0, 0.0), "mm": ("m", 1e-3, 0.0),
-    "um": ("m", 1e-6, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
-    "F": ("F", 1.0, 0.0), "pF": ("F", 1e-12, 0.0), "m/s2": ("m/s2", 1.0, 0.0),
-    "g": ("m/s2", _G, 0.0), "1": ("1", 1.0, 0.0),
+_SCALES: Final[dict[str, dict[str, float]]] = {  # SI unit: units on the wire, and SI units in each
+    "N": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "kN": 1e3, "daN": 10.0, "gf": 1e-3 * _G, "kgf": _G},
+    "N m": {
+        "N m": 1.0, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "kNm": 1e3, "Nmm": 1e-3, "Ncm": 1e-2,
+        "kgfm": _G,
+    },
+    "Pa": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "mbar": 1e2},
+    "T": {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9}, "K": {"K": 1.0, "degC": 1.0},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}, "V": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},
+    "F": {"F": 1.0, "nF": 1e-9, "pF": 1e-12}, "m/s2": {"m/s2": 1.0, "g": _G}, "1": {"1": 1.0},
 }  # fmt: skip
+UNITS: Final = {  # unit on the wire: (SI unit, SI units in it, offset)
+    unit: (si, scale, 273.15 if unit == "degC" else 0.0)
+    for si, scales in _SCALES.items()
+    for unit, scale in scales.items()
+}
 # SI units of channels whose names say what they are
 _KNOWN: Final = {
     **dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my", "mz"), "N m"),
@@ -181,6 +185,8 @@ def parse_column(word: str, where: str) -> Column:
         if not 1 <= bits <= MOST_BITS:
             raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
         return Column(found[1].removeprefix("time:"), bits=bits)
+    if word == "time:days":
+        return Column("s", scale=86_400.0, offset=-86_400.0 * 25_569)  # of 1970
     if found := _SECONDS.fullmatch(word):
         return Column("s", scale=_scale(found[1], where))
     found = _MEASUREMENT.fullmatch(word)
@@ -191,7 +197,7 @@ def parse_column(word: str, where: str) -> Column:
         )
     element, channel, scale, unit = found.groups()
     if unit and unit not in UNITS:
-        raise ConfigError(f"{where}: unknown unit {unit!r}; there are {', '.join(UNITS)}")
+        raise ConfigError(f"{where}: unknown unit {unit!r}; {nearest(unit, UNITS)}")
     return Column.measured(element, channel, unit or "", _scale(scale, where))
 
 

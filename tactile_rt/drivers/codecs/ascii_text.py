@@ -55,6 +55,7 @@ def number(word: Any) -> float | None:
         return float(word) if abs(word) < 1e300 else NAN
     if not isinstance(word, str):
         return NAN if word is None else None
+    word = word.replace("\u2212", "-")  # a minus of typographers
     try:
         return None if "_" in word else float(word)
     except ValueError:

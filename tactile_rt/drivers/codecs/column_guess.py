@@ -24,12 +24,15 @@ LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
 PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
+FASTEST_HZ: Final = 50_000  # of readings of touch
+DAYS: Final = (25_569, 80_000)  # of a spreadsheet: 1970 to 2119
 SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
 Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
-    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value)"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value"
+    r"|(?:uhr)?zeit|datum)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
@@ -43,8 +46,9 @@ _TIME_UNIT: Final = re.compile(
 _UNITS_OF_TIME: Final = {"sec": "s", "secs": "s", "µs": "us", "nsec": "ns", "nsecs": "ns"}
 _IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
+_OTHER_UNIT: Final = re.compile(r"\[[^\d\]]")  # which keeps to its own column
 _TAIL_UNIT: Final = re.compile(
-    r"_(mN|uN|N|Nm|mNm|gf|kgf|kPa|Pa|uT|mT|T|degC|C|K|rad|deg|mV|V|mm|um|pF)$"
+    r"_(mN|uN|kN|N|[mk]?Nm|Nmm|gf|kgf|[hkM]?Pa|mbar|[unm]?T|degC|C|K|rad|deg|mV|V|[cmu]m|pF)$"
 )
 _BEGIN, _END = r"(?:^|[\W_])", r"(?:$|[\W_]|(?=\d))"
 _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
@@ -177,6 +181,9 @@ def _of_places(lines: list[str]) -> list[str] | None:
         if len(clocks) == len(same[:20]) and all(c[k] not in line for line, c in clocks)
     }
     words, _ = guess_columns((), rows, dated)
+    heads = [c for c in cut if not any(number(word) is not None for word in c)]
+    times = {k for c in heads for k, word in enumerate(c) if _TIME.fullmatch(word)}
+    words = ["-" if k in times and "." in w else w for k, w in enumerate(words)]
     if not _measures(words):
         return None
     varied = {tuple(row) for row in rows}
@@ -255,10 +262,10 @@ def _time_unit(name: str, v: NDArray[np.float64]) -> str:
     for least, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s")):
         if size > least:
             return unit
-    if (v % 1 != 0).any():
-        return "s"
     steps = np.diff(v)
     step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    if (v % 1 != 0).any():
+        return "days" if DAYS[0] < size < DAYS[1] and step < 1 / FASTEST_HZ else "s"
     return "ms" if step < 200 else "us" if step < 500_000 else "ns"
 
 
@@ -281,7 +288,7 @@ def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())
     others = [unit for _, channel, unit in parsed.values() if not channel]
-    if others and (len({*others} - {""}) > 1 or 2 * len(known) >= len(parsed)):
+    if others and (len({*others}) > 1 or 2 * len(known) >= len(parsed)):
         # quantities of one place, such as force and temperature, each in its own unit
         told = {k: p[1] or p[0].lower() for k, p in parsed.items()}
         alone = all(p[0] == "S" and p[1] in ALONE for p in known.values())
@@ -325,4 +332,5 @@ def _parsed(name: str) -> tuple[str, str, str]:
         element = _PLAIN.sub("_", rest).strip("_-") or "S"
         element = f"S{element}" if element.isdecimal() else element
         return element, channel.format(axis), unit or usual
+    unit = unit or ("1" if _OTHER_UNIT.search(name) else "")
     return _PLAIN.sub("_", bare).strip("_-") or "S", "", unit

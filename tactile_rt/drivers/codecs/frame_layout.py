@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.settings import nearest
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS, Column, array_of
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD, FrameCounter, FrameMapping, Values
@@ -220,7 +221,7 @@ class FrameLayout:
                 pairs = [(e, c) for c, e in product(values.channels, elements)]
             if values.unit and values.unit not in UNITS:
                 raise ConfigError(
-                    f"{path}: {where}: unknown unit {values.unit!r}; there are {', '.join(UNITS)}"
+                    f"{path}: {where}: unknown unit {values.unit!r}; {nearest(values.unit, UNITS)}"
                 )
             scales = values.scale if isinstance(values.scale, tuple) else (values.scale,)
             if len(scales) == 1:

@@ -97,11 +97,7 @@ def is_recording(path: Path) -> bool:
 
 
 def import_bag(
-    path: Path,
-    output: Path,
-    topic: str = "",
-    columns: str = "",
-    rate_hz: float = 0.0,
+    path: Path, output: Path, topic: str = "", columns: str = "", rate_hz: float = 0.0
 ) -> Import:
     """Write a topic of a bag as a recording.
 
@@ -161,11 +157,8 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     if len(fitting) == 1:
         return fitting[0]
     told = ", ".join(f"{t.name} ({t.type})" for t in fitting or topics) or "none"
-    what = (
-        "name one with --topic"
-        if fitting
-        else "of none is known what is what: give --topic, and --columns tells"
-    )
+    none = "of none is known what is what: give --topic, and --columns tells"
+    what = "name one with --topic" if fitting else none
     raise ConfigError(f"{path} has the topics {told}: {what}")
 
 

@@ -35,8 +35,8 @@ _REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a s
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
-    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|[munk\u00b5]?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)"
-    r"|[mu]?N[ .*\u00b7-]?m{1,2}|deg|degC|kgf?|%|bar|counts?"
+    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|%|m?bar|counts?"
+    r"|(?:[munkhcM\u00b5]|da)?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)|[muk]?N[ .*\u00b7-]?[mc]?m"
 )
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
 _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
@@ -142,6 +142,7 @@ def _joined(text: TextIOWrapper, skip: int, lines: int) -> Iterator[str]:
     begun: list[str] = []
     # a line ends as anybody ends lines; one that does not end is cut
     for line in islice(iter(lambda: text.readline(LONGEST), ""), skip, None):
+        line = re.sub(r"\u2212(?=[.,]?\d)", "-", line)  # a minus of typographers
         for part in line.rstrip("\r\n").split("\r"):
             begun.append(part)
             if len(begun) == lines:
@@ -277,12 +278,16 @@ def _names(
         next_above &= not line.strip() or 2 * numbers >= len(cells)
         if longer and line[:1] != "#" and len(set(words)) == len(cells):
             return tuple(cells), units, k  # its last columns are seldom there
-        if len(cells) != width or 2 * len(words) < width or 2 * numbers >= width:
+        if len(cells) != width or 2 * numbers >= width:
             continue
-        if all(_UNIT.fullmatch(c) for c in cells):
+        known = sum(bool(_UNIT.fullmatch(c)) for c in words)
+        most = 2 * known > len(words) and not units
+        if 0 < known == len(words) or (
+            most and 0 < k - 1 == _names(above[: k - 1], delimiter, comma, width, spans)[2]
+        ):
             units = units or tuple(c.strip("[]() ") for c in cells)
             end = end or k
-        else:
+        elif 2 * len(words) >= width:
             return tuple(_distinct(cells)), units, end or k
     return (), (), 0
 

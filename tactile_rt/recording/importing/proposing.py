@@ -14,10 +14,11 @@ from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, gue
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
-from tactile_rt.recording.importing.table import read_samples
+from tactile_rt.recording.importing.table import read_samples, shown_names
 
 __all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line_columns"]
 
+_DELTA = re.compile(r"Delta_X\W+([\d.,]+(?:E[+-]\d+)?)")  # LabVIEW's step, s
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
 DATED = 0.9  # of the cells of a column of dates
@@ -31,6 +32,7 @@ class ProposedColumns:
     Attributes:
         columns: The columns in words; empty where none were found with which the file is read.
         table: Whether the file is to be read as a table; else as what a board prints.
+        rate_hz: Rate that the header tells, Hz; 0: it tells none.
     """
 
     columns: str
@@ -38,6 +40,7 @@ class ProposedColumns:
     timed: bool
     said: str
     samples: int = 0
+    rate_hz: float = 0.0
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
@@ -93,9 +96,12 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     if form.units:  # said as names say them
         names = tuple(f"{n} [{u}]" if u else n for n, u in zip(names, form.units, strict=True))
     words, timed = guess_columns(names, cells, clocks)
-    if not any("." in word for word in words if not word.startswith("time")):
-        return None
     said = f"{path} is a table of {form.width} columns"
+    left = [n for n, word in zip(form.names, words, strict=False) if word == "-"]
+    said += f" (left out: {shown_names(left)})" if left else ""
+    if not any("." in word for word in words if not word.startswith("time")):
+        none = f"no number of a measurement in {shown_names(left)}"
+        return ProposedColumns("", True, timed, none) if left and timed else None
     for k, order in clocks.items():
         if words[k] == "time:iso" and order != "iso":
             words[k] = f"time:{order}"
@@ -105,7 +111,15 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
             said += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
     if form.names:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    return _try_import(path, form, ProposedColumns(compress_columns(words), True, timed, said))
+    told = ProposedColumns(compress_columns(words), True, timed, said, rate_hz=_find_rate(form))
+    return _try_import(path, form, told)
+
+
+def _find_rate(form: CsvForm) -> float:
+    steps = {m[1].replace(",", ".") for head in form.heads if (m := _DELTA.match(head))}
+    of_time = all("Time" in x for x in form.heads if x.startswith("X_Dimension"))
+    step_s = number(steps.pop()) if of_time and len(steps) == 1 else None
+    return float(f"{1 / step_s:.6g}") if step_s else 0.0
 
 
 def _find_order(cells: Sequence[str]) -> str:

@@ -36,6 +36,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     read_mapping,
 )
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
+from tactile_rt.drivers.codecs.column_guess import FASTEST_HZ
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
@@ -152,6 +153,8 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         t_ns, told = _strictly(times - zero, rate_hz, account)
         if rate_hz and not 0.8 < told / rate_hz < 1.2:
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
+        if told > FASTEST_HZ:
+            account.notes.append(f"{told:.4g} Hz by its times is too fast: in days (time:days)?")
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     session = {"imported": table.path.name, "columns": columns}
@@ -263,7 +266,7 @@ def _time(cell: Any, column: Column) -> int:
     if column.kind == "iso":
         text = in_seconds(text, column.unit)
     try:
-        ns = Decimal(text) * NS[column.kind] * Decimal(column.scale)
+        ns = (Decimal(text) * Decimal(column.scale) + Decimal(column.offset)) * NS[column.kind]
         if abs(ns) < 1 << 62:
             return round(ns)
     except InvalidOperation:  # it is no number
@@ -363,7 +366,8 @@ def _strictly(
     if not forward.any():
         raise ConfigError("all lines have one time: leave its column out, and give --rate")
     stretches, repeats = int((steps < 0).sum()), int((steps == 0).sum())
-    usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
+    pause = GAP * np.median(steps[ends][forward])
+    usual = forward & (steps[ends] <= pause)
     rows = np.diff(ends, prepend=-1)
     long = steps[ends] > EVEN[1] * np.median((steps[ends] / rows)[usual]) * rows
     if (long & usual).sum() <= account.corrupt:
@@ -373,6 +377,11 @@ def _strictly(
         account.notes.append(f"times go back {stretches} times: there they go on a period later")
         jump = np.where(steps < 0, round(period) - steps, 0)
         times = times + np.concatenate([[0], np.cumsum(jump)])
+    gaps = np.flatnonzero(steps > max(pause, account.corrupt * period, NS_PER_S / 10))
+    if len(gaps) and not account.missing:
+        at = int(gaps[steps[gaps].argmax()])
+        more = f", the longest of {len(gaps)} gaps" if len(gaps) > 1 else ""
+        account.notes.append(f"no rows for {steps[at] / NS_PER_S:.4g} s after row {at + 1}{more}")
     if repeats:
         account.notes.append(f"{repeats} lines have the time of the one before: spread evenly")
         times = _spread(times, period)

@@ -27,6 +27,7 @@ def lines(form: str) -> bytes:
         ("{t},{a},{b}\n", "time:ms,T{0..1}.value"),
         ("{k}\t{s:.4f}\t{a}\t{b}\n", "count,time:s,T{0..1}.value"),
         ("2024-05-10 09:48:16.{t:03d}  {a}  {b}\n", "time:iso,T{0..1}.value"),
+        ("Fx: \u2212{a}.5 N, Fy: {b} N\n", "Fx=S.fx:N,Fy=S.fy:N"),
         ("Fx: {a} N, Fy: {b} N\n", "Fx=S.fx:N,Fy=S.fy:N"),
         ("magX[{a}] magY[{b}]\r\n", "magX=S.bx:1,magY=S.by:1"),
         ("X: {a} uT\r\nY: {b} uT\r\n", "Y=S.y:1,X=S.x:1"),

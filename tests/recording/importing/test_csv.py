@@ -96,6 +96,22 @@ def test_a_time_of_seconds_and_the_rest(table):
     assert chunk.t_ns[:4].tolist() == [0, 500_000_001, 10**9, 1_500_000_001]
 
 
+def test_days_of_a_spreadsheet_are_told_from_seconds(table):
+    lines = [f"{45356.5 + k / 86400:.9f},{k}\n" for k in range(9)]
+    made, chunk, _ = table(lines, "time:days,S.fx")
+    assert made.first == "2024-03-05 12:00:00.000000 UTC" and not made.notes
+    assert np.diff(chunk.t_ns) == pytest.approx(1e9, abs=1e5)
+    made, _, _ = table(lines, "time:s,S.fx")
+    assert "8.64e+04 Hz by its times is too fast" in made.notes[0]
+
+
+def test_a_long_pause_is_told_with_its_place(table):
+    late = [0.01 * k + 50 * (k >= 30) + 2 * (k >= 40) for k in range(N)]
+    made, _, about = table([f"{t:.2f},{k}\n" for k, t in enumerate(late)], "time:s,S.fx")
+    assert made.notes == ["no rows for 50.01 s after row 30, the longest of 2 gaps"]
+    assert about.spec.rate_hz == 100
+
+
 def test_names_from_windows(tmp_path):
     (tmp_path / "t.csv").write_bytes(("t;T (\u00b0C)\n" + rows("{k};{b}\n")).encode("cp1252"))
     assert csv_form(tmp_path / "t.csv").names == ("t", "T (\u00b0C)")
