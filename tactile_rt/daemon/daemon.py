@@ -313,10 +313,9 @@ class Daemon:
             self._hold_devices()
             self.turned("watch")
             for name, source in self._sources.copy().items():
-                on_it = (p for _, p in self._models.copy().values() if p.config.source == name)
-                told = [(p.sensor, p.changes) for p in on_it]
-                sensor = next((found for found, _ in told if found is not None), None)
-                source.expect(sensor, max((changes for _, changes in told), default=0.0))
+                on_it = [p for _, p in self._models.copy().values() if p.config.source == name]
+                sensor = next((p.sensor for p in on_it if p.sensor is not None), None)
+                source.expect(sensor, max((p.changes for p in on_it), default=0.0))
             for part in self._parts():
                 part.watch()
             late_s = {name: source.late_s for name, source in self._sources.copy().items()}

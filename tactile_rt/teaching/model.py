@@ -52,7 +52,6 @@ __all__ = [
     "Enrolment",
     "FewShot",
     "write_features",
-    "write_few_shot",
 ]
 
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
@@ -107,8 +106,7 @@ class FewShot:
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
         """Count the touches of anything else that are refused, each judged without it."""
-        last = features[:, -1:], labels, self.network.kinds, others[:, -1:]
-        return count_refused(*last)
+        return count_refused(features[:, -1:], labels, self.network.kinds, others[:, -1:])
 
     def learn(
         self,
@@ -121,8 +119,23 @@ class FewShot:
         told: dict[str, Any],
     ) -> ModelCard:
         """Write the model of the classes of these touches (touch, step, feature)."""
-        classes = fit_classes(features, labels, self.network.kinds, others=others)
-        return write_few_shot(path, self, classes, name, told, largest)
+        graph, network = OnnxGraph(), self.network
+        classes = fit_classes(features, labels, network.kinds, others=others)
+        found, after = network.build(graph)
+        logits = _head(graph, found, after["count"], self.timing, classes)
+        graph.output("logits", logits, ["batch", len(classes.labels) + 1])
+        card = {
+            "name": name,
+            "labels": (*classes.labels, UNKNOWN),
+            "refusals": (UNKNOWN,),
+            "unknown": OpenSetRule(POSTERIOR, "logits", (MAYBE,)),
+            "temperature": classes.temperature,
+            "provenance": {**_made_by(), **told},
+        }
+        if largest.any():
+            believed = np.maximum(LARGER * largest, NOISES * self.floor)
+            card["clip"] = tuple(map(float, believed))
+        return _write(path, self, graph, found, after, card)
 
 
 class Enrolment:
@@ -210,33 +223,6 @@ def write_features(path: Path, taught: FewShot) -> ModelCard:
     first = graph("Slice", features, graph.integers(0), graph.integers(1), graph.integers(1))
     graph.output("logits", first, ["batch", 1])
     return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
-
-
-def write_few_shot(
-    path: Path,
-    taught: FewShot,
-    classes: TouchClasses,
-    name: str,
-    provenance: dict[str, Any],
-    largest: NDArray[np.float32],
-) -> ModelCard:
-    """Write the model of the classes; it appears whole or not at all."""
-    graph, network = OnnxGraph(), taught.network
-    features, after = network.build(graph)
-    logits = _head(graph, features, after["count"], taught.timing, classes)
-    graph.output("logits", logits, ["batch", len(classes.labels) + 1])
-    told = {
-        "name": name,
-        "labels": (*classes.labels, UNKNOWN),
-        "refusals": (UNKNOWN,),
-        "unknown": OpenSetRule(POSTERIOR, "logits", (MAYBE,)),
-        "temperature": classes.temperature,
-        "provenance": {**_made_by(), **provenance},
-    }
-    if largest.any():
-        believed = np.maximum(LARGER * largest, NOISES * taught.floor)
-        told["clip"] = tuple(map(float, believed))
-    return _write(path, taught, graph, features, after, told)
 
 
 def _head(g: OnnxGraph, features: str, count: str, timing: Timing, classes: TouchClasses) -> str:
