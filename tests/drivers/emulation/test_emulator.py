@@ -5,6 +5,7 @@ import os
 import select
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -317,11 +318,11 @@ def test_python_can_reads_it() -> None:
             counts: list[int] = []
             end = time.monotonic() + PATIENCE_S
             while len(counts) < 200 and time.monotonic() < end:
-                message = bus.recv(0.5)
-                if message is not None:
-                    frame = (message.arbitration_id, bytes(message.data), False, False, False)
-                    samples = host.feed([frame], 0)  # type: ignore[list-item]
-                    counts += [] if samples is None else samples.count.tolist()
+                with suppress(can.CanOperationError):  # the kernel may wake a read for nothing
+                    if (message := bus.recv(0.5)) is not None:
+                        frame = (message.arbitration_id, bytes(message.data), False, False, False)
+                        samples = host.feed([frame], 0)  # type: ignore[list-item]
+                        counts += [] if samples is None else samples.count.tolist()
             assert counts == list(range(200))
 
 
