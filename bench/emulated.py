@@ -131,7 +131,7 @@ class LoopedSource(Source):
     """
 
     live = False
-    every = 1  # of so many samples one is measured
+    every, pace = 1, 1.0  # of so many samples one is measured; and how often
 
     def __init__(
         self, spec: ArraySpec, signal: NDArray[np.float32], samples: int | None = None
@@ -139,7 +139,7 @@ class LoopedSource(Source):
         super().__init__(spec)
         self._loop = signal.astype(np.float32, copy=False)
         self._left = len(signal) if samples is None else samples
-        self._sent = 0
+        self._sent, self._t_ns = 0, 0.0
         self._piece = max(1, round(PIECE_S * spec.rate_hz))
 
     def read(self, timeout: float | None = None) -> Chunk | None:
@@ -148,7 +148,9 @@ class LoopedSource(Source):
             raise EndOfStream
         seq = self._sent + np.arange(n, dtype=np.int64)
         self._sent, self._left = self._sent + n, self._left - n
-        t_ns = np.round(seq * (NS_PER_S / self.spec.rate_hz)).astype(np.int64)
+        period_ns = NS_PER_S / self.spec.rate_hz / self.pace
+        t_ns = np.round(self._t_ns + np.arange(n) * period_ns).astype(np.int64)
+        self._t_ns += n * period_ns
         seq, t_ns = seq[:: self.every], t_ns[:: self.every]
         values = self._loop[seq % len(self._loop)]
         return Chunk(seq, t_ns, values, np.ones(values.shape[:2], np.bool_))
@@ -204,7 +206,8 @@ class EmulatedArray(EmulatedDevice):
     Attributes:
         mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
             same values again and again; ``no_number``: NaN; ``slow``: at half its rate;
-            ``fails``: its status says that a sensor fails; ``uncounted``: its counter stands;
+            ``fast``: at twice its rate; ``fails``: its status says that a sensor fails;
+            ``uncounted``, ``back``: its counter stands, or runs back;
             ``gaps``, ``corrupt``: every twentieth sample is missing, or damaged.
     """
 
@@ -248,14 +251,15 @@ class EmulatedArray(EmulatedDevice):
         """What the array's mood makes of what it feels."""
         values = chunk.values
         self._source.every = 2 if self.mood == "slow" else 1
+        self._source.pace = 2.0 if self.mood == "fast" else 1.0
         self.codec.status = 2 if self.mood == "fails" else 0
         if self.mood == "stuck":
             values = np.broadcast_to(self._last, values.shape).copy()
         elif self.mood == "no_number":
             values = np.full_like(values, np.nan)
         self._last = values[-1]
-        seq = np.zeros_like(chunk.seq) if self.mood == "uncounted" else chunk.seq
-        return Chunk(seq, chunk.t_ns, values, chunk.valid)
+        counts = {"uncounted": 0, "back": -1}.get(self.mood, 1)
+        return Chunk(counts * chunk.seq, chunk.t_ns, values, chunk.valid)
 
     def end(self) -> None:
         """Measure nothing more; what is measured still goes out."""

@@ -238,6 +238,13 @@ def _disk_hangs(scene: FaultScene) -> Iterator[float]:
     _do("fsfreeze", "-u", scene.disk)
 
 
+def _disk_pulled_out(scene: FaultScene) -> Iterator[float]:
+    """Its folder stays, and is the system's disk's."""
+    _do("umount", "-l", scene.disk)
+    yield time.monotonic()
+    _do("mount", "-o", "loop", scene.disk.parent / "image", scene.disk)
+
+
 def _folder_read_only(scene: FaultScene) -> Iterator[float]:
     """No file can be begun or taken away, and the one that was written is gone."""
     folder = scene.disk / "recordings"
@@ -348,6 +355,15 @@ def _reloaded(further: str) -> Callable[[FaultScene], Iterator[float]]:
         scene.configure()
 
     return cause
+
+
+def _no_threads(scene: FaultScene) -> Iterator[float]:
+    with _kept_short(scene, "pids", "pids.max", "pids.max") as limit:
+        limit("1")
+        scene.daemon.reload()
+        yield time.monotonic()
+        limit("max")
+    scene.configure()
 
 
 def _port_taken(scene: FaultScene) -> Iterator[float]:
@@ -477,6 +493,10 @@ KINDS: dict[str, FaultKind] = {
     "counter_stuck": FaultKind(
         _mood("whiskers", "uncounted", 0.064), (("source.whiskers", "no counter"),)
     ),
+    "counter_runs_back": FaultKind(
+        _mood("whiskers", "back", 0.064), (("source.whiskers", "no counter"),)
+    ),
+    "device_fast": FaultKind(_mood("whiskers", "fast", 1.5), (("source.whiskers", "fast"),)),
     "array_exchanged": FaultKind(
         _exchanged("whiskers"), (("source.whiskers", "another array"),),
         (("source.whiskers", "lost samples"), ("source.whiskers", "no samples")),
@@ -503,6 +523,7 @@ KINDS: dict[str, FaultKind] = {
     "recordings_emptied": FaultKind(_recordings_emptied, (RECORDER,), lasts=False),
     "folder_is_a_file": FaultKind(_folder_is_a_file, (RECORDER,)),
     "folder_read_only": FaultKind(_folder_read_only, (RECORDER,), root=True),
+    "disk_pulled_out": FaultKind(_disk_pulled_out, (RECORDER,), root=True),
     "disk_hangs": FaultKind(_disk_hangs, (RECORDER,), root=True),
     "little_room": FaultKind(_little_room, (RECORDER,), root=True),
     "no_room": FaultKind(_no_room, (RECORDER,), root=True),
@@ -523,6 +544,7 @@ KINDS: dict[str, FaultKind] = {
         _starved, (("daemon", "late"),), LATE_TOO, lasts=False, root=True, blind=True
     ),
     "memory_swapped_out": FaultKind(_swapped_out, (), (("daemon", "late"), *LATE_TOO), root=True),
+    "no_threads": FaultKind(_no_threads, (("daemon", "old configuration"),), root=True),
     "port_taken": FaultKind(_port_taken, (("publisher.second", "not published"),)),
     "device_not_there": FaultKind(_reloaded(GHOST), (("source.ghost", "no samples"),)),
     "file_cannot_be_written": FaultKind(

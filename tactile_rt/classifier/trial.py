@@ -152,7 +152,7 @@ def _result(path: Path, limits: TrialLimits, code: int, said: bytes) -> Trial:
 def _too_large(limits: TrialLimits) -> str:
     return (
         f"it needs more memory than limits.model_mb = {limits.memory_mb:g} MB and four times its "
-        "size, or breaks onnxruntime"
+        "size, breaks onnxruntime, or was killed"
     )
 
 

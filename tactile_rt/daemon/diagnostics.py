@@ -30,6 +30,7 @@ from tactile_rt.daemon.health import (
     PartState,
     SourceState,
 )
+from tactile_rt.daemon.rate_meter import SLOW
 from tactile_rt.drivers.health import State
 
 __all__ = ["LossWindow", "diagnose", "oldest_s"]
@@ -134,15 +135,17 @@ def _of_source(
         elif taken_s > most:
             why = f"when they come they are older than {most:g} s"
             found.append(Diagnostic(name, "late samples", why))
-    if source.stuck_at_s:
-        why = f"{'all zeros' if source.zeros else 'no value changes'}: the device hangs"
-        found.append(Diagnostic(name, "stuck-at fault", why))
-    elif source.stuck:
-        why = f"no value of {name_some(source.stuck)} changes: it hangs, or is out of range"
+    if source.stuck_at_s or source.stuck:
+        each = f"no value of {name_some(source.stuck)} changes: it hangs, or is out of range"
+        all_of_it = f"{'all zeros' if source.zeros else 'no value changes'}: the device hangs"
+        why = all_of_it if source.stuck_at_s else each
         found.append(Diagnostic(name, "stuck-at fault", why))
     if source.slow and read_s <= most and not starved:
         why = f"it measures less often than nine tenths of the {source.rate_hz:g} Hz that it has"
         found.append(Diagnostic(name, "slow", why))
+    if source.measured_hz > source.rate_hz / SLOW and not starved:
+        why = f"it measures more often than ten ninths of the {source.rate_hz:g} Hz that it has"
+        found.append(Diagnostic(name, "fast", why))
     if device is not None and not device.counts:
         why = "its counter does not go on: what is lost cannot be seen"
         found.append(Diagnostic(name, "no counter", why))
@@ -169,11 +172,9 @@ def _of_model(
     if model.behind_s > limits.behind_s:
         why = f"it is more than {limits.behind_s:g} s behind"
         return [Diagnostic(part.name, "late decisions", why, still)]
-    if model.skips.second:
-        why = "it cannot keep up, and skips to the newest sample"
-        return [Diagnostic(part.name, "missing decisions", why, still)]
-    if model.lost.second:
-        why = "it was too slow for its samples"
+    if model.skips.second or model.lost.second:
+        skips = "it cannot keep up, and skips to the newest sample"
+        why = skips if model.skips.second else "it was too slow for its samples"
         return [Diagnostic(part.name, "missing decisions", why, still)]
     if model.implausible:
         return [Diagnostic(part.name, "implausible loads", IMPLAUSIBLE_LOADS, still)]

@@ -55,6 +55,7 @@ def note_signals() -> None:
     have come by then; for good, so that none ends it while Python winds down, either."""
     for number in SIGNALS:
         signal.signal(number, lambda number, frame: _noted.put(number))
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # log rotators send it; see `Log`
 
 
 def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = None) -> ExitCode:
@@ -66,8 +67,7 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
         ConfigError: The configuration is wrong.
         AlreadyRunning: Another process has it, or a device.
     """
-    # Signals, and the end of all streams.
-    calls: Calls = SimpleQueue()
+    calls: Calls = SimpleQueue()  # signals, and the end of all streams
 
     def note(number: int, frame: FrameType | None) -> None:
         calls.put(number)
@@ -137,7 +137,11 @@ def _serve(
             if reload is not None:
                 reload.wanted = False
             reload = _Reload(daemon, path, sets)
-            reload.start()
+            try:
+                reload.start()
+            except RuntimeError as error:
+                reload = None
+                daemon.refuse(f"{path}: {error}: raise the limit of threads (TasksMax)")
         left = TURN_S if end is None else min(TURN_S, end - time.monotonic())
         if left < 0:
             return

@@ -45,4 +45,5 @@ class RateMeter:
         """Return the rate, Hz, and whether it is slow; 0 after a silence, s."""
         if silent_s > max(1.0, 3 / max(self.hz, 1e-9)):
             return 0.0, False
-        return self.hz, 0 < max(self.hz, self.typical_hz) < SLOW * nominal_hz
+        hz = min(self.hz, max(self.typical_hz, nominal_hz))  # a backlog is in one stretch
+        return hz, 0 < max(self.hz, self.typical_hz) < SLOW * nominal_hz

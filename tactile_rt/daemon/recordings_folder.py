@@ -43,7 +43,7 @@ class RecordingsFolder:
     ) -> None:
         self.path, self._min_free_mb = path, min_free_mb
         self._later, self._tell = later, tell
-        self.state, self.why, self._room_mb = "on", "", 0.0
+        self.state, self.why, self._room_mb, self._disk = "on", "", 0.0, 0
         self._written: deque[tuple[float, float]] = deque(maxlen=POINTS)  # s, MB
 
     @property
@@ -58,6 +58,7 @@ class RecordingsFolder:
             OSError: it cannot be made or read.
         """
         self._make(parents=True)
+        self._disk = self.path.stat().st_dev
         with os.scandir(self.path) as found:  # a pipe or a dead mount is not even looked at
             files = sorted(f.name for f in found if f.is_file(follow_symlinks=False))
         for name in files:  # of one who was killed as it began a file
@@ -75,6 +76,9 @@ class RecordingsFolder:
         try:
             # Deleted, perhaps; a parent that is gone, too, may be the place of a medium that is.
             self._make(parents=False)
+            disk = self.path.stat().st_dev
+            if self._disk not in (0, disk) and disk == os.stat("/").st_dev:
+                raise OSError("its disk is gone, and this is the system's: mount it again")
             free = shutil.disk_usage(self.path).free / MB
         except OSError as error:
             state, why = "no folder", words(self.path, error)

@@ -74,6 +74,8 @@ def test_who_does_what_it_should_is_not_named():
          "no samples: source.a fails: no such port"),
         ({"slow": True, "measured_hz": 500.0},
          "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
+        ({"measured_hz": 1200.0},
+         "fast: source.a: it measures more often than ten ninths of the 1000 Hz that it has"),
         ({"device": Health(State.STREAMING, 1, faults=("a sensor fails",)), "bad": Losses(1, 1)},
          "device fault: source.a: it says: a sensor fails"),
         ({"device": Health(State.STREAMING, 1, counts=False)},

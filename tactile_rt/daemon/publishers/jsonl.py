@@ -61,6 +61,9 @@ class JsonlPublisher(Consumer):
             os.write(self._handle, b"\n")
 
     def handle(self, items: list[Item]) -> None:
+        name = self._options.file
+        if name and not os.path.samestat(os.fstat(self._handle), os.stat(name)):
+            raise OSError(f"{name} was moved while it was written: another is begun")
         # After a reader that stalled much waits: not all of it at once, in this thread and memory.
         for start in range(0, len(items), TOGETHER):
             found = map(message_of, items[start : start + TOGETHER])
@@ -84,7 +87,6 @@ class JsonlPublisher(Consumer):
 
     def details(self) -> dict[str, str | int | float]:
         return {
-            "file": self._options.file or "standard output",
-            "messages": self._lines,
+            "file": self._options.file or "standard output", "messages": self._lines,
             "bytes": self._bytes,
-        }
+        }  # fmt: skip
