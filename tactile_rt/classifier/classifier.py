@@ -261,7 +261,7 @@ class Classifier:
         self._decided = False  # the episode has had its final decision
         self._touched_ns, self._endless = 0, False  # the latest change of contact
         self._skipping = False
-        self._next_seq = self._joined_ns = 0
+        self._next_seq = 0
         self._rated = rated_noise(self.card)
         self._plausible = IMPLAUSIBLE * np.array(self.card.clip, dtype=np.float32)
         self.implausible = self.undecided = False
@@ -296,7 +296,7 @@ class Classifier:
         """Be as if no sample had come: find the baseline anew."""
         self._renew_detector()
         self._resampler = Resampler(self.card.period_ns, self._rate_hz)
-        self._onset_ns, self._next_seq, self._joined_ns = None, 0, 0
+        self._onset_ns, self._next_seq = None, 0
         self._felt.clear()
 
     def _renew_detector(self) -> None:
@@ -326,12 +326,11 @@ class Classifier:
 
     def _sample(self, t_ns: int, sample: Floats, valid: NDArray[np.bool_]) -> Classification | None:
         touched = self.detector.contact
-        ready = self.detector.ready
+        joined = self._next_seq * self.card.period_ns > JOINING_S * NS_PER_S
+        ready = self.detector.ready or joined
         begins = self.detector.update(sample, valid)
-        self._joined_ns = self._joined_ns or t_ns
-        if self.detector.ready and not ready and t_ns - self._joined_ns < JOINING_S * NS_PER_S:
-            if self.detector.moves:  # a stream that is joined within a touch: wait for its end
-                self._renew_detector()
+        if self.detector.ready and not ready and self.detector.moves:
+            self._renew_detector()  # the stream is joined within a touch: wait for its end
         if self.detector.contact != touched:
             self.touches.append((t_ns, not touched))
             self._touched_ns = t_ns

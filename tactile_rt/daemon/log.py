@@ -149,11 +149,7 @@ class Log(Consumer):
 
 
 class EventHandler(logging.Handler):
-    """Makes an event of each warning of a Python logger.
-
-    Args:
-        report: takes an event, see `Daemon.report`.
-    """
+    """Makes an event of each warning of a Python logger, for `Daemon.report`."""
 
     def __init__(self, report: Callable[[str, str, str, str], None]) -> None:
         super().__init__(logging.WARNING)

@@ -179,10 +179,13 @@ class Recorder(Consumer):
         recording = sum(track.file is not None for track in tracks)
         return {
             "state": self._folder.state if self._folder.why else "on" if self._on else "off",
-            "mode": self._config.mode, "recording": recording, "files": self._files,
-            "megabytes": round(self._written_mb(), 1), "lost_samples": self._lost_samples,
+            "mode": self._config.mode,
+            "recording": recording,
+            "files": self._files,
+            "megabytes": round(self._written_mb(), 1),
+            "lost_samples": self._lost_samples,
             "newest": self._newest,
-        }  # fmt: skip
+        }
 
     def _written_mb(self) -> float:
         files = [track.file for track in list(self._tracks.values())]

@@ -183,10 +183,10 @@ class SourcePart(Part):
     def expect(self, sensor: SensorSpec | None, changes: float) -> None:
         """Take what the model on this source tells of its sensor, see `StuckAtDetector.expect`."""
         judge, given_s = self._stuck_at, self.config.stuck_at_s
-        if given_s or self._spec is None or self._device is None:
+        if self._spec is None or self._device is None:
             judge.after_s, judge.each_after_s = given_s or math.inf, math.inf
         else:
-            judge.expect(self._spec, sensor, max(changes, self._tared_changes))
+            judge.expect(self._spec, sensor, max(changes, self._tared_changes), given_s)
 
     def stop(self) -> None:
         self._stopped_s = self._stopped_s or time.monotonic()

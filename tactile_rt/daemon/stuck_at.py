@@ -47,15 +47,18 @@ class StuckAtDetector:
         self._began_ns = self._since_ns = self._counted = 0
         self.seconds, self.elements, self.zeros = 0.0, tuple[int, ...](), False
 
-    def expect(self, spec: ArraySpec, sensor: SensorSpec | None, changes: float) -> None:
+    def expect(
+        self, spec: ArraySpec, sensor: SensorSpec | None, changes: float, after_s: float = 0.0
+    ) -> None:
         """Derive for how long readings may be equal from what is known of the sensor.
 
         Args:
             changes: share of readings at rest that differ from the one before, where an element
                 repeats most; 0: not known.
+            after_s: what somebody says of all together, s; 0: nobody does.
         """
         noisy = changes > OFTEN and not self._rested
-        self.after_s = derive_stuck_at_s(spec, sensor, noisy=noisy or self.noisy)
+        self.after_s = after_s or derive_stuck_at_s(spec, sensor, noisy=noisy or self.noisy)
         self.each_after_s = derive_stuck_at_s(spec, sensor, each=True, noisy=noisy)
 
     def add(self, *chunks: Chunk) -> None:
@@ -82,8 +85,7 @@ class StuckAtDetector:
         if before_s and not self.seconds:
             noisy = self._changes > OFTEN
             if (differs[moved.any(axis=1).argmax()] & noisy).sum() < noisy.sum() / 2:
-                self._changes[:], self.noisy = 0.0, False  # one step of one: it was at rest
-                self._rested = True
+                self._changes[:], self.noisy, self._rested = 0.0, False, True  # it was at rest
         self._counted += int(useful.sum())
         self._differed += differs.sum(axis=0)
         if self._counted >= self._window and not self.seconds:

@@ -65,11 +65,7 @@ def read_free_bytes() -> float:
 
 
 class Trends:
-    """Those of a daemon: its memory, and how late the samples of each source come.
-
-    Args:
-        free_bytes: tells how much memory is free.
-    """
+    """Those of a daemon: its memory, and how late the samples of each source come."""
 
     def __init__(self, free_bytes: Callable[[], float] = read_free_bytes) -> None:
         self._free_bytes = free_bytes
@@ -94,8 +90,6 @@ class Trends:
         for name, trend in self._late.copy().items():
             growth = trend.growth()
             if growth and growth[1] > max(LATER * growth[0], LATE_MS):
-                before, now, seconds = growth
-                ago = f"{seconds / 60:.0f} minutes ago {before:.0f}"
-                why = f"its samples come {now:.0f} ms late, {ago}"
+                why = f"its samples come {growth[1]:.0f} ms late, and came {growth[0]:.0f} ms late"
                 found.append(Diagnostic(name, "jitter grows", why))
         return found

@@ -25,7 +25,7 @@ def test_memory_that_grows_until_none_is_left():
 def test_samples_that_come_later_and_later():
     (found,) = foreseen(lambda t: 100, lambda t: 2 + t / 100)
     assert found[:2] == ("hand", "jitter grows")
-    assert found[2] == "its samples come 17 ms late, 20 minutes ago 5"
+    assert found[2] == "its samples come 17 ms late, and came 5 ms late"
 
 
 @pytest.mark.parametrize(
@@ -38,12 +38,3 @@ def test_samples_that_come_later_and_later():
 )
 def test_what_settles_comes_back_or_is_small_is_no_trend(resident_mb, late_ms):
     assert not foreseen(resident_mb, late_ms, free_mb=300.0)
-
-
-def test_a_source_that_is_gone_is_forgotten():
-    trends = Trends()
-    for t in HALF_AN_HOUR:
-        trends.look(t, 0, {"hand": t / 100})
-    assert [one.part for one in trends.foresee()] == ["hand"]
-    trends.look(1900.0, 0, {})
-    assert not trends.foresee()

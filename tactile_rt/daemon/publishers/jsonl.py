@@ -87,6 +87,7 @@ class JsonlPublisher(Consumer):
 
     def details(self) -> dict[str, str | int | float]:
         return {
-            "file": self._options.file or "standard output", "messages": self._lines,
+            "file": self._options.file or "standard output",
+            "messages": self._lines,
             "bytes": self._bytes,
-        }  # fmt: skip
+        }
