@@ -207,7 +207,7 @@ class EmulatedArray(EmulatedDevice):
         mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``stuck``: the
             same values again and again; ``no_number``: NaN; ``slow``: at half its rate;
             ``fast``: at twice its rate; ``fails``: its status says that a sensor fails;
-            ``uncounted``, ``back``: its counter stands, or runs back;
+            ``uncounted``: its counter stands;
             ``gaps``, ``corrupt``: every twentieth sample is missing, or damaged.
     """
 
@@ -258,8 +258,8 @@ class EmulatedArray(EmulatedDevice):
         elif self.mood == "no_number":
             values = np.full_like(values, np.nan)
         self._last = values[-1]
-        counts = {"uncounted": 0, "back": -1}.get(self.mood, 1)
-        return Chunk(counts * chunk.seq, chunk.t_ns, values, chunk.valid)
+        seq = np.zeros_like(chunk.seq) if self.mood == "uncounted" else chunk.seq
+        return Chunk(seq, chunk.t_ns, values, chunk.valid)
 
     def end(self) -> None:
         """Measure nothing more; what is measured still goes out."""

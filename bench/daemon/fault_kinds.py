@@ -493,9 +493,6 @@ KINDS: dict[str, FaultKind] = {
     "counter_stuck": FaultKind(
         _mood("whiskers", "uncounted", 0.064), (("source.whiskers", "no counter"),)
     ),
-    "counter_runs_back": FaultKind(
-        _mood("whiskers", "back", 0.064), (("source.whiskers", "no counter"),)
-    ),
     "device_fast": FaultKind(_mood("whiskers", "fast", 1.5), (("source.whiskers", "fast"),)),
     "array_exchanged": FaultKind(
         _exchanged("whiskers"), (("source.whiskers", "another array"),),

@@ -30,7 +30,7 @@ ADVICE = {
     "fast": "Describe the device by the rate that it has: decisions depend on it.",
     "device fault": "See its manual on what it says; what touches a broken sensor is not felt.",
     "another array": "Plug in the one that was there, or accept the new one by SIGHUP.",
-    "no counter": "Mend the device's program: its counter does not go on.",
+    "no counter": "Mend the device's program: its counter does not move.",
     "no decisions": VERIFY,
     "late decisions": LOAD,
     "missing decisions": LOAD,

@@ -33,7 +33,7 @@ __all__ = ["Sequencer"]
 REMEMBERED = 1024  # samples back that a repeated one is looked for
 HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
 RATE_TOLERANCE = 0.02  # of the nominal rate, when the clock is to tell how many samples passed
-STANDING = 5  # samples in a row that do not follow the one before: it counts nothing
+STANDING = 5  # samples in a row that have the count of the one before: it counts nothing
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
@@ -73,7 +73,7 @@ class Sequencer:
 
     @property
     def useless(self) -> bool:
-        """Whether the counter stands or runs back, and shows no loss."""
+        """Whether the counter stands, and shows no loss."""
         return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
@@ -107,7 +107,7 @@ class Sequencer:
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
-        self._standing = self._standing + 1 if gap < 0 else 0
+        self._standing = self._standing + 1 if count == self._count and gap < 0 else 0
         if gap < 0:
             self.resets += not self.useless
             self._seen.clear()
