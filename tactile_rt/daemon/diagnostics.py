@@ -143,7 +143,7 @@ def _of_source(
     if source.slow and read_s <= most and not starved:
         why = f"it measures less often than nine tenths of the {source.rate_hz:g} Hz that it has"
         found.append(Diagnostic(name, "slow", why))
-    if source.measured_hz > source.rate_hz / SLOW and not starved:
+    if device is not None and source.measured_hz > source.rate_hz / SLOW and not starved:
         why = f"it measures more often than ten ninths of the {source.rate_hz:g} Hz that it has"
         found.append(Diagnostic(name, "fast", why))
     if device is not None and not device.counts:

@@ -167,7 +167,7 @@ class SourcePart(Part):
             about, array=spec.name, frame=spec.frame, rate_hz=spec.rate_hz,
             elements=spec.elements, channels=spec.channels, units=spec.units,
             stuck=tuple(spec.elements[k] for k in self._stuck_at.elements),
-            measured_hz=measured_hz, slow=slow,
+            measured_hz=measured_hz, slow=slow and self._device is not None,
         )  # fmt: skip
 
     @property
@@ -277,8 +277,7 @@ class SourcePart(Part):
         useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
         self._held.append(good)
-        if self._device is not None:
-            self._rate.add(*self._device.measured)
+        self._rate.add(*(self._device.measured if self._device else (self._samples, now)))
         spec, accepted = stream.spec, not self.another
         item = SourceChunk(self.config.name, spec, chunk, now, self._offset_ns, accepted)
         self._hub.post(item)
