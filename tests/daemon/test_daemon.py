@@ -594,14 +594,30 @@ def test_what_hangs_at_the_end_is_named_and_left_behind(tmp_path, spy):
     assert daemon._consumers["publisher.spy"][1].join(time.monotonic() + PATIENCE_S)
 
 
+def test_a_recording_is_measured_and_its_rate_is_no_fault(robot):
+    daemon, _ = robot(source("a", "replay:demo?speed=0.5"))
+    until(lambda: daemon.snapshot().sources[0].measured_hz)
+    found = daemon.snapshot().sources[0]
+    assert 100 < found.measured_hz < 900 and not found.slow
+
+
+class SteppedClock(Clock):
+    by = 0
+
+    def utc_ns(self):
+        return time.time_ns() + self.by
+
+
+def test_a_step_of_the_wall_clock_is_seen_once():
+    clock = SteppedClock()
+    assert clock.stepped_ns() == 0
+    clock.by = -3600 * 10**9
+    assert abs(clock.stepped_ns() + 3600 * 10**9) < 10**8
+    assert clock.stepped_ns() == 0
+
+
 def test_the_wall_clock_may_jump(robot):
-    class Stepped(Clock):
-        by = 0
-
-        def utc_ns(self):
-            return time.time_ns() + self.by
-
-    clock = Stepped()
+    clock = SteppedClock()
     daemon, spy = robot(source("a", "synthetic:"), clock=clock)
     until(lambda: len(spy.of(SourceChunk)) > 3)
     clock.by, first = 3600 * 10**9, spy.of(SourceChunk)[0]

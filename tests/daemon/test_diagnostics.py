@@ -93,6 +93,7 @@ def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
 @pytest.mark.parametrize(
     "changes",
     [
+        {"measured_hz": 5000.0, "device": None},  # a recording, replayed quickly
         {"losses": Losses(0, 50_000)},  # lost within the minute, and no longer
         {"part": part("source.a", "ended"), "newest_ns": 1, "read_ns": 1},
         {"part": part("source.a", "stopped"), "newest_ns": 1, "read_ns": 1},

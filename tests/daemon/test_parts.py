@@ -20,7 +20,6 @@ from tactile_rt.core import locks as lock
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.core.stream import Chunk
-from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
 from tactile_rt.daemon.health import EDGES_S, LatencyMeter
 from tactile_rt.daemon.items import (
@@ -478,17 +477,3 @@ def test_reasons_are_one_line():
     assert reason_of(OSError(28, "No space left on device", "/x")) == "/x: No space left on device"
     assert reason_of(KeyError("k")) == "KeyError: 'k'"
     assert reason_of(TimeoutError()) == "TimeoutError"
-
-
-def test_a_step_of_the_wall_clock_is_seen_once():
-    class Stepped(Clock):
-        by = 0
-
-        def utc_ns(self):
-            return time.monotonic_ns() + OFFSET_NS + self.by
-
-    clock = Stepped()
-    assert clock.stepped_ns() == 0
-    clock.by = -3600 * 10**9
-    assert abs(clock.stepped_ns() + 3600 * 10**9) < 10**8
-    assert clock.stepped_ns() == 0
