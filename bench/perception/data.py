@@ -33,6 +33,7 @@ SHAPES_FILE = FILE.with_name(f"{NAME}-2.xz")
 SOURCE = "source"  # known kinds from a source that no other split has anything of
 SPLITS = ("train", "validation", "test", SOURCE, OUTLIERS, WITHHELD, KINDS)
 STEP = 0.2  # of the rated noise
+BLOCK = 16  # sweeps that a processor's cache holds
 
 
 class BenchmarkObject(Origin, frozen=True, kw_only=True, omit_defaults=True):
@@ -145,7 +146,10 @@ def load(path: Path = FILE) -> Data:
         steps, objects, step, wide = (arrays[k] for k in ("steps", "objects", "step", "wide"))
         manifest = msgspec.json.decode(arrays["manifest"].tobytes(), type=SweepManifest)
         origins = msgspec.json.decode(arrays["origins"].tobytes(), type=dict[str, BenchmarkObject])
-    values = (steps.transpose(0, 3, 1, 2).cumsum(axis=1, dtype=np.int32) * step).astype(np.float32)
+    values = np.empty((len(steps), steps.shape[3], *steps.shape[1:3]), np.float32)
+    for at in range(0, len(steps), BLOCK):
+        block = steps[at : at + BLOCK].transpose(0, 3, 1, 2).cumsum(axis=1, dtype=np.int32)
+        values[at : at + BLOCK] = block * step
     split = {s: tuple(n for n, o in origins.items() if o.split == s) for s in SPLITS}
     category_of = {name: origin.category for name, origin in origins.items()}
     manifest = replace(manifest, split=split, category_of=category_of)

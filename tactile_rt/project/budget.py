@@ -95,7 +95,7 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
         return Budget(described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most))
     per_category = min(of_a_kind, recipe.objects.per_category)
     test = max(round(TEST_SHARE * per_category), math.ceil(TEST_OBJECTS / kinds))
-    test = max(1, min(test, per_category // 4))
+    test = max(1, min(test, per_category // 3))
     validation = max(1, round(VALIDATION_SHARE * per_category))
     return Budget(described(project), per_category, validation, test, draws)
 

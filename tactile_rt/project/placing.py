@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,6 +18,7 @@ SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `dra
 ABOUT_MM = 6.0  # how far an object of 40 mm passes above or below the middle of the tips
 NEARER = (1.0, 0.8, 0.6, 0.45, 0.3)  # shares of the usual distance, tried in turn
 TRIALS, ENOUGH = 48, 0.97  # sweeps that are tried, and the share of them that is to touch
+_make_object = lru_cache(2 * TRIALS)(make_object)  # the same ones pass at every distance
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,9 @@ def _share_touching(
     """Share of sweeps of new objects that touch; nothing is simulated."""
     rng, touching = np.random.default_rng(0), 0
     for number in range(TRIALS):
-        chosen = {
-            "size_mm": size_mm,
-            "distance_mm": float(rng.uniform(*distance_mm)),
-            "height_mm": float(rng.uniform(*height_mm)),
-        }
-        target = make_object(kinds[number % len(kinds)], number // len(kinds))
+        distance, height = float(rng.uniform(*distance_mm)), float(rng.uniform(*height_mm))
+        chosen = {"size_mm": size_mm, "distance_mm": distance, "height_mm": height}
+        target = _make_object(kinds[number % len(kinds)], number // len(kinds))
         sweep = draw_sweep(rng, chosen=chosen)
         touching += SweepSimulation(animals, target, sweep, PROFILES["realtime"]).touches
     return touching / TRIALS

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import mujoco
@@ -138,16 +138,14 @@ class SweepSimulation:
         animals = array if isinstance(array, tuple) else (array,)
         animals = tuple(_on_surface(animal, sweep.surface_friction) for animal in animals)
         whiskers = [w for animal in animals for w in animal.whiskers]
-        straight = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
         rods = engine_of(profile) == "rods"
         level = sweep.gravity(animals[0].gravity) * 1e-3 * rods  # mm/ms^2; MuJoCo's has none
         gravity = level if sweep.tilt_ms else sweep.gravity(animals[0].gravity, 1.0) * 1e-3 * rods
-        if gravity.any():
-            straight = _bend_by_weight(straight, animals, profile, gravity)
-        outward = faces_right(animals, straight)
+        resting = _bend_lines(animals, profile, tuple(gravity.tolist()))
+        outward = faces_right(animals, resting)
         # All that follows is in the frame in which the object goes along -y.
         across = sweep.across
-        lines = [line @ across.T for line in straight]
+        lines = [line @ across.T for line in resting]
         turned = [piece.vertices * sweep.size_mm @ sweep.turn.T for piece in target.pieces]
         shape = [points @ across.T for points in turned]
         start = _beside(lines, outward, np.concatenate(shape), sweep)
@@ -339,21 +337,24 @@ def _beside(
     return np.array([x, FAR_MM, sweep.height_mm])
 
 
-def _bend_by_weight(
-    lines: Sequence[Floats], animals: Sequence[WhiskerArray], profile: Profile, gravity: Floats
+@lru_cache(4)  # sweeps past one array follow each other
+def _bend_lines(
+    animals: Sequence[WhiskerArray], profile: Profile, gravity: tuple[float, ...]
 ) -> list[Floats]:
-    """Bend lines (point, 3) of whiskers at rest by their weight, mm."""
+    """Find the lines (point, 3) of whiskers at rest, bent by their weight, mm."""
     from tactile_rt.sim_backend.rods.world import RodWorld
 
+    lines = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
+    if not any(gravity):
+        return lines
     whiskers = [w for animal in animals for w in animal.whiskers]
     steps = round(SAMPLE_MS / profile.timestep_ms)
-    world = RodWorld(whiskers, _roots(animals), (), profile.links, steps, gravity)
-    bent = []
+    world = RodWorld(whiskers, _roots(animals), (), profile.links, steps, np.array(gravity))
     for whisker, line, sag in zip(whiskers, lines, world.sag, strict=True):
         s = np.linspace(0, whisker.length, len(line))
         nodes = link_nodes(whisker, profile.links)
-        bent.append(line + np.stack([np.interp(s, nodes, sag[:, k]) for k in range(3)], axis=1))
-    return bent
+        line += np.stack([np.interp(s, nodes, sag[:, k]) for k in range(3)], axis=1)
+    return lines
 
 
 def _on_surface(animal: WhiskerArray, friction: float) -> WhiskerArray:

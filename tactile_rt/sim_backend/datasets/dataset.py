@@ -141,13 +141,13 @@ def make_sweeps(
 
 
 def _spread(manifest: SweepManifest, missing: set[str]) -> list[str]:
-    """Order objects so that all splits and categories grow alike: one may stop any time."""
+    """Order objects so that sides grow alike, the test twice as fast."""
     alike: dict[tuple[str, str], list[str]] = {}
     for side, names in manifest.split.items():
         for name in names:
             alike.setdefault((side, manifest.category(name)), []).append(name)
     place = {
-        name: ((at + 1) / len(names), side)
+        name: ((at + 1) / len(names) / (1 + (side == "test")), side)
         for (side, _), names in alike.items()
         for at, name in enumerate(names)
     }

@@ -296,6 +296,7 @@ def test_categories_grow_alike_so_that_one_may_stop_any_time() -> None:
         begun = order[: len(order) // share]
         number = [sum(manifest.category(n) == c for n in begun) for c in manifest.categories]
         assert max(number) - min(number) <= 1
+    assert set(manifest.split["test"]) <= set(order[: len(order) // 2])
 
 
 def test_an_object_that_another_run_finished_meanwhile_is_left_alone(finished: Path) -> None:
