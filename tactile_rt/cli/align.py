@@ -78,8 +78,7 @@ def build_benchmark(
     from tactile_rt.alignment import build, save_benchmark
     from tactile_rt.alignment.selection import Selection
 
-    for file in (out, json):
-        check_output(file)
+    check_output(out)
     console = Console(stderr=True)
     selection = Selection.of(task, sessions or (), depth, cells)
     with progress_bar(console, "building", total=1.0) as update:
@@ -120,8 +119,7 @@ def score_models(
     seed: Seed = 0,
 ) -> None:
     """Score every layer of models against a benchmark."""
-    for file in (json, page):
-        check_output(file)
+    check_output(page)
     with needing("train"):
         if page:
             import matplotlib  # noqa: F401
@@ -202,7 +200,6 @@ def decode_stimuli(
 
     Each figure stands beside its chance level by permutation.
     """
-    check_output(json)
     with needing("train"):
         from tactile_rt.alignment.benchmark import load_strict
         from tactile_rt.alignment.building import animal_means

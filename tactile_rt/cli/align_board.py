@@ -65,7 +65,6 @@ def fetch_recordings(
     if not files:
         raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
     console = Console(stderr=True)
-    check_output(json)
     if listed:
         if not told_as_json(files, json):
             for file in files:
@@ -123,8 +122,7 @@ def write_board(
 
     Figures are shares of what the noise of the recordings permits.
     """
-    for file in (json, page):
-        check_output(file)
+    check_output(page)
     if not data:
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
     parts, models = list(dict.fromkeys(part or ["all"])), models or []

@@ -12,7 +12,7 @@ from rich.markup import escape
 from typer.core import TyperCommand
 
 from tactile_rt.cli.align import align
-from tactile_rt.cli.app import check_output, needing
+from tactile_rt.cli.app import needing
 from tactile_rt.cli.options import Json, Stimuli
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, TactileError
@@ -75,7 +75,6 @@ def _gate(
     stimuli: Path | None,
     json: Path | None,
 ) -> int:
-    check_output(json)
     if benchmark is None and reference is None:
         raise ConfigError("name a --benchmark to score on, or the --reference it was exported from")
     if baseline is not None and benchmark is None:

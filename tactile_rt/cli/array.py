@@ -67,8 +67,7 @@ def fit(
     Record the array untouched for a minute or two, then bend each whisker and
     let it go, three times or more, with some seconds between.
     """
-    for file in (out, json):
-        check_output(file)
+    check_output(out)
     from tactile_rt.sources.opening import check_source
 
     if not described.is_file():

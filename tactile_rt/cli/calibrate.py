@@ -48,8 +48,7 @@ def tare(
     from tactile_rt.calibration import Calibration, calibration_path, save_calibration
     from tactile_rt.calibration import tare as measure
 
-    for file in (out, json):
-        check_output(file)
+    check_output(out)
     with open_url(source) as opened:
         raw, before = _find_raw(opened, source)
         name = device or (before.device if before else _own_id(raw))
@@ -117,8 +116,7 @@ def calibrate(
     )
     from tactile_rt.calibration import calibrate as fit_loads
 
-    for file in (out, json):
-        check_output(file)
+    check_output(out)
     loads = read_loads(table)
     path = out or (calibration_path(device) if device else None)
     known = _existing(path, device) if path else None

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_folder, check_output, needing
+from tactile_rt.cli.app import app, check_folder, needing
 from tactile_rt.cli.options import Accelerator, Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -29,7 +29,6 @@ def grid(
     from tactile_rt.models.grid.plan import read_grid
     from tactile_rt.sets.manifest import SweepManifest
 
-    check_output(json)
     check_folder(folder)
     wanted = read_grid(plan)
     if waiting_tasks(wanted, folder):

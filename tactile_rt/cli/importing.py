@@ -77,7 +77,6 @@ def import_file(
     check_no_pointer(log)
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
     check_is_mcap(output)
-    check_output(json)
     check_new(output, force)
     if plot is not None:
         check_output(plot)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_folder, check_output, check_text
+from tactile_rt.cli.app import app, check_folder, check_text
 from tactile_rt.cli.options import Force, Json, Seed
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -66,7 +66,6 @@ def label(
         raise ConfigError(f"no OUT: name the folder of the sweep set after {folder}")
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
-    check_output(json)
     check_text(*recordings, folder, labels, like)  # which the manifest tells
     parts = _shares(shares)
     _check_out(folder, force)

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import add_group, app, check_output, needing
+from tactile_rt.cli.app import add_group, app, needing
 from tactile_rt.cli.options import STDOUT, Json, Quick
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
@@ -96,7 +96,6 @@ def verify(file: File, json: Json = None) -> None:
     from tactile_rt.classifier.model_file import load_model, read_model, verify_model
     from tactile_rt.classifier.trial import try_model
 
-    check_output(json)
     card, contents, data = read_model(file)
     told: dict[str, str] = {}
 
@@ -136,7 +135,6 @@ def bench(
     card, _, _ = read_model(file)
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
-    check_output(json)
     with progress_bar(Console(stderr=True), "measuring"):
         records = measure_model(Subject("model", file), steps)
     show_records(records, json)

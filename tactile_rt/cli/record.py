@@ -40,8 +40,7 @@ def record(
     """
     from tactile_rt.recording import StreamWriter
 
-    for file in (output, json):
-        check_output(file)
+    check_output(output)
     check_is_mcap(output)
     check_new(output, force)  # before a device is opened and started
     session = _notes(note or [])
@@ -119,8 +118,7 @@ def recover(
     from tactile_rt.recording import Recording
     from tactile_rt.recording import recover as recovered
 
-    for file in (out, json):
-        check_output(file)
+    check_output(out)
     with progress_bar(Console(stderr=True), f"reading {recording}"):
         made = recovered(recording, out, force)
         n, first, last = 0, 0, 0
@@ -169,7 +167,6 @@ def convert(
     """
     from tactile_rt.recording.conversion import convert as converted
 
-    check_output(json)
     console = Console(stderr=True)
     if to:
         with progress_bar(console, f"writing for {to}"):

@@ -9,7 +9,7 @@ from urllib.parse import quote, urlencode
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, leaving, starting
+from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.core.errors import ConfigError
@@ -61,7 +61,6 @@ def sniff(
     """
     from tactile_rt.cli.importing import codec_fields
 
-    check_output(json)
     told = _Told(target, json)
     tried = [codec_fields(text, "--try") for text in further or []]
     candidates: list[Tried] = [(fields.pop("codec"), fields) for fields in tried]

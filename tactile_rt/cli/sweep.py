@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -52,7 +52,6 @@ def sweep(
     json: Json = None,
 ) -> None:
     """Simulate sweeps of objects past an array as a training set."""
-    check_output(json)
     console = Console(stderr=True, soft_wrap=True)
     if verify:
         from tactile_rt.sim_backend.datasets.inventory import check_sums

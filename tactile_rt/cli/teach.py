@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactile_rt.cli.app import app, check_folder, check_output, check_text, leaving, open_url
+from tactile_rt.cli.app import app, check_folder, check_text, leaving, open_url
 from tactile_rt.cli.options import Json, Seconds, Url
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
@@ -79,7 +79,6 @@ def teach(
     from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
-    check_output(json)
     wanted = [name.strip() for name in classes.split(",") if name.strip()]
     at = _address(page) if page else None
     _check_labels(wanted)

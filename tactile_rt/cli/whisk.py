@@ -63,7 +63,7 @@ def whisk(
     if target is not None and stimulus is not None:
         raise ConfigError("--object and --stimulus exclude each other: name one of them")
     beside = out.with_suffix(".json")
-    for file in (out, beside, json):
+    for file in (out, beside):
         check_output(file)
     if json is not None and json.resolve() == beside.resolve():
         raise ConfigError(f"{json} goes beside {out} and says what is in it: name another")
