@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Column, Table
 
 from tactile_rt.cli.app import add_group, check_output, needing
 from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.progress import progress_bar, share_bar
 from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
@@ -37,18 +36,11 @@ def write_brain(
     from tactile_rt.alignment.example_files import write_example
 
     (brain,) = take_sets("align example", sets or (), Brain)
-    console = Console(stderr=True)
-    with progress_bar(console, "recording", total=1.0) as update:
-        with needing("align"):
-            recordings, models = write_example(
-                folder, brain, seed, lambda share: update(completed=share)
-            )
+    with share_bar("recording") as tell, needing("align"):
+        recordings, models = write_example(folder, brain, seed, tell)
     names = ", ".join(sorted(path.name for path in models.iterdir()))
-    for line in (
-        f"{recordings}: {brain.mice} mice; {models}: {names}",
-        f"next: tactile-rt align build {recordings} --out benchmark.json",
-    ):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    typer.echo(f"{recordings}: {brain.mice} mice; {models}: {names}", err=True)
+    typer.echo(f"next: tactile-rt align build {recordings} --out benchmark.json", err=True)
 
 
 @align.command("build", epilog="tactile-rt align build brain/recordings --out benchmark.json")
@@ -79,19 +71,9 @@ def build_benchmark(
     from tactile_rt.alignment.selection import Selection
 
     check_output(out)
-    console = Console(stderr=True)
     selection = Selection.of(task, sessions or (), depth, cells)
-    with progress_bar(console, "building", total=1.0) as update:
-        with needing("align"):
-            made = build(
-                recordings,
-                protocol,
-                bootstraps,
-                seed,
-                lambda share: update(completed=share),
-                selection,
-                clock,
-            )
+    with share_bar("building") as tell, needing("align"):
+        made = build(recordings, protocol, bootstraps, seed, tell, selection, clock)
     save_benchmark(made, out)
     told = {
         "benchmark": out, "animals": len(made.targets), "reliable": len(made.reliable),
@@ -99,13 +81,12 @@ def build_benchmark(
     }  # fmt: skip
     told_as_json(told, json)
     for note in made.notes:
-        colour = "bold red" if note.startswith("WARNING") else None
-        console.print(note, highlight=False, markup=False, style=colour, soft_wrap=True)
-    console.print(
+        warning = note.startswith("WARNING")
+        typer.secho(note, err=True, fg="red" if warning else None, bold=warning)
+    typer.echo(
         f"{out}: {len(made.reliable)} of {len(made.targets)} animals are reliable; animal to "
         f"animal {made.a2a.mean:.3f} ± {made.a2a.sem:.3f}",
-        highlight=False,
-        soft_wrap=True,
+        err=True,
     )
 
 
@@ -131,7 +112,7 @@ def score_models(
         felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
         names = check_models(models)
         done: list[ModelResult] = []
-        with progress_bar(Console(stderr=True), "scoring", len(models)) as update:
+        with progress_bar("scoring", len(models)) as update:
             for path, name in zip(models, names, strict=True):
                 update(description=name)
                 layers, own = load_layers(path, felt)
@@ -176,7 +157,7 @@ def write_report(
         for (model, _), name in zip(found, names, strict=True)
     )
     _write_report(msgspec.structs.replace(read[0], models=models), out)
-    Console(stderr=True).print(f"{out}", highlight=False)
+    typer.echo(out, err=True)
 
 
 @align.command("decode", epilog="tactile-rt align decode run/best.pt --paper")
@@ -230,7 +211,7 @@ def decode_stimuli(
             if found:
                 rows.append((f"animals, mean of {len(found)}", variant, mean_decoded(found)))
     for note in notes:
-        Console(stderr=True).print(note, highlight=False, markup=False)
+        typer.echo(note, err=True)
     for target in targets:
         rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
     told = [{"name": n, "variant": v or "balanced", **asdict(d)} for n, v, d in rows]

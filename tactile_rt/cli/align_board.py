@@ -1,6 +1,5 @@
 """`tactile-rt align board`: models by datasets by metrics; the datasets, and how they are got."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ from rich.table import Column, Table
 from tactile_rt.cli.align import align
 from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Page, Seed, Sessions, Stimuli
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.progress import progress_bar, share_bar
 from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -64,7 +63,6 @@ def fetch_recordings(
     files = [file for file in every if wanted.takes(file.name)]
     if not files:
         raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
-    console = Console(stderr=True)
     if listed:
         if not told_as_json(files, json):
             for file in files:
@@ -73,25 +71,21 @@ def fetch_recordings(
     if folder is None:
         raise ConfigError("name a folder to write to, or give --list")
     with needing("align"):
-        with progress_bar(console, "fetching", total=1.0) as update:
-            done = fetch(files, folder, _shown(update))
+        with share_bar("fetching") as tell:
+            new, transferred = fetch(files, folder, tell)
         mice, units, notes = counted([folder / file.name for file in files])
     for note in notes:
-        console.print(note, highlight=False, markup=False)
+        typer.echo(note, err=True)
     size = sum(file.size for file in files)
-    console.print(
-        f"{folder}: {done.files} sessions ({done.new} new), {mice} mice, {units} units with valid "
-        f"trials; {done.transferred / 1e6:.0f} MB of {size / 1e9:.0f} GB were read",
-        highlight=False, soft_wrap=True,
-    )  # fmt: skip
-    told_as_json(
-        {"mice": mice, "units": units, "transferred": done.transferred, "files": files}, json
+    typer.echo(
+        f"{folder}: {len(files)} sessions ({new} new), {mice} mice, {units} units with valid "
+        f"trials; {transferred / 1e6:.0f} MB of {size / 1e9:.0f} GB were read",
+        err=True,
     )
+    told_as_json({"mice": mice, "units": units, "transferred": transferred, "files": files}, json)
     if len(files) == len(every) and dataset.counts not in (None, (mice, units)):
-        console.print(
-            "WARNING: the published analysis is of {} mice and {} units".format(*dataset.counts),
-            style="bold red", highlight=False,
-        )  # fmt: skip
+        other = "WARNING: the published analysis is of {} mice and {} units".format(*dataset.counts)
+        typer.secho(other, err=True, fg="red", bold=True)
 
 
 @align.command("board", epilog="tactile-rt align board run/best.pt --data 000231=recordings")
@@ -148,19 +142,14 @@ def write_board(
         felt = read_stimuli(stimuli)
         files = list(zip(models, check_models(models), strict=True))
         boards = []
-        console = Console(stderr=True)
         for dataset, path in datasets:
-            with progress_bar(console, f"reading {dataset.name}", total=1.0) as update:
-                read = dataset.read([path], felt, _shown(update))
-            with progress_bar(console, f"models on {dataset.name}", max(len(files), 1)) as update:
+            with share_bar(f"reading {dataset.name}") as tell:
+                read = dataset.read([path], felt, tell)
+            with progress_bar(f"models on {dataset.name}", max(len(files), 1)) as update:
                 rows = _rows(files, read.stimuli or felt, seed, update)
-            with progress_bar(console, f"scoring on {dataset.name}", total=1.0) as update:
-                boards.append(
-                    with_cells(
-                        rows, dataset, read.animals, parts, metrics, read.notes,
-                        _shown(update),
-                    )
-                )  # fmt: skip
+            with share_bar(f"scoring on {dataset.name}") as tell:
+                made = with_cells(rows, dataset, read.animals, parts, metrics, read.notes, tell)
+            boards.append(made)
         made = joined(boards)
     if page:
         from tactile_rt.alignment.board_page import board_page
@@ -169,10 +158,6 @@ def write_board(
         write_page(board_page(made), page)
     if not told_as_json(made, json):
         _show(made)
-
-
-def _shown(update: Any) -> Callable[[float], None]:
-    return lambda share: update(completed=share)
 
 
 def _rows(

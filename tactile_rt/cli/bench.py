@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
@@ -54,9 +53,9 @@ def bench(
         raise ConfigError(f"no benchmark area {area!r}: there are {name_some(known, 8)}")
     if resume is not None and area != FAULTS:
         raise ConfigError("--resume goes with faults: tactile-rt bench faults --resume FILE")
-    console, records = Console(stderr=True), []
+    records: list[Any] = []
     for name in [area] if area else AREAS:
-        with progress_bar(console, f"measuring {name}"):
+        with progress_bar(f"measuring {name}"):
             with needing(AREAS.get(name, "train")):
                 if name == FAULTS:
                     rig = _rig("daemon", "faults")

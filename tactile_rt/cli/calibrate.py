@@ -55,7 +55,7 @@ def tare(
         path = out or calibration_path(name)
         known = _existing(path, device) or before or Calibration.of(name, raw.spec)
         known.output_spec(raw.spec)  # refuses another array now, not after the reading
-        with progress_bar(Console(stderr=True), f"do not touch {raw.spec.name}"):
+        with progress_bar(f"do not touch {raw.spec.name}"):
             measured = measure(raw, seconds)
     untared = set(measured.untared)
     tared = [i for i, e in enumerate(raw.spec.elements) if e not in untared]

@@ -125,7 +125,7 @@ def demo(
         do = "leave out --recorded" if simulated else install_extra("sim")
         raise ConfigError(f"--fast and --seed are for a simulation: {do}")
     recorded |= not simulated
-    with needing("sim"), progress_bar(Console(stderr=True), "building the array and the objects"):
+    with needing("sim"), progress_bar("building the array and the objects"):
         demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     with leaving(seconds), demonstration:
         if console.width < WIDTH or not console.is_terminal or console.is_dumb_terminal:

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, check_folder, needing
 from tactile_rt.cli.options import Accelerator, Json
@@ -37,7 +36,6 @@ def grid(
         from tactile_rt.models.grid.picture import draw_grid
         from tactile_rt.models.grid.pool import run_grid
         from tactile_rt.models.grid.results import GridResults, gather, write_results
-    console = Console(stderr=True)
 
     def conclude() -> GridResults:
         results = gather(wanted, folder)
@@ -50,15 +48,13 @@ def grid(
         right = found.right()
         said = found.failed or f"top-1 {100 * right.mean():.1f} %"
         took = f", {found.seconds:.0f} CPU s" if found.seconds else ""
-        console.print(
-            f"{done}/{total} {found.name}, seed {found.seed}: {said}{took}", highlight=False
-        )
+        typer.echo(f"{done}/{total} {found.name}, seed {found.seed}: {said}{took}", err=True)
         if done % per_seed == 0:
             conclude()
 
     per_seed = -(-len(wanted.tasks()) // wanted.seeds)
     done = len(wanted.tasks()) - len(waiting_tasks(wanted, folder))
-    with progress_bar(console, "tasks", len(wanted.tasks()), done, counted=True) as update:
+    with progress_bar("tasks", len(wanted.tasks()), done, counted=True) as update:
         run_grid(wanted, folder, processes, show, accelerator)
     told_as_json(conclude(), json)
-    console.print(f"{folder}: its tables and pictures")
+    typer.echo(f"{folder}: its tables and pictures", err=True)

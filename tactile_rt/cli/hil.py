@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 from urllib.parse import parse_qsl
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from tactile_rt.cli.app import INTERRUPTED, app, leaving, open_url
@@ -79,14 +78,13 @@ def hil(
             source = _add_option(source, "sweeps", str(sweeps or SWEEPS))
     elif sweeps is not None:
         raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
-    console = Console(stderr=True)
     opened = open_url(source)
     try:
         loop = Loop(opened, file, wire, codec, fields, schedule, seconds)
     except BaseException:
         opened.close()
         raise
-    with leaving(None), progress_bar(console, f"{codec} over {wire}"):
+    with leaving(None), progress_bar(f"{codec} over {wire}"):
         loop.run()
     report = loop.report()
     told = {

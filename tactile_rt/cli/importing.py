@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from urllib.parse import parse_qsl
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, needing, starting
 from tactile_rt.cli.options import Force, Json
@@ -91,7 +90,7 @@ def import_file(
         if strict:  # hidden until it is known to be good
             hidden = stack.enter_context(TemporaryDirectory(prefix=".", dir=output.parent))
             target = Path(hidden) / output.name
-        with starting(), progress_bar(Console(stderr=True), f"reading {log}"):
+        with starting(), progress_bar(f"reading {log}"):
             from tactile_rt.drivers.logs import read_log
             from tactile_rt.recording.importing.bag import import_bag
             from tactile_rt.recording.importing.bag_file import is_bag

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, check_folder, check_text
 from tactile_rt.cli.options import Force, Json, Seed
@@ -79,8 +78,7 @@ def label(
         intervals = intervals_of_all(recordings)
     else:
         intervals = intervals_beside(recordings, labels)
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
-    with progress_bar(console, "finding touches") as update:
+    with progress_bar("finding touches") as update:
         touches = find_labelled(
             recordings, intervals, like,
             lambda one, seconds: update(description=f"{one.name} {seconds:.0f} s"),
@@ -90,10 +88,11 @@ def label(
     words += [k for k, v in {"--by-name": by_name, "--unlabelled": unlabelled}.items() if v]
     manifest = write_set(folder, touches, parts, seed, shlex.join(words), write_sums)
     for line in touches.left_out:
-        console.print(line, markup=False)
+        typer.echo(line, err=True)
     for name, some in (("validation", "to train"), ("test", "for `tactile-rt eval`")):
         if not manifest.split[name]:
-            console.print(f"no object is left for {name}, which is needed {some}: label more")
+            none = f"no object is left for {name}, which is needed {some}: label more"
+            typer.echo(none, err=True)
     sides = ", ".join(f"{name} {len(manifest.split[name])}" for name in SPLITS)
     counts = {
         c: sum(used.interval.label == c for used in touches.used) for c in manifest.categories
@@ -107,10 +106,8 @@ def label(
         json,
     )  # fmt: skip
     told = ", ".join(f"{name} {n}" for name, n in counts.items())
-    console.print(
-        f"{folder}: {len(touches.used)} of {touches.found.total()} touches ({told}); "
-        f"objects: {sides}"
-    )
+    used = f"{len(touches.used)} of {touches.found.total()} touches ({told})"
+    typer.echo(f"{folder}: {used}; objects: {sides}", err=True)
 
 
 def _shares(text: str) -> tuple[float, ...]:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -135,7 +134,7 @@ def bench(
     card, _, _ = read_model(file)
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
-    with progress_bar(Console(stderr=True), "measuring"):
+    with progress_bar("measuring"):
         records = measure_model(Subject("model", file), steps)
     show_records(records, json)
 
@@ -187,6 +186,6 @@ def evaluate(
     SweepManifest.read(data)
     with needing("train"):
         from tactile_rt.models.evaluation.model_file import evaluate_model
-    with progress_bar(Console(stderr=True), "evaluating"):
+    with progress_bar("evaluating"):
         records = evaluate_model(model, data, svm, pictures, quick)
     show_records(records, json)

@@ -4,8 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from tactile_rt.cli.app import add_group, check_output, needing
 from tactile_rt.cli.options import Json
@@ -37,11 +35,10 @@ def get(
     from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
 
     listed = read_list(wanted)
-    console = Console(stderr=True)
-    with needing("sim"), progress_bar(console, "getting", len(listed), counted=True) as update:
+    with needing("sim"), progress_bar("getting", len(listed), counted=True) as update:
         missing = get_objects(listed, folder, clones, lambda name: update(advance=1))
     for name, why in missing.items():
-        console.print(f"[red]{escape(name)}[/]: {escape(why)}", soft_wrap=True, highlight=False)
+        typer.echo(f"{typer.style(name, fg='red')}: {why}", err=True)
     licences = sorted({thing.files[0].licence for thing in listed})
     kinds = len({thing.files[0].category for thing in listed})
     told = {
@@ -77,8 +74,7 @@ def check(
         from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
         from tactile_rt.sim_backend.objects.object_sets import open_objects
     opened = open_objects(folder)
-    console = Console(stderr=True)
-    with progress_bar(console, "loading", total=len(opened.names), counted=True) as update:
+    with progress_bar("loading", total=len(opened.names), counted=True) as update:
         usable = opened.check(lambda name: update(advance=1))
     if plot:
         with needing("view"):
@@ -100,7 +96,8 @@ def check(
     }  # fmt: skip
     show_table(found, headings, json)
     if plates := [thing for thing in usable.values() if thing.made_by == "plates"]:
-        console.print(f"{len(plates)} of {len(opened.names)} are not closed, taken as plates")
+        of = len(opened.names)
+        typer.echo(f"{len(plates)} of {of} are not closed, taken as plates", err=True)
     for why in opened.skipped.values():
-        console.print(escape(why), soft_wrap=True, highlight=False)
+        typer.echo(why, err=True)
     raise typer.Exit(1 if opened.skipped else 0)

@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["progress_bar"]
+__all__ = ["progress_bar", "share_bar"]
 
 A_DAY_S = 86_400.0
 # Between lines where there is no terminal: at first, and at most; a fourth of the time so far.
@@ -26,12 +26,12 @@ Update = Callable[..., None]
 
 @contextmanager
 def progress_bar(
-    console: Console,
     what: str,
     total: float | None = None,
     completed: int = 0,
     counted: bool = False,
     timed: bool = True,
+    console: Console | None = None,
 ) -> Iterator[Update]:
     """Show a bar with the time left, gone when the block is done or fails.
 
@@ -44,11 +44,13 @@ def progress_bar(
         completed: was done before, and says nothing about the time left.
         counted: show how many of the total are done, not what share.
         timed: show the time left; False where the description says it.
+        console: where to; None: standard error.
 
     Yields:
         What to call as the work goes on: rich's `Progress.update` without the task
         (``advance=1``, ``completed=7``, ``total=9``, ``description="mug-1"``).
     """
+    console = console or Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -74,6 +76,13 @@ def progress_bar(
             done.set()
             if progress.disable:
                 lines.join()
+
+
+@contextmanager
+def share_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """Show a bar of work that tells which share of it is done, 0 to 1."""
+    with progress_bar(what, total=1.0) as update:
+        yield lambda share: update(completed=share)
 
 
 def _print_lines(

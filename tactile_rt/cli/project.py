@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json
@@ -53,7 +52,6 @@ def make(
 
     Finished steps are not repeated; an interrupted step continues.
     """
-    console = Console(stderr=True, soft_wrap=True)
     with needing("sim,train"):
         from tactile_rt.models.evaluation.records import as_dicts
         from tactile_rt.project.folder import Project
@@ -61,7 +59,7 @@ def make(
         from tactile_rt.project.making import preview_sweeps
     project = Project(folder)
     if preview:
-        with progress_bar(console, "sweeping", timed=False):
+        with progress_bar("sweeping", timed=False):
             counts = preview_sweeps(project, picture := folder / "preview.png")
         headings = {
             "kind": "kind", "sweeps": "sweeps", "touch": "touch, %", "beyond": "beyond range, %",
@@ -73,30 +71,24 @@ def make(
             row = (kind, count.sweeps, 100 * touch, 100 * beyond, count.shortcomings)
             rows.append(dict(zip(headings, row, strict=True)))
         show_table(rows, headings, json)
-        console.print(f"{picture} shows an object of each kind where it first touches")
+        typer.echo(f"{picture} shows an object of each kind where it first touches", err=True)
         return
-    with progress_bar(console, "reading", timed=False) as update:
+    with progress_bar("reading", timed=False) as update:
         seen = ""
 
         def tell(stage: "MakeProgress") -> None:
             nonlocal seen
             left = f"about {max(stage.left_s, 0) / 60:.0f} min left of all"
-            update(
-                description=f"{stage.name}, {left}",
-                total=stage.of,
-                completed=stage.done,
-            )
+            update(description=f"{stage.name}, {left}", total=stage.of, completed=stage.done)
             if stage.name != seen:
                 seen = stage.name
-                console.print(f"{stage.name} ({left})")
+                typer.echo(f"{stage.name} ({left})", err=True)
 
         records = make_project(project, minutes, tell)
     told_as_json(as_dicts(records), json)
     for record in records:
-        if record.name.removeprefix("models.") in ABOUT:
-            console.print(
-                f"{record.name.removeprefix('models.')}: {record.value:.1f} {record.unit}"
-                f" ({record.anchor})"
-            )
+        if (what := record.name.removeprefix("models.")) in ABOUT:
+            typer.echo(f"{what}: {record.value:.1f} {record.unit} ({record.anchor})", err=True)
     decides = shlex.join(["tactile-rt", "run", str(folder / "robot.toml")])
-    console.print(f"{project.report / 'report.html'} tells the rest; `{decides}` decides")
+    report = project.report / "report.html"
+    typer.echo(f"{report} tells the rest; `{decides}` decides", err=True)

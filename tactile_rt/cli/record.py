@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leaving, open_url
 from tactile_rt.cli.options import Force, Json, Seconds, Url
@@ -119,7 +118,7 @@ def recover(
     from tactile_rt.recording import recover as recovered
 
     check_output(out)
-    with progress_bar(Console(stderr=True), f"reading {recording}"):
+    with progress_bar(f"reading {recording}"):
         made = recovered(recording, out, force)
         n, first, last = 0, 0, 0
         for chunk in Recording(made):
@@ -167,9 +166,8 @@ def convert(
     """
     from tactile_rt.recording.conversion import convert as converted
 
-    console = Console(stderr=True)
     if to:
-        with progress_bar(console, f"writing for {to}"):
+        with progress_bar(f"writing for {to}"):
             told = _as_folder(to, files, fps, task, video or [], force)
         _tell(told, json)
         return
@@ -177,7 +175,7 @@ def convert(
         raise ConfigError("name a recording and what to write, or say what --to")
     recording, output = files
     check_new(output, force)
-    with progress_bar(console, f"converting {recording}"):
+    with progress_bar(f"converting {recording}"):
         samples = converted(recording, output)
     _tell({"output": output, "samples": samples}, json)
 

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, set_option
@@ -52,21 +51,16 @@ def sweep(
     json: Json = None,
 ) -> None:
     """Simulate sweeps of objects past an array as a training set."""
-    console = Console(stderr=True, soft_wrap=True)
     if verify:
         from tactile_rt.sim_backend.datasets.inventory import check_sums
 
         files = check_sums(folder)
         told_as_json({"set": folder, "files": files}, json)
-        console.print(f"{folder}: {files} files are as they were written")
+        typer.echo(f"{folder}: {files} files are as they were written", err=True)
         return
     with needing("sim"):
         from tactile_rt.sim_backend.arrays.files import load_animals
-        from tactile_rt.sim_backend.datasets.dataset import (
-            describe_set,
-            finished_objects,
-            make_sweeps,
-        )
+        from tactile_rt.sim_backend.datasets import dataset
         from tactile_rt.sim_backend.datasets.inventory import tally
         from tactile_rt.sim_backend.sweep_simulation import ringing
         from tactile_rt.sim_backend.world import PROFILES
@@ -74,34 +68,23 @@ def sweep(
     given = [f"{key}={value}" for key, value in asked.items() if value is not None]
     chosen = _recipe(folder, recipe, [*given, *(sets or ())])
     splits = tuple(dict.fromkeys(s.strip() for s in split.split(","))) if split else ()
-    names = describe_set(chosen).names(splits)
+    names = dataset.describe_set(chosen).names(splits)
     if line := ringing(load_animals(chosen.array), PROFILES[chosen.profile]):
-        console.print(line)
-    there = len(finished_objects(folder, names))
-    made = make_sweeps(
-        chosen,
-        folder,
-        processes or None,
-        splits,
-        engine="processes" if ray is None else "ray",
-        address=None if ray == "auto" else ray,
-    )
-    with progress_bar(console, "objects", len(names), there, counted=True) as update:
+        typer.echo(line, err=True)
+    there = len(dataset.finished_objects(folder, names))
+    engine, address = "processes" if ray is None else "ray", None if ray == "auto" else ray
+    made = dataset.make_sweeps(chosen, folder, processes or None, splits, engine, address)
+    with progress_bar("objects", len(names), there, counted=True) as update:
         for k, name in enumerate(made):  # those that were there first
             update(advance=int(k >= there), description=name)
     found = tally(folder, names, len(chosen.sweeps))
-    told_as_json(
-        {
-            "set": folder, "sweeps": found.sweeps, "profile": chosen.profile,
-            "shortcomings": found.shortcomings,
-        },
-        json,
-    )  # fmt: skip
+    told = {"set": folder, "sweeps": found.sweeps, "profile": chosen.profile}
+    told_as_json(told | {"shortcomings": found.shortcomings}, json)
     but = f"; {found.shortcomings}" if found.shortcomings else ""
-    console.print(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{but}")
+    typer.echo(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{but}", err=True)
     if card:
         _write_card(folder)
-        console.print(f"{folder / 'README.md'} describes them")
+        typer.echo(f"{folder / 'README.md'} describes them", err=True)
 
 
 def _write_card(folder: Path) -> None:

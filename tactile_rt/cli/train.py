@@ -81,7 +81,7 @@ def train(
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=not first)
     history: list[dict[str, Any]] = []
-    with progress_bar(console, "finding onsets") as update:
+    with progress_bar("finding onsets", console=console) as update:
 
         def show(at: "Progress") -> None:
             update(
@@ -103,14 +103,16 @@ def train(
 def _in_words(at: "Progress") -> str:
     m = at.metrics
     if "validation_top1" in m:
-        found = (
-            f"validation top-1 {100 * m['validation_top1']:.1f} % clean, "
-            f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
-        )
+        found = _top1(m)
     else:
         found = f"validation loss {m['validation_loss']:.3f}"
     waited = f" ({100 * m['waiting']:.0f} % of the time waiting for data)"
     return f"epoch {at.epoch}: loss {m['loss']:.3f}, {found}" + waited * (m["waiting"] >= WAITING)
+
+
+def _top1(m: dict[str, float]) -> str:
+    noisy = f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
+    return f"validation top-1 {100 * m['validation_top1']:.1f} % clean, {noisy}"
 
 
 def _text(path: Path) -> str:
@@ -157,9 +159,8 @@ def probe(
     probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
     with needing("train"):
         from tactile_rt.models.training.probing import probe as fit
-    console = Console(stderr=True)
     shown: list[Progress] = []
-    with progress_bar(console, "probing") as update:
+    with progress_bar("probing") as update:
 
         def show(at: "Progress") -> None:
             shown.append(at)
@@ -168,10 +169,7 @@ def probe(
         best = fit(checkpoint, folder, config, show)
     m = shown[-1].metrics
     told_as_json({"best": best, **m}, json)
-    console.print(
-        f"{best}: validation top-1 {100 * m['validation_top1']:.1f} % clean, "
-        f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
-    )
+    typer.echo(f"{best}: {_top1(m)}", err=True)
 
 
 @app.command(epilog="tactile-rt export run/best.pt model.onnx")
@@ -207,28 +205,17 @@ def export(
         raise ConfigError(f"--kind is {kind!r}, not one of step, window")
     with needing("train"):
         from tactile_rt.export.release import release
-    console = Console(stderr=True)
-    with progress_bar(console, "calibrating, exporting and checking parity"):
+    whole = "window" if kind == "window" else "step"
+    with progress_bar("calibrating, exporting and checking parity"):
         card = release(
-            checkpoint,
-            model,
-            name or model.stem,
-            precision,
-            "window" if kind == "window" else "step",
-            data or (),
-            license,
+            checkpoint, model, name or model.stem, precision, whole, data or (), license
         )
-    megabytes = model.stat().st_size / 1e6
-    told_as_json(
-        {"model": model, "megabytes": megabytes, "temperature": card.temperature, **card.figures},
-        json,
-    )
-    console.print(
-        f"{model}: {megabytes:.1f} MB, parity {card.figures['parity']:.1e}, "
-        f"temperature {card.temperature:.2f}"
-    )
+    size, found = model.stat().st_size / 1e6, card.figures
+    told = {"model": model, "megabytes": size, "temperature": card.temperature, **found}
+    told_as_json(told, json)
+    parity = f"parity {found['parity']:.1e}, temperature {card.temperature:.2f}"
+    typer.echo(f"{model}: {size:.1f} MB, {parity}", err=True)
     if precision != "fp32":
-        console.print(
-            "{quantisation_agreement:.1f} % of {quantisation_sweeps} validation decisions as in "
-            "fp32, top-1 {quantisation_top1_drop:.1f} points lower".format(**card.figures)
-        )
+        kept = "{quantisation_agreement:.1f} % of {quantisation_sweeps} validation decisions as in "
+        kept += "fp32, top-1 {quantisation_top1_drop:.1f} points lower"
+        typer.echo(kept.format(**found), err=True)

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, set_option
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.progress import progress_bar, share_bar
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
 
@@ -85,12 +84,12 @@ def view(
     simulation = SweepSimulation(animals, thing, sweep, PROFILES[profile], whole=True)
     if at is not None and not 0 <= at <= simulation.duration_ms:
         raise ConfigError(f"--at {at:g}: the sweep lasts {simulation.duration_ms:.0f} ms")
-    console = Console(stderr=True)
     if not simulation.touches:
-        console.print(f"{thing.name} passes without touching: --set height_mm or distance_mm")
+        none = f"{thing.name} passes without touching: --set height_mm or distance_mm"
+        typer.echo(none, err=True)
     period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (FPS * slow)))
-    with progress_bar(console, "simulating", total=1.0) as update:
-        footage = record(simulation, spec, period, lambda done: update(completed=done), sensor)
+    with share_bar("simulating") as tell:
+        footage = record(simulation, spec, period, tell, sensor)
     detail = f"{camera} view · {thing.name} moves along -y"
     if suffix not in IMAGES:
         detail += f" · {FPS * period / 1000:.2g} x real speed"
@@ -102,7 +101,7 @@ def view(
         if suffix in IMAGES:
             write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
             return
-        with progress_bar(console, "drawing", total=len(footage)) as update:
+        with progress_bar("drawing", total=len(footage)) as update:
 
             def pictures() -> Iterator["NDArray[np.uint8]"]:
                 for picture in film:

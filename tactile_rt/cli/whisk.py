@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, Json, set_option
@@ -108,9 +107,8 @@ def whisk(
                 "facet_error_mm": surface.largest_gap_mm,
             }
 
-    console = Console(stderr=True)
     felt = {}
-    with progress_bar(console, "whisking") as update:
+    with progress_bar("whisking") as update:
         for name, corners in pieces.items():
             try:
                 simulation = WhiskSimulation(
@@ -144,11 +142,12 @@ def whisk(
     ]  # fmt: skip
     told_as_json(told, json)
     for one in told:
-        console.print(
+        typer.echo(
             f"{one['stimulus']}: first contact at {one['first_ms']} ms, {one['whiskers']} of "
-            f"{len(animal.whiskers)} whiskers touch it"
+            f"{len(animal.whiskers)} whiskers touch it",
+            err=True,
         )
-    console.print(f"{out} and {beside}: {len(felt)} stimuli")
+    typer.echo(f"{out} and {beside}: {len(felt)} stimuli", err=True)
 
 
 def _described(trajectory: Path) -> dict[str, str]:

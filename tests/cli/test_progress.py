@@ -16,7 +16,7 @@ def bar(request):
 
     def begin(**options):
         console = Console(file=io.StringIO(), force_terminal=request.param, width=80)
-        shown = progress_bar(console, "objects", **options)
+        shown = progress_bar("objects", console=console, **options)
         update = shown.__enter__()
         clock = [0.0]
         progress = update.func.__self__
@@ -62,7 +62,7 @@ def test_shares_are_per_cent_and_long_times_are_minutes_and_hours(bar):
 def test_a_log_file_gets_a_line_whenever_one_is_due(monkeypatch):
     monkeypatch.setattr(progress, "LINE_S", 0.01)
     console = Console(file=io.StringIO())
-    with progress_bar(console, "[x] reading") as update:
+    with progress_bar("[x] reading", console=console) as update:
         until(lambda: console.file.getvalue().startswith("[x] reading: 0 s so far\n"))
         update(description="fitting")
         until(lambda: "\nfitting: " in console.file.getvalue())
@@ -70,8 +70,8 @@ def test_a_log_file_gets_a_line_whenever_one_is_due(monkeypatch):
 
 def test_what_is_done_or_fails_before_a_line_is_due_says_nothing():
     console = Console(file=io.StringIO())
-    with progress_bar(console, "objects", total=2) as update:
+    with progress_bar("objects", total=2, console=console) as update:
         update(advance=1)
-    with pytest.raises(ZeroDivisionError), progress_bar(console, "objects"):
+    with pytest.raises(ZeroDivisionError), progress_bar("objects", console=console):
         raise ZeroDivisionError
     assert console.file.getvalue() == ""

@@ -153,21 +153,6 @@ class PublishedFile:
         return PurePosixPath(self.path).name
 
 
-@dataclass(frozen=True)
-class Fetched:
-    """What came of it.
-
-    Attributes:
-        files: The number of files that are in the folder now.
-        new: The number of those that were not there before.
-        transferred: The bytes that came over the network.
-    """
-
-    files: int
-    new: int
-    transferred: int
-
-
 def published_files(listing: str) -> tuple[PublishedFile, ...]:
     """The files with spikes of a dataset, from the list of them that ships."""
     text = resources.files(__package__).joinpath(listing).read_text("utf-8")
@@ -181,10 +166,13 @@ def fetch(
     files: Sequence[PublishedFile],
     folder: Path,
     progress: Callable[[float], None] = lambda share: None,
-) -> Fetched:
+) -> tuple[int, int]:
     """Write what alignment needs of some files to a folder, one small NWB file each.
 
     What is there already stays, so that a fetch that broke off goes on.
+
+    Returns:
+        The number of new files, and of bytes that came over the network.
 
     Raises:
         ConfigError: a file cannot be had, or is not the one that was published; those before it
@@ -200,7 +188,7 @@ def fetch(
             write_whole(path, lambda out, small=small: out.write(small))  # type: ignore[misc]
             new, transferred = new + 1, transferred + came
         progress(done / len(files))
-    return Fetched(len(files), new, transferred)
+    return new, transferred
 
 
 def counted(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
