@@ -36,7 +36,7 @@ from tactile_rt.recording.description import RECOVERED, Description, seal
 from tactile_rt.recording.layout import SAMPLES, WIRE, Raw, decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.ros2 import messages
-from tactile_rt.recording.ros2_form import CHANNELS, TEXTS, WRENCH, FileForm
+from tactile_rt.recording.ros2_form import TEXTS, WRENCH
 from tactile_rt.recording.writer import McapFile
 
 if TYPE_CHECKING:
@@ -268,10 +268,7 @@ def _write(recording: Recording, path: Path) -> tuple[int, _File]:
             if raw.topic == SAMPLES:
                 n += _add_wrenches(made, raw)
         made.finish()
-    form = FileForm(about)
-    kinds = {name: kind for (name, wire), kind in CHANNELS.items() if wire in ("", about.wire)}
-    kinds[WRENCH] = messages.WRENCH
-    counts = {(form.topic(k), kinds[k]): many for k, many in made.counts.items()}
+    counts = {made.topics[name]: many for name, many in made.counts.items()}
     return n, _File(path.name, min(begin_ns, end_ns), end_ns, counts)
 
 

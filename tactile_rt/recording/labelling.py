@@ -7,7 +7,7 @@ told, never left out in silence. `labelled_set` makes a sweep set of them.
 """
 
 import hashlib
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -179,7 +179,7 @@ def find_labelled(
         floor = channel_limits(first, sensor, period_ns).floor
     except ConfigError as error:
         raise ConfigError(f"{error}: --like takes it from a sweep set or model") from None
-    reasons, silent = _Reasons(), _Reasons()
+    reasons, silent = defaultdict[str, list[str]](list), list[str]()  # places, by reason
     met: dict[bytes, Path] = {}  # the recording of each touch, by its numbers
     for one, recording in zip(recordings, opened, strict=True):
         mine, touched = list(intervals.get(one, ())), set()
@@ -201,17 +201,20 @@ def find_labelled(
                 elif of and not why and met.setdefault(_digest(touch), one) != one:
                     why = AGAIN
                 if why:
-                    reasons.add(why, f"{one.name} at {onset_s:.2f} s")
+                    reasons[why].append(f"{one.name} at {onset_s:.2f} s")
                 else:
                     found.used.append(LabelledTouch(touch, one, onset_s, of[0]))
         for interval in mine:
             if interval not in touched:
-                silent.add("in which no touch begins", interval.where or str(one))
+                silent.append(interval.where or str(one))
         if stream.lost:
             found.left_out.append(f"samples missing in {one.name}: {stream.lost}")
         if not mine:
             found.left_out.append(f"no interval of {one.name} is labelled")
-    found.left_out = [*reasons.lines("touches"), *silent.lines("intervals"), *found.left_out]
+    unused = [f"touches {why}: {len(at)}, first {at[0]}" for why, at in reasons.items()]
+    if silent:
+        unused.append(f"intervals in which no touch begins: {len(silent)}, first {silent[0]}")
+    found.left_out = [*unused, *found.left_out]
     others = {one: len(i) for one, i in intervals.items() if one not in recordings}
     if others:
         found.left_out.append(
@@ -247,21 +250,6 @@ class _Counted:
                 told = int(chunk.t_ns[-1])
                 self._report(self._recording, (told - self.first_ns) / NS_PER_S)
             yield chunk
-
-
-class _Reasons:
-    """Counts by reason, with the first place of each."""
-
-    def __init__(self) -> None:
-        self._count: Counter[str] = Counter()
-        self._first: dict[str, str] = {}
-
-    def add(self, why: str, where: str) -> None:
-        self._count[why] += 1
-        self._first.setdefault(why, where)
-
-    def lines(self, what: str) -> list[str]:
-        return [f"{what} {why}: {n}, first {self._first[why]}" for why, n in self._count.items()]
 
 
 def _digest(touch: RecordedTouch) -> bytes:

@@ -89,7 +89,7 @@ def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
     n = samples_in(data)
     values_at = 4 + 16 + 16 * n + 12
     valid_at = values_at + 4 * n * elements * channels + 4
-    if n == 0 or data[:4] != _CDR or len(data) != valid_at + n * elements:
+    if not is_samples(data, shape):
         raise ValueError(f"{len(data)} bytes are not samples of {elements} x {channels}")
     counts = struct.unpack_from("<III", data, values_at - 12)
     again = struct.unpack_from("<I", data, 12 + 8 * n) + struct.unpack_from(

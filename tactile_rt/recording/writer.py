@@ -74,6 +74,7 @@ class McapFile:
             self._writer.add_metadata(SESSION, seal(about.session))
         self._writer.add_metadata(METADATA, about.to_metadata())
         self._form = FileForm(about)
+        self.topics: dict[str, tuple[str, str]] = {}  # of each channel, and its message
         self._channels: dict[str, int] = {}
         schemas: dict[str, int] = {}
         kinds = {name: kind for (name, wire), kind in CHANNELS.items() if wire in ("", about.wire)}
@@ -82,6 +83,7 @@ class McapFile:
                 text = schema_text(kind).encode()
                 schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
             topic = self._form.topic(name)
+            self.topics[name] = topic, kind
             self._channels[name] = self._writer.register_channel(topic, "cdr", schemas[kind])
         self.counts = dict.fromkeys(self._channels, 0)
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import hash_of, load_model
-from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.recording import Recording, recover
@@ -43,12 +43,7 @@ from tactile_rt.recording.labels import (
 )
 from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
-from tactile_rt.teaching.model import (
-    TOUCH,
-    Enrolment,
-    FewShot,
-    write_features,
-)
+from tactile_rt.teaching.model import TOUCH, Enrolment, FewShot, write_features
 
 __all__ = [
     "ANYTHING_ELSE",
@@ -239,7 +234,7 @@ class Lesson:
         if old not in (*self.labels, *self.unfelt):
             raise ConfigError(f"there is no {old!r}: `list` tells the names")
         if new:
-            self.check(new)
+            check_label(new)
         relabel(self.folder / LABELS, old, new)
         self.touches = [
             replace(one, label=new, line=relabel_line(one.line, old, new).rstrip("\n"))
@@ -248,10 +243,6 @@ class Lesson:
             for one in self.touches
             if new or one.label != old
         ]
-
-    def check(self, label: str) -> str:
-        """The label itself."""
-        return check_label(label)
 
     def count(self, label: str) -> int:
         """How many touches there are of a label."""
@@ -395,11 +386,7 @@ def check_label(name: str) -> str:
 
 def _whole(path: Path) -> Path:
     """The recording, made whole if it was cut short."""
-    try:
-        for _ in Recording(path).raw():
-            pass
-    except RecordingError:
-        new = recover(path, path.with_suffix(".recovered"), force=True)
+    if (new := recover(path, force=True)) != path:
         shutil.move(new, path)
     return path
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.teaching.lesson import ANYTHING_ELSE, NAMING, ORDERS, Lesson, LessonProgress
+from tactile_rt.teaching.lesson import ANYTHING_ELSE, NAMING, Lesson, LessonProgress, check_label
 
-__all__ = ["ORDERS", "Teacher"]
+__all__ = ["Teacher"]
 
 ELSE_S = 20.0  # for touches of anything else
 LONG = 9  # digits: more are no class's number
@@ -44,7 +44,7 @@ class Teacher:
 
     def __post_init__(self) -> None:
         for name in self.wanted:
-            self.lesson.check(name)
+            check_label(name)
         self.progress = self.lesson.leave_one_out()
         self.label = next(iter(self._short()), "")
         self._planned = bool(self.label)
@@ -80,7 +80,7 @@ class Teacher:
                 return f"there is no class {order[:LONG]}: there are {len(self.wanted)}"
             order = self.wanted[number - 1]
         try:
-            self.label = self.lesson.check(order)
+            self.label = check_label(order)
         except ConfigError as error:
             return str(error)
         if order not in self.wanted and order != ANYTHING_ELSE:

@@ -14,7 +14,7 @@ from tactile_rt.classifier.model_file import load_model, verify_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS, relabel
-from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
+from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson, check_label
 from tactile_rt.teaching.model import Enrolment
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource
@@ -132,6 +132,6 @@ def test_an_object_cannot_have_a_name_with_a_meaning(network, tmp_path):
     assert Teacher(lesson, [], 3).obey("list") == "nothing is taught yet"
     for name in (NONE_OF_THESE, "list", "rename me", "forget"):
         with pytest.raises(ConfigError, match="name it otherwise"):
-            lesson.check(name)
+            check_label(name)
     with pytest.raises(ConfigError, match="there is no 'cup'"):
         lesson.rename("cup", "mug")

@@ -27,10 +27,10 @@ __all__ = [
 ]
 
 PACKAGE = Path(__file__).parents[2] / "assets" / "tactile_rt_msgs"
-# Of a definition's words, those that are no other message: bytes of each; a string has none.
+# Of a definition's words, those that are no other message: how `struct` packs each; not a string.
 SIMPLE = {
-    "bool": 1, "uint8": 1, "int32": 4, "uint32": 4, "int64": 8, "float32": 4, "float64": 8,
-    "string": 0,
+    "bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "int64": "q", "float32": "f",
+    "float64": "d", "string": "",
 }  # fmt: skip
 STANDARD = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
@@ -108,10 +108,6 @@ def _text(message: str) -> str:
 
 
 CDR = b"\x00\x01\x00\x00"  # little-endian, no options
-CODES = {
-    "bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "int64": "q", "float32": "f",
-    "float64": "d",
-}  # fmt: skip
 MOST_S = 2**31 - 1  # a stamp's seconds are an int32
 NS = 10**9
 
@@ -158,60 +154,50 @@ def header_size(data: bytes) -> int:
 
 def _put(out: bytearray, message: str, values: Mapping[str, Any]) -> None:
     for name, kind, many in fields_of(message):
-        value = values[name]
+        ones, code = values[name] if many else (values[name],), SIMPLE.get(kind)
         if many:
-            _number(out, "I", 4, len(value))
-            if kind in CODES and value:
-                out += bytes(-(len(out) - 4) % SIMPLE[kind])
-                out += struct.pack(f"<{len(value)}{CODES[kind]}", *value)
-                continue
-        for one in value if many else (value,):
+            _pack(out, "I", len(ones))
+        if code and ones:
+            _pack(out, code, *ones)
+        for one in () if code else ones:
             if kind == "string":
                 text = one.encode()
-                _number(out, "I", 4, len(text) + 1)
+                _pack(out, "I", len(text) + 1)
                 out += text + b"\0"
-            elif kind in CODES:
-                _number(out, CODES[kind], SIMPLE[kind], one)
             else:
                 _put(out, kind, one)
 
 
-def _number(out: bytearray, code: str, size: int, value: Any) -> None:
-    out += bytes(-(len(out) - 4) % size)
-    out += struct.pack(f"<{code}", value)
+def _pack(out: bytearray, code: str, *numbers: Any) -> None:
+    out += bytes(-(len(out) - 4) % struct.calcsize(f"<{code}"))
+    out += struct.pack(f"<{len(numbers)}{code}", *numbers)
 
 
 def _take(data: bytes, at: int, message: str) -> tuple[dict[str, Any], int]:
     found: dict[str, Any] = {}
     for name, kind, many in fields_of(message):
-        n = 1
+        n, code, ones = 1, SIMPLE.get(kind), list[Any]()
         if many:
-            n, at = _read(data, at, "I", 4)
+            (n,), at = _unpack(data, at, "I")
             if n > len(data):
                 raise ValueError(f"{n} of {name} in {len(data)} bytes")
-            if kind in CODES and n:
-                at += -(at - 4) % SIMPLE[kind]
-                code = f"<{n}{CODES[kind]}"
-                found[name] = list(struct.unpack_from(code, data, at))
-                at += struct.calcsize(code)
-                continue
-        ones: list[Any] = []
-        for _ in range(n):
+        if code and n:
+            ones, at = _unpack(data, at, code, n)
+        for _ in range(0 if code else n):
             if kind == "string":
-                length, at = _read(data, at, "I", 4)
+                (length,), at = _unpack(data, at, "I")
                 if not 0 < length <= len(data) - at:
                     raise ValueError(f"a text of {length} bytes where {len(data) - at} are left")
-                one: Any = data[at : at + length - 1].decode()
+                ones.append(data[at : at + length - 1].decode())
                 at += length
-            elif kind in CODES:
-                one, at = _read(data, at, CODES[kind], SIMPLE[kind])
             else:
                 one, at = _take(data, at, kind)
-            ones.append(one)
+                ones.append(one)
         found[name] = ones if many else ones[0]
     return found, at
 
 
-def _read(data: bytes, at: int, code: str, size: int) -> tuple[Any, int]:
-    at += -(at - 4) % size
-    return struct.unpack_from(f"<{code}", data, at)[0], at + size
+def _unpack(data: bytes, at: int, code: str, n: int = 1) -> tuple[list[Any], int]:
+    at += -(at - 4) % struct.calcsize(f"<{code}")
+    code = f"<{n}{code}"
+    return list(struct.unpack_from(code, data, at)), at + struct.calcsize(code)
