@@ -240,8 +240,8 @@ def _decoder_layers(decoder: nn.Module) -> list[Tap]:
 @contextmanager
 def _recorded(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
     """Record, in the order of `taps`, what they give within the block, (6, step, unit)."""
-    traces: Traces = {}
     shape = frames.shape[:2]
+    traces: Traces = {f"{part}.{name}": frames for name, *_ in taps}  # by which they are in order
 
     def keep(name: str, change: Change | None, x: Tensor) -> None:
         x = change(x) if change else x
@@ -264,6 +264,3 @@ def _recorded(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
     finally:
         for handle in handles:
             handle.remove()
-    order = {f"{part}.{name}": i for i, (name, *_) in enumerate(taps)}
-    for name in sorted(traces, key=order.__getitem__):
-        traces[name] = traces.pop(name)

@@ -79,23 +79,14 @@ class ContactResponse:
         return self.other_z >= max(ELSEWHERE_Z, CLEARLY * self.z)
 
     @property
-    def before_hz(self) -> float:
-        """Mean rate of a unit 3 to 40 ms before contact, in spikes per second."""
-        return self._rate(BEFORE)
-
-    @property
-    def after_hz(self) -> float:
-        """Mean rate of a unit 3 to 40 ms after contact, in spikes per second."""
-        return self._rate(AFTER)
-
-    @property
     def latency_s(self) -> float:
         """When the rate is half way from its level before contact to its highest after, in s."""
         smooth = np.convolve(self.histogram, np.ones(3) / 3, mode="same")
         base, after = smooth[1:BEFORE_MS].mean(), smooth[BEFORE_MS:-1]
         return float(np.argmax(after >= (base + after.max()) / 2) + 0.5) * 1e-3
 
-    def _rate(self, part: slice) -> float:
+    def rate_hz(self, part: slice) -> float:
+        """Return the mean rate of a unit in a part of the histogram, in spikes per second."""
         time_s = self.windows * (part.stop - part.start) * 1e-3
         return float(self.histogram[part].sum() / time_s) if time_s else 0.0
 
@@ -180,7 +171,7 @@ def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
     where = "spikes on the session's clock (offset 0 s)"
     if clock == "recording":
         where = f"spikes shifted by the starting time ({_span(shifts)} s), as published"
-    before, after = whole.before_hz, whole.after_hz
+    before, after = whole.rate_hz(BEFORE), whole.rate_hz(AFTER)
     figures = f"{before:.2f} spikes/s before contact, {after:.2f} in the 3-40 ms after it"
     if not whole.rises:
         return f"{WARNING}{where}: rates do not rise after contact: {figures} (z = {whole.z:.1f})"

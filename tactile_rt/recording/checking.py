@@ -161,22 +161,22 @@ def check_decisions(
     kept = [d for d in recorded if d["t_ns"] >= span_ns[0]]
     mine = [d for d in replayed if d["final"] or not final_only]
     same = withheld = at = 0
+    difference = ""
     before = len(recorded) - len(kept)
     for k, theirs in enumerate(kept, 1):
         while may_withhold and at < len(mine) and mine[at]["t_ns"] < theirs["t_ns"]:
             at, withheld = at + 1, withheld + 1
         if at == len(mine):
-            return Checked(
-                same, before, 0, withheld, f"decision {k} ({_of(theirs)}) is not decided again"
-            )
-        difference = _difference(theirs, mine[at])
+            difference = f"decision {k} ({_of(theirs)}) is not decided again"
+        elif found := _difference(theirs, mine[at]):
+            difference = f"decision {k} ({_of(theirs)}): {found}"
         if difference:
-            return Checked(same, before, 0, withheld, f"decision {k} ({_of(theirs)}): {difference}")
+            break
         at, same = at + 1, same + 1
-    left = mine[at:]
+    left = [] if difference else mine[at:]
     if left and not may_withhold and left[0]["t_ns"] < span_ns[1] - END_NS:
-        return Checked(same, before, 0, withheld, f"a decision ({_of(left[0])}) was not recorded")
-    return Checked(same, before, len(left), withheld)
+        left, difference = [], f"a decision ({_of(left[0])}) was not recorded"
+    return Checked(same, before, len(left), withheld, difference)
 
 
 def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:

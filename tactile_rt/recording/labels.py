@@ -15,7 +15,6 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -49,13 +48,13 @@ LONGEST_LINE = 10_000  # bytes, that are looked at
 RESERVED = ("unknown", "none of these", "unlabelled")
 
 
-@dataclass(frozen=True, kw_only=True)
-class LabelledInterval:
+class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
     """A part of a recording in which one thing is touched.
 
     Attributes:
         start_s, end_s: Seconds since the recording's first sample; the end is not in it.
         object: The name of the one thing of this kind; empty: it is not told.
+        recording: The name of its file as the labels have it; empty: the only one.
         where: File and line, for messages; empty: not out of a file.
     """
 
@@ -63,20 +62,13 @@ class LabelledInterval:
     start_s: float = 0.0
     end_s: float = math.inf
     object: str = ""
+    recording: str = ""
     where: str = ""
 
     @property
     def thing(self) -> tuple[str, str]:
         """What was touched: label and object."""
         return self.label, self.object
-
-
-class _Row(msgspec.Struct):
-    start_s: float
-    end_s: float
-    label: str
-    recording: str = ""
-    object: str = ""
 
 
 def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[LabelledInterval]]:
@@ -99,7 +91,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
     known = {one.resolve(): one for one in recordings}
     found: dict[Path, list[LabelledInterval]] = {one: [] for one in recordings}
     for node in table.rows:
-        row = convert(node, _Row, lax=True)
+        row = convert(node, LabelledInterval, lax=True)
         for column, name in (("label", row.label), ("object", row.object)):
             if why := check_name(name, empty=column == "object"):
                 raise refusal(node, [column], why)
@@ -117,15 +109,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
             names = sorted(r.name for r in recordings)
             why = f"no file {row.recording!r} beside {path.name}; {nearest(row.recording, names)}"
             raise refusal(node, ["recording"], why)
-        found.setdefault(one or file, []).append(
-            LabelledInterval(
-                label=row.label,
-                start_s=row.start_s,
-                end_s=row.end_s,
-                object=row.object,
-                where=node.where,
-            )
-        )
+        found.setdefault(one or file, []).append(msgspec.structs.replace(row, where=node.where))
     return found
 
 

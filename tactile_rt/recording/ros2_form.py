@@ -5,19 +5,19 @@ definition is in the file, so that whatever reads ROS 2 reads it.
 """
 
 from tactile_rt.recording import layout
-from tactile_rt.recording.description import Description
 from tactile_rt.recording.ros2 import messages
-from tactile_rt.recording.ros2.cdr import CDR, token
+from tactile_rt.recording.ros2.cdr import CDR
 
 __all__ = [
     "ARRAY",
     "CHANNELS",
+    "PREFIX",
     "TEXTS",
     "WRENCH",
-    "FileForm",
     "is_in_file_form",
     "name_channel",
     "plain",
+    "put_in_form",
 ]
 
 ARRAY, WRENCH = "array", "wrench"
@@ -31,32 +31,8 @@ CHANNELS = {
     (layout.EVENTS, ""): messages.EVENT,
     (ARRAY, ""): messages.ARRAY,
 }
-PREFIX = "tactile"
+PREFIX = "tactile"  # of a topic: /tactile/SOURCE/CHANNEL
 TEXTS = (layout.HEALTH, layout.DECISIONS, layout.EVENTS)
-
-
-class FileForm:
-    """How the messages of one recording stand in its file."""
-
-    def __init__(self, about: Description) -> None:
-        self._spec, self._offset_ns = about.spec, about.utc_offset_ns
-        self._source = about.session.get("daemon_source") or about.spec.name
-
-    def topic(self, name: str) -> str:
-        """The topic of a channel such as ``samples``."""
-        return f"/{PREFIX}/{token(self._source)}/{name}"
-
-    def array(self, t_ns: int) -> bytes:
-        """What the array is, told at this host time, ns."""
-        return messages.array_message(self._spec, self._source, t_ns + self._offset_ns)
-
-    def encode(self, name: str, data: bytes) -> bytes:
-        """A message of `layout` as it stands in the file."""
-        if name == layout.SAMPLES:
-            return messages.stamped(data, layout.last_ns(data) + self._offset_ns, self._spec.frame)
-        if name == layout.DECISIONS:
-            return messages.decision_message(data)
-        return messages.event_message(data) if name in TEXTS else data
 
 
 def name_channel(topic: str) -> str:
@@ -67,8 +43,17 @@ def name_channel(topic: str) -> str:
     return " ".join(topic.split())
 
 
+def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes:
+    """Write a message of `layout` as it stands in the file."""
+    if name == layout.SAMPLES:
+        return messages.stamped(data, layout.last_ns(data) + utc_offset_ns, frame)
+    if name == layout.DECISIONS:
+        return messages.decision_message(data)
+    return messages.event_message(data) if name in TEXTS else data
+
+
 def plain(name: str, data: bytes) -> bytes:
-    """What was given to `FileForm.encode`."""
+    """What was given to `put_in_form`."""
     if name == layout.SAMPLES:
         return messages.unstamped(data)
     if name in TEXTS:
@@ -79,7 +64,7 @@ def plain(name: str, data: bytes) -> bytes:
 
 
 def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
-    """Whether data can be what `FileForm.encode` gave for a message of this channel, as far as its
+    """Whether data can be what `put_in_form` gave for a message of this channel, as far as its
     length, beginning and end tell.
 
     Args:

@@ -42,8 +42,9 @@ from tactile_rt.recording.description import (
     utc_offset_ns,
 )
 from tactile_rt.recording.layout import HEALTH, SAMPLES, WIRE, Packet, encode_packet, samples_in
-from tactile_rt.recording.ros2.cdr import schema_text
-from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
+from tactile_rt.recording.ros2 import messages
+from tactile_rt.recording.ros2.cdr import schema_text, token
+from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, PREFIX, put_in_form
 from tactile_rt.recording.syncing import Extent, Syncer
 
 __all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats", "check_not_recorded"]
@@ -73,7 +74,7 @@ class McapFile:
         if about.session:
             self._writer.add_metadata(SESSION, seal(about.session))
         self._writer.add_metadata(METADATA, about.to_metadata())
-        self._form = FileForm(about)
+        self._array = about.session.get("daemon_source") or about.spec.name
         self.topics: dict[str, tuple[str, str]] = {}  # of each channel, and its message
         self._channels: dict[str, int] = {}
         schemas: dict[str, int] = {}
@@ -82,16 +83,17 @@ class McapFile:
             if kind not in schemas:
                 text = schema_text(kind).encode()
                 schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
-            topic = self._form.topic(name)
+            topic = f"/{PREFIX}/{token(self._array)}/{name}"
             self.topics[name] = topic, kind
             self._channels[name] = self._writer.register_channel(topic, "cdr", schemas[kind])
         self.counts = dict.fromkeys(self._channels, 0)
 
     def add(self, name: str, data: bytes, t_ns: int) -> None:
         """Add a message, as `layout` has it, of this host time, ns."""
+        spec, offset_ns = self.about.spec, self.about.utc_offset_ns
         if not self.counts[ARRAY]:
-            self.put(ARRAY, self._form.array(t_ns), t_ns)
-        self.put(name, self._form.encode(name, data), t_ns)
+            self.put(ARRAY, messages.array_message(spec, self._array, t_ns + offset_ns), t_ns)
+        self.put(name, put_in_form(name, data, offset_ns, spec.frame), t_ns)
 
     def put(self, name: str, data: bytes, t_ns: int) -> None:
         """Add a message as it is to stand in the file; messages are numbered so that none gets

@@ -12,7 +12,6 @@ Nothing else of tactile_rt imports it, so that pytest is needed for tests only.
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from typing import Any
 
 import pytest
 
@@ -25,19 +24,11 @@ __all__ = ["fake_can", "fake_serial"]
 def fake_serial() -> Iterator[Callable[..., FakeSerial]]:
     """Makes devices on serial ports, plugged in; unplugged when the test ends."""
     with ExitStack() as devices:
-
-        def make(*arguments: Any, **options: Any) -> FakeSerial:
-            return devices.enter_context(FakeSerial(*arguments, **options))
-
-        yield make
+        yield lambda *words, **options: devices.enter_context(FakeSerial(*words, **options))
 
 
 @pytest.fixture
 def fake_can() -> Iterator[Callable[..., FakeCan]]:
     """Makes devices on CAN buses, plugged in; unplugged when the test ends."""
     with ExitStack() as devices:
-
-        def make(*arguments: Any, **options: Any) -> FakeCan:
-            return devices.enter_context(FakeCan(*arguments, **options))
-
-        yield make
+        yield lambda *words, **options: devices.enter_context(FakeCan(*words, **options))

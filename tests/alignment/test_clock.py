@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.alignment import build
-from tactile_rt.alignment.clock import contact_response
+from tactile_rt.alignment.clock import AFTER, BEFORE, contact_response
 from tactile_rt.alignment.neural import by_animal
 from tactile_rt.alignment.nwb import find_nwb, read_nwb
 from tactile_rt.alignment.strict import freeze_strict
@@ -94,8 +94,8 @@ def test_the_figures_are_those_of_a_plain_count():
         n = sum(((t >= c + low) & (t < c + high)).sum() for t in spikes for c in contacts)
         return n / (3 * 50 * (high - low))
 
-    assert found.before_hz == pytest.approx(rate(-0.040, -0.003), abs=0.2)
-    assert found.after_hz == pytest.approx(rate(0.003, 0.040), abs=0.2)
+    assert found.rate_hz(BEFORE) == pytest.approx(rate(-0.040, -0.003), abs=0.2)
+    assert found.rate_hz(AFTER) == pytest.approx(rate(0.003, 0.040), abs=0.2)
     assert found.latency_s == pytest.approx(0.0105, abs=0.0015)
     assert found.rises and not found.elsewhere
 

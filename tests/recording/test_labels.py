@@ -1,9 +1,9 @@
 """labels.csv: what was touched when; a mistake is one line, and a line is there whole or not."""
 
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.recording.labels import LabelledInterval, append_label, label_of_file, read_labels
@@ -35,7 +35,7 @@ def test_what_was_appended_is_read(night):
         append_label(path, "night.mcap", one)
     assert path.read_text().splitlines()[1] == 'night.mcap,0.25,12,mug,"red, with a handle"'
     found = read_labels(path, [night])[night]
-    assert [replace(i, where="") for i in found] == said
+    assert [replace(i, where="", recording="") for i in found] == said
     assert found[1].where == f"{path}:3"
 
 
