@@ -22,23 +22,6 @@ from tactile_rt.core.packages import VERSION, require_extra
 if TYPE_CHECKING:
     from tactile_rt.core.stream import Source
 
-__all__ = [
-    "INTERRUPTED",
-    "USER_ERROR",
-    "add_group",
-    "app",
-    "check_folder",
-    "check_is_mcap",
-    "check_named_once",
-    "check_new",
-    "check_output",
-    "check_text",
-    "leaving",
-    "needing",
-    "open_url",
-    "starting",
-]
-
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
 SLOW_WORK = "tactile_rt.sim_backend.objects"  # a logger
 

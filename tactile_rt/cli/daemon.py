@@ -12,8 +12,6 @@ from tactile_rt.cli.app import add_group, app, check_output
 from tactile_rt.cli.options import set_option
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["Settings", "serve"]
-
 Settings = Annotated[
     list[str] | None,
     set_option("A key of the configuration: page.port=9000, source.whiskers.url=..."),

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification
     from tactile_rt.core.stream import Source
 
-__all__ = ["WIDTH", "Demonstration", "SweepOutcome", "draw", "watch"]
-
 WIDTH = 80
 HEIGHT = 15  # of the upper panels
 DROPPED = 0.02  # share of the samples from which on the score says little of the model

@@ -14,8 +14,6 @@ from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
 from tactile_rt.core.errors import ModelError, name_some
 
-__all__ = []
-
 model = add_group("model", "Inspect, verify and time a model file.")
 
 File = Annotated[Path, typer.Argument(help="Model file, .onnx.")]

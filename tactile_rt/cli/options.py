@@ -8,27 +8,6 @@ import typer
 from tactile_rt.cli.app import check_named_once, check_output
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "STDOUT",
-    "Accelerator",
-    "Array",
-    "Fast",
-    "Faults",
-    "Force",
-    "Json",
-    "Model",
-    "Models",
-    "Page",
-    "ProjectFolder",
-    "Quick",
-    "Seconds",
-    "Seed",
-    "Sessions",
-    "Stimuli",
-    "Url",
-    "set_option",
-]
-
 STDOUT = Path("-")
 LARGEST_SEED = 2**32 - 1  # that every generator takes
 

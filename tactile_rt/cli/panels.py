@@ -4,8 +4,6 @@ from typing import Any
 
 from typer.core import TyperGroup
 
-__all__ = ["PANELS", "WELCOME", "PanelGroup"]
-
 # Of the program and of a group: each panel and its commands, the most common first.
 PANELS = {
     "tactile-rt": {

@@ -15,8 +15,6 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["progress_bar", "share_bar"]
-
 A_DAY_S = 86_400.0
 # Between lines where there is no terminal: at first, and at most; a fourth of the time so far.
 LINE_S, LONGEST_S, SHARE = 10.0, 120.0, 0.25

@@ -18,8 +18,6 @@ from tactile_rt.core.files import write_whole
 if TYPE_CHECKING:
     from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["fitting", "print_table", "show_records", "show_table", "told_as_json"]
-
 WIDE = 10_000  # columns: more than any table has
 
 

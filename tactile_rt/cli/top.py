@@ -21,8 +21,6 @@ from tactile_rt.core.errors import ConfigError, SourceError
 if TYPE_CHECKING:
     from tactile_rt.daemon.health import Latency, PartState, Snapshot
 
-__all__ = ["picture", "read_snapshots", "snapshot_at"]
-
 LARGEST = 16 << 20  # bytes of a state
 EVERY_S = 1.0  # between looks
 COLOURS = {
