@@ -40,14 +40,10 @@ ANOTHER = "another animal"
 
 
 class BoardRow(msgspec.Struct, frozen=True):
-    """What is compared with the recordings.
-
-    Attributes:
-        kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or
-            ``animal``.
-    """
+    """What is compared with the recordings."""
 
     name: str
+    # kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or ``animal``
     kind: str
     sha256: str = ""
     parameters: int = 0
@@ -55,32 +51,23 @@ class BoardRow(msgspec.Struct, frozen=True):
 
 
 class BoardColumn(msgspec.Struct, frozen=True):
-    """Part of a dataset under a metric.
-
-    Attributes:
-        usable: The number of animals whose noise is low enough to be corrected for.
-        ceiling: The mean over these of the value that a perfect model is expected to reach; NaN
-            without any.
-    """
+    """Part of a dataset under a metric."""
 
     dataset: str
     part: str
     metric: str
     animals: int
-    usable: int
+    usable: int  # number of animals whose noise is low enough to be corrected for
+    # mean over these of the value that a perfect model is expected to reach; NaN without any
     ceiling: Number
 
 
 class BoardCell(msgspec.Struct, frozen=True):
-    """A row's value in a column.
+    """A row's value in a column."""
 
-    Attributes:
-        score: The mean over animals of the value as a share of the ceiling; NaN without any.
-        sem: The standard error of that mean; NaN with fewer than two animals.
-    """
-
+    # mean over animals of the value as a share of the ceiling; NaN without any
     score: Number = math.nan
-    sem: Number = math.nan
+    sem: Number = math.nan  # standard error of that mean; NaN with fewer than two animals
     value: Number = math.nan
     layer: str = ""
 
@@ -101,15 +88,11 @@ class BoardDataset(msgspec.Struct, frozen=True):
 
 
 class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt board 2"):
-    """A whole board.
-
-    Attributes:
-        cells: (row, column) The value of each row in each column.
-    """
+    """A whole board."""
 
     rows: tuple[BoardRow, ...]
     columns: tuple[BoardColumn, ...]
-    cells: tuple[tuple[BoardCell, ...], ...]
+    cells: tuple[tuple[BoardCell, ...], ...]  # (row, column) value of each row in each column
     datasets: tuple[BoardDataset, ...]
     metrics: dict[str, str]
 

@@ -41,27 +41,18 @@ ELSEWHERE_Z, CLEARLY = 7.0, 1.5
 
 @dataclass(frozen=True, eq=False)
 class ContactResponse:
-    """How the rates of a session, or of several, change with contact.
-
-    Attributes:
-        shift_s: What was subtracted from the stored spike times, in s.
-        histogram: (100,) The number of spikes of all units in each ms from 40 ms before to 60 ms
-            after contact.
-        windows: The number of contacts times the number of units.
-        rise: The number of spikes 3 to 40 ms after contact less that in as long a time before.
-        spread: The spread of that number over other shifts, which chance alone makes.
-        other_s: The shift in s from the stored spike times at which the rise is greatest otherwise.
-        other_z: The rise at that shift, in units of `spread`.
-    """
+    """How the rates of a session, or of several, change with contact."""
 
     session: str
-    shift_s: float
+    shift_s: float  # what was subtracted from the stored spike times, in s
+    # (100,) number of spikes of all units in each ms from 40 ms before to 60 ms after contact
     histogram: NDArray[np.int64]
-    windows: int
-    rise: float
-    spread: float
+    windows: int  # number of contacts times the number of units
+    rise: float  # number of spikes 3 to 40 ms after contact less that in as long a time before
+    spread: float  # spread of that number over other shifts, which chance alone makes
+    # shift in s from the stored spike times at which the rise is greatest otherwise
     other_s: float = 0.0
-    other_z: float = 0.0
+    other_z: float = 0.0  # rise at that shift, in units of `spread`
 
     @property
     def z(self) -> float:

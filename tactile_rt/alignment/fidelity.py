@@ -25,18 +25,13 @@ FLAT = 1e-6  # an RDM that spans less says nothing: of two classes the output's 
 
 @dataclass(frozen=True)
 class LayerFidelity:
-    """One layer in both models.
-
-    Attributes:
-        pearson: The correlation of the two RDMs of the layer; NaN if one has none, or both are
-            flat.
-        difference: The largest difference between the two (6, unit) responses, as a share of the
-            reference's largest response where that is above 1; infinite for another number of
-            units.
-    """
+    """One layer in both models."""
 
     layer: str
+    # correlation of the two RDMs of the layer; NaN if one has none, or both are flat
     pearson: float
+    # largest difference between the two (6, unit) responses, as a share of the reference's largest
+    # response where that is above 1; infinite for another number of units
     difference: float
     kept: bool
 

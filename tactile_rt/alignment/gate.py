@@ -74,18 +74,12 @@ PARTS = np.array(
 @dataclass(frozen=True, eq=False)
 class BesideMice:
     """Models beside mice. Fits are mean correlations with single mice, corrected for their noise.
-
-    Attributes:
-        fits: (model, mouse) The fit to each mouse, of a layer that was chosen on the others.
-        fit: (model,) The mean fit of each model; NaN where no layer has an RDM.
-        error: (model,) The standard error of that less the ceiling, over animals and stimuli.
-        floor: (model,) What each fit exceeds in seven of eight cases, given that error.
     """
 
-    fits: Floats
-    fit: Floats
-    error: Floats
-    floor: Floats
+    fits: Floats  # (model, mouse) fit to each mouse, of a layer that was chosen on the others
+    fit: Floats  # (model,) mean fit of each model; NaN where no layer has an RDM
+    error: Floats  # (model,) standard error of that less the ceiling, over animals and stimuli
+    floor: Floats  # (model,) what each fit exceeds in seven of eight cases, given that error
     ceiling: float
     bound: float
 

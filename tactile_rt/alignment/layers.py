@@ -15,22 +15,16 @@ SAME = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What a model's layers do while an array whisks the six stimuli.
-
-    Attributes:
-        traces: The responses of each layer, by name: (6, step, unit) float32.
-        first: The first step that input can reach, by the name of the layer.
-        logits: (6, step, class) The model's output, float32.
-        sha256: The SHA-256 sum of the model's file, hex; empty for a network in memory.
-    """
+    """What a model's layers do while an array whisks the six stimuli."""
 
     name: str
+    # responses of each layer, by name: (6, step, unit) float32
     traces: Mapping[str, NDArray[np.float32]]
-    first: Mapping[str, int]
-    logits: NDArray[np.float32]
+    first: Mapping[str, int]  # first step that input can reach, by the name of the layer
+    logits: NDArray[np.float32]  # (6, step, class) model's output, float32
     parameters: int
     precision: str = "fp32"
-    sha256: str = ""
+    sha256: str = ""  # SHA-256 sum of the model's file, hex; empty for a network in memory
     network: Mapping[str, object] = field(default_factory=dict)
     training: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

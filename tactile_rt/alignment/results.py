@@ -22,15 +22,7 @@ __all__ = ["ModelResult", "Results", "baseline_of", "model_result", "read_result
 
 
 class ModelResult(Score, frozen=True, eq=False, kw_only=True):
-    """Everything that is shown of a model: its score, and fields as in `layers.Layers`.
-
-    Attributes:
-        performance: The accuracy on the task, 0 to 1; NaN if no accuracy is known.
-        groups: The groups that the model belongs to, by what they divide models by: encoder,
-            attender, objective, augmentation, masking; without those that are not known.
-        turing: The verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty
-            under paper-code.
-    """
+    """Everything that is shown of a model: its score, and fields as in `layers.Layers`."""
 
     name: str
     sha256: str
@@ -38,11 +30,14 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
     parameters: int
     first: tuple[int, ...]
     units: tuple[int, ...]
-    performance: Number = math.nan
+    performance: Number = math.nan  # accuracy on the task, 0 to 1; NaN if no accuracy is known
     performance_of: str = ""
     untrained: Score | None = None
     notes: tuple[str, ...] = ()
+    # groups that the model belongs to, by what they divide models by: encoder, attender, objective,
+    # augmentation, masking; without those that are not known
     groups: dict[str, str] = msgspec.field(default_factory=dict)
+    # verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty under paper-code
     turing: str = ""
     turing_why: str = ""
 

@@ -29,20 +29,16 @@ LAYERS_UM = {
 
 @dataclass(frozen=True)
 class Selection:
-    """What is kept of some recordings; by default everything.
+    """What is kept of some recordings; by default everything."""
 
-    Attributes:
-        task: The task of the sessions, ``discrimination`` or ``detection``; None for both.
-        sessions: Patterns of session names with ``*`` and ``?``, of which one must fit a part of
-            the name; empty for all.
-        depth_um: The depths below the pia in um that units lie between, the first included; None
-            for all.
-        cells: The type of the units, ``excitatory`` or ``inhibitory`` (putative); None for both.
-    """
-
+    # task of the sessions, ``discrimination`` or ``detection``; None for both
     task: str | None = None
+    # patterns of session names with ``*`` and ``?``, of which one must fit a part of the name;
+    # empty for all
     sessions: tuple[str, ...] = ()
+    # depths below the pia in um that units lie between, the first included; None for all
     depth_um: tuple[float, float] | None = None
+    # type of the units, ``excitatory`` or ``inhibitory`` (putative); None for both
     cells: str | None = None
 
     @classmethod

@@ -32,17 +32,11 @@ TIE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Permutations:
-    """A statistic among those of all relabelled stimuli.
+    """A statistic among those of all relabelled stimuli."""
 
-    Attributes:
-        statistic: The statistic of the stimuli as they are; NaN if there is none.
-        null: (720,) The statistics of all relabellings, the identity first.
-        p: The share of relabellings that reach the statistic, at least 1/720.
-    """
-
-    statistic: float
-    null: Floats
-    p: float
+    statistic: float  # statistic of the stimuli as they are; NaN if there is none
+    null: Floats  # (720,) statistics of all relabellings, the identity first
+    p: float  # share of relabellings that reach the statistic, at least 1/720
     percentile_95: float
 
 

@@ -46,17 +46,11 @@ MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over units of responses to six stimuli.
+    """Sums over units of responses to six stimuli."""
 
-    Attributes:
-        units: (...) The number of units that the sums run over.
-        sums: (..., 6) The sum over units of the response to each stimulus.
-        products: (..., 6, 6) The sum over units of the products of the responses to two stimuli.
-    """
-
-    units: Floats
-    sums: Floats
-    products: Floats
+    units: Floats  # (...) number of units that the sums run over
+    sums: Floats  # (..., 6) sum over units of the response to each stimulus
+    products: Floats  # (..., 6, 6) sum over units of the products of the responses to two stimuli
 
     def __add__(self, other: "Moments") -> "Moments":
         return Moments(
@@ -77,16 +71,12 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Units of an animal, or of several, in every division and both halves of it.
+    """Units of an animal, or of several, in every division and both halves of it."""
 
-    Attributes:
-        halves: (division, 2, ...) The moments of the mean responses over each half of the trials,
-            of the units that were chosen on the other half.
-        quarters: (division, 2, 2, ...) The same of the two halves of each half.
-    """
-
+    # (division, 2, ...) moments of the mean responses over each half of the trials, of the units
+    # that were chosen on the other half
     halves: Moments
-    quarters: Moments
+    quarters: Moments  # (division, 2, 2, ...) the same of the two halves of each half
 
     def __add__(self, other: "_Pool") -> "_Pool":
         return _Pool(self.halves + other.halves, self.quarters + other.quarters)
@@ -198,17 +188,12 @@ def _pools(
 
 @dataclass(frozen=True, eq=False)
 class Divided:
-    """Random divisions of a session's trials in two, and of each half in two.
+    """Random divisions of a session's trials in two, and of each half in two."""
 
-    Attributes:
-        halves: (division, 2, 6, unit) The mean responses over each half of the trials.
-        quarters: (division, 2, 2, 6, unit) The mean responses over each half of each half.
-        reliable: (division, 2, unit) Whether the tuning of a unit over that half of the trials has
-            a reliability above `MINIMUM_RELIABILITY`.
-    """
-
-    halves: Floats
-    quarters: Floats
+    halves: Floats  # (division, 2, 6, unit) mean responses over each half of the trials
+    quarters: Floats  # (division, 2, 2, 6, unit) mean responses over each half of each half
+    # (division, 2, unit) whether the tuning of a unit over that half of the trials has a
+    # reliability above `MINIMUM_RELIABILITY`
     reliable: NDArray[np.bool_]
 
 

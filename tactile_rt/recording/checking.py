@@ -36,19 +36,12 @@ Fields = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class RecordedModel:
-    """A model of the daemon that decided on the recorded source.
+    """A model of the daemon that decided on the recorded source."""
 
-    Attributes:
-        name: The name of the model in the configuration, and in its decisions.
-        file: The path that the model's file had.
-        sha256: The SHA-256 of the file, in hexadecimal; empty: the recording does not tell.
-        table: The model's table ``[[model]]`` in the configuration.
-    """
-
-    name: str
-    file: Path
-    sha256: str
-    table: Fields = field(default_factory=dict)
+    name: str  # name of the model in the configuration, and in its decisions
+    file: Path  # path that the model's file had
+    sha256: str  # SHA-256 of the file, in hexadecimal; empty: the recording does not tell
+    table: Fields = field(default_factory=dict)  # model's table ``[[model]]`` in the configuration
 
 
 def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
@@ -122,23 +115,15 @@ def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
 
 @dataclass(frozen=True)
 class Checked:
-    """What became of the comparison.
+    """What became of the comparison."""
 
-    Attributes:
-        same: The number of decisions that are as recorded.
-        before: The number of recorded decisions about samples before the first.
-        late: The number of replayed decisions of the last second, for which the recording ended
-            too early.
-        withheld: The number of replayed decisions that were not recorded because they were late
-            (``late = "skip"``).
-        difference: The first difference, in words; empty: there is none.
-    """
-
-    same: int
-    before: int = 0
+    same: int  # number of decisions that are as recorded
+    before: int = 0  # number of recorded decisions about samples before the first
+    # number of replayed decisions of the last second, for which the recording ended too early
     late: int = 0
+    # number of replayed decisions that were not recorded because they were late (``late = "skip"``)
     withheld: int = 0
-    difference: str = ""
+    difference: str = ""  # first difference, in words; empty: there is none
 
 
 def check_decisions(
@@ -221,25 +206,18 @@ Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class Redecoded:
-    """Recorded samples beside those that the packets decode to.
-
-    Attributes:
-        equal: The number of samples of both whose values and validity are the same, bit for bit.
-        differing: The number of samples of both whose values or validity are not the same.
-        validity: The number of differing samples in which an element is valid in one of both alone.
-        largest: Each channel that differs, its unit, and the largest difference where both samples
-            are valid.
-        time_ns: The largest difference between the two times of one sample, ns.
-        array: The differences between the two arrays, in words; values then are not compared.
-    """
+    """Recorded samples beside those that the packets decode to."""
 
     recorded: int
     decoded: int
-    equal: int = 0
-    differing: int = 0
+    equal: int = 0  # number of samples of both whose values and validity are the same, bit for bit
+    differing: int = 0  # number of samples of both whose values or validity are not the same
+    # number of differing samples in which an element is valid in one of both alone
     validity: int = 0
+    # each channel that differs, its unit, and the largest difference where both samples are valid
     largest: tuple[tuple[str, str, float], ...] = ()
-    time_ns: int = 0
+    time_ns: int = 0  # largest difference between the two times of one sample, ns
+    # differences between the two arrays, in words; values then are not compared
     array: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:

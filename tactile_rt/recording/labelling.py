@@ -48,35 +48,25 @@ Intervals = dict[Path, list[LabelledInterval]]
 
 @dataclass(frozen=True)
 class LabelledTouch:
-    """A touch that is used.
-
-    Attributes:
-        onset_s: The time of its onset, seconds since the first sample of the recording.
-    """
+    """A touch that is used."""
 
     touch: RecordedTouch
     recording: Path
-    onset_s: float
+    onset_s: float  # time of its onset, seconds since the first sample of the recording
     interval: LabelledInterval
 
 
 @dataclass
 class LabelledTouches:
-    """The touches of some recordings that can be used, and what could not.
-
-    Attributes:
-        period_ns: The sample period of the touches, ns.
-        sensor: The description of the array's sensor; None: it has none.
-        sums: The sha256 of each recording's file.
-        left_out: The lines that tell what could not be used, or should be known.
-    """
+    """The touches of some recordings that can be used, and what could not."""
 
     spec: ArraySpec
-    period_ns: int
-    sensor: SensorSpec | None
+    period_ns: int  # sample period of the touches, ns
+    sensor: SensorSpec | None  # description of the array's sensor; None: it has none
     used: list[LabelledTouch] = field(default_factory=list)
-    sums: dict[Path, str] = field(default_factory=dict)
+    sums: dict[Path, str] = field(default_factory=dict)  # sha256 of each recording's file
     found: Counter[Path] = field(default_factory=Counter)
+    # lines that tell what could not be used, or should be known
     left_out: list[str] = field(default_factory=list)
 
 

@@ -42,14 +42,10 @@ _FRAME = struct.Struct("<I???xI")  # and its data, padded to 4
 
 @dataclass(frozen=True)
 class Raw:
-    """One message of a recording, as it stands in the file.
-
-    Attributes:
-        t_ns: The time under which it was recorded, host monotonic time, ns.
-    """
+    """One message of a recording, as it stands in the file."""
 
     topic: str
-    t_ns: int
+    t_ns: int  # time under which it was recorded, host monotonic time, ns
     data: bytes
 
 

@@ -39,19 +39,13 @@ PIXELS = 16384  # of each, at most
 
 @dataclass(frozen=True)
 class CameraFilm:
-    """A film and when it was taken.
-
-    Attributes:
-        path: The file of the film, in any form that FFmpeg reads.
-        begin_s: The time of the film's first frame after the recording's first sample, s; below 0
-            it was before.
-        size: The (height, width) of a frame.
-    """
+    """A film and when it was taken."""
 
     name: str
-    path: Path
+    path: Path  # file of the film, in any form that FFmpeg reads
+    # time of the film's first frame after the recording's first sample, s; below 0 it was before
     begin_s: float
-    size: tuple[int, int]
+    size: tuple[int, int]  # (height, width) of a frame
 
     @property
     def key(self) -> str:
@@ -190,17 +184,14 @@ def import_pyarrow() -> tuple[Any, Any]:
 
 @dataclass
 class Episode:
-    """An episode: a recording.
-
-    Attributes:
-        statistics: The statistics of each feature, as `Statistics.found` gives them.
-    """
+    """An episode: a recording."""
 
     index: int
     rows: int
     first: int
     task: str
     task_index: int
+    # statistics of each feature, as `Statistics.found` gives them
     statistics: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
 
     def columns(self, frame: NDArray[np.int64], fps: int) -> dict[str, NDArray[Any]]:

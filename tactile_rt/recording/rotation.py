@@ -26,17 +26,12 @@ SUFFIX = ".mcap"
 
 @dataclass(frozen=True)
 class Rotation:
-    """The files of one recording, named by the UTC at which each was begun.
-
-    Attributes:
-        mb: The size beyond which the next file begins, MB; 0: whatever the size.
-        seconds: The time after which the next file begins, s; 0: never.
-    """
+    """The files of one recording, named by the UTC at which each was begun."""
 
     folder: Path
     stem: str
-    mb: float = 0.0
-    seconds: float = 0.0
+    mb: float = 0.0  # size beyond which the next file begins, MB; 0: whatever the size
+    seconds: float = 0.0  # time after which the next file begins, s; 0: never
 
     def begin(self, source: Source, about: Description, **further: Any) -> RecordingWriter:
         """Begin the next file; one that is there is never written over.

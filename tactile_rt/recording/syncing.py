@@ -13,15 +13,11 @@ __all__ = ["Extent", "Syncer"]
 
 
 class Extent(NamedTuple):
-    """How much of a recording there is, up to some moment.
-
-    Attributes:
-        newest_ns: The host monotonic time of the newest sample, ns; 0 if there is none.
-    """
+    """How much of a recording there is, up to some moment."""
 
     samples: int = 0
     packets: int = 0
-    newest_ns: int = 0
+    newest_ns: int = 0  # host monotonic time of the newest sample, ns; 0 if there is none
 
 
 class Syncer:

@@ -42,20 +42,14 @@ UNSURE = "whose onset is not found again after so short a rest"
 
 @dataclass(frozen=True)
 class RecordedTouch:
-    """One touch.
+    """One touch."""
 
-    Attributes:
-        onset_ns: The stream time of the onset, ns.
-        end_ns: The stream time of the window's last sample, ns.
-        values: (sample, element, channel) float32: `REST` samples of rest, then the window, SI;
-            where a classifier takes an element for untouched, its baseline.
-        flaw: The reason why nothing can be learnt from the touch; empty: there is none.
-    """
-
-    onset_ns: int
-    end_ns: int
+    onset_ns: int  # stream time of the onset, ns
+    end_ns: int  # stream time of the window's last sample, ns
+    # (sample, element, channel) float32: `REST` samples of rest, then the window, SI; where a
+    # classifier takes an element for untouched, its baseline
     values: NDArray[np.float32]
-    flaw: str = ""
+    flaw: str = ""  # reason why nothing can be learnt from the touch; empty: there is none
 
 
 def find_touches(

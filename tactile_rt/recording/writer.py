@@ -121,17 +121,12 @@ class McapFile:
 
 @dataclass
 class WriterStats:
-    """What became of what was to be recorded.
-
-    Attributes:
-        dropped_samples: The number of samples that were not written: the disk was slow or full.
-        dropped_packets: The number of raw packets that were not written, for the same reason.
-    """
+    """What became of what was to be recorded."""
 
     samples: int = 0
     packets: int = 0
-    dropped_samples: int = 0
-    dropped_packets: int = 0
+    dropped_samples: int = 0  # number of samples that were not written: the disk was slow or full
+    dropped_packets: int = 0  # number of raw packets that were not written, for the same reason
     bytes: int = 0
 
 

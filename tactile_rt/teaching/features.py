@@ -35,19 +35,13 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FeatureNetwork:
-    """Features of a stream of an array, step by step.
-
-    Attributes:
-        kernels: (kernel, signal, tap) The weights of the temporal kernels.
-        dilations: (kernel,) The number of samples from one tap to the next, ascending.
-        thresholds: (kernel,) The output of a kernel above which it counts as high.
-    """
+    """Features of a stream of an array, step by step."""
 
     spec: ArraySpec
     substeps: int
-    kernels: Floats
-    dilations: NDArray[np.int64]
-    thresholds: Floats
+    kernels: Floats  # (kernel, signal, tap) weights of the temporal kernels
+    dilations: NDArray[np.int64]  # (kernel,) number of samples from one tap to the next, ascending
+    thresholds: Floats  # (kernel,) output of a kernel above which it counts as high
 
     @classmethod
     def drawn(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":

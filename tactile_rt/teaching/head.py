@@ -85,15 +85,10 @@ class TouchClasses:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """What was made of every touch, leave-one-out: by the others alone.
+    """What was made of every touch, leave-one-out: by the others alone."""
 
-    Attributes:
-        distances: (touch, step, class) Squared distances from the classes of the others.
-        right: (touch,) Whether the nearest class at the last step was its own.
-    """
-
-    distances: Floats
-    right: NDArray[np.bool_]
+    distances: Floats  # (touch, step, class) squared distances from the classes of the others
+    right: NDArray[np.bool_]  # (touch,) whether the nearest class at the last step was its own
 
 
 def fit_classes(

@@ -71,33 +71,25 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TaughtTouch:
-    """One touch.
-
-    Attributes:
-        features: (step, feature) What was felt, step by step.
-    """
+    """One touch."""
 
     label: str
-    features: NDArray[np.float32]
+    features: NDArray[np.float32]  # (step, feature) what was felt, step by step
     recording: str
     line: str
 
 
 @dataclass
 class Lesson:
-    """Touches and what is learnt from them, kept in a folder.
-
-    Attributes:
-        touches: All touches, in their order.
-        lost: The number of touches in the list that are not in the recordings, as their last
-            moment was not written when the program was killed.
-        unfelt: The labels of those of them that are whole in the list.
-    """
+    """Touches and what is learnt from them, kept in a folder."""
 
     folder: Path
     taught: FewShot | Enrolment
-    touches: list[TaughtTouch] = field(default_factory=list)
+    touches: list[TaughtTouch] = field(default_factory=list)  # all touches, in their order
+    # number of touches in the list that are not in the recordings, as their last moment was not
+    # written when the program was killed
     lost: int = 0
+    # labels of those of them that are whole in the list
     unfelt: list[str] = field(default_factory=list)
     _largest: list[NDArray[np.float32]] = field(default_factory=list)  # of each listener
 
@@ -313,22 +305,18 @@ class Lesson:
 
 @dataclass(frozen=True)
 class LessonProgress:
-    """How well touches are told apart, leave-one-out.
+    """How well touches are told apart, leave-one-out."""
 
-    Attributes:
-        classes: The name of each class, the number of its touches, and how many of them were
-            right.
-        odd: Touches that are unlike the others of their class: their number, counted from 1, and
-            the class that they are most like.
-        confused: Pairs of classes that are taken for one another, the most often first.
-        same: Pairs of classes that feel the same: touches of the two are told apart by chance.
-        others: How many touches of anything else are refused, and of how many.
-    """
-
+    # name of each class, the number of its touches, and how many of them were right
     classes: tuple[tuple[str, int, int], ...]
+    # touches that are unlike the others of their class: their number, counted from 1, and the class
+    # that they are most like
     odd: tuple[tuple[int, str], ...]
+    # pairs of classes that are taken for one another, the most often first
     confused: tuple[tuple[str, str], ...]
+    # pairs of classes that feel the same: touches of the two are told apart by chance
     same: tuple[tuple[str, str], ...] = ()
+    # how many touches of anything else are refused, and of how many
     others: tuple[int, int] = (0, 0)
 
     @property

@@ -65,17 +65,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FewShot:
-    """What is needed to learn a model few-shot, from a lesson alone.
-
-    Attributes:
-        floor: (channel,) The smallest noise that the contact detector assumes, in the channel's
-            unit.
-        changes: The share of readings at rest that differ from the one before, of the element that
-            repeats most; 0: not known.
-    """
+    """What is needed to learn a model few-shot, from a lesson alone."""
 
     spec: ArraySpec
+    # (channel,) smallest noise that the contact detector assumes, in the channel's unit
     floor: NDArray[np.float32]
+    # share of readings at rest that differ from the one before, of the element that repeats most;
+    # 0: not known
     changes: float = 0.0
     each = 10  # touches of a class that are worth their time
     few = ENOUGH  # fewer are told

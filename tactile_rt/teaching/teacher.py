@@ -22,21 +22,15 @@ LONG = 9  # digits: more are no class's number
 
 @dataclass
 class Teacher:
-    """What is asked of who touches.
-
-    Attributes:
-        wanted: The names of the classes to be taught, in their order; more come as they are named.
-        label: The name of what is touched now; empty: nobody has said.
-        done: Whether who teaches has had enough, or all that was wanted is there.
-        ended: How the lesson ended; empty: it goes on.
-    """
+    """What is asked of who touches."""
 
     lesson: Lesson
+    # names of the classes to be taught, in their order; more come as they are named
     wanted: list[str]
     each: int
-    label: str = ""
-    done: bool = False
-    ended: str = ""
+    label: str = ""  # name of what is touched now; empty: nobody has said
+    done: bool = False  # whether who teaches has had enough, or all that was wanted is there
+    ended: str = ""  # how the lesson ended; empty: it goes on
     said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether there is a list to be worked through, and then an end

@@ -135,15 +135,10 @@ class RangeFile(io.RawIOBase):
 
 @dataclass(frozen=True)
 class PublishedFile:
-    """A session's file in an archive.
+    """A session's file in an archive."""
 
-    Attributes:
-        path: The path in the dataset, ``sub-231CR/sub-231CR_ses-20190921T144923_....nwb``.
-        size: Bytes.
-    """
-
-    path: str
-    size: int
+    path: str  # path in the dataset, ``sub-231CR/sub-231CR_ses-20190921T144923_....nwb``
+    size: int  # bytes
     sha256: str
     url: str
 

@@ -62,19 +62,14 @@ _NO_NAME: Final = re.compile(r"[^A-Za-z0-9_-]+")
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag.
-
-    Attributes:
-        columns: What each is a sample of, in the words of ``--columns``; empty where only a user
-            can tell.
-        proposed: Columns for a user to check where only a user can tell; empty if no message
-            holds a number.
-    """
+    """A topic of a bag."""
 
     name: str
     type: str
     messages: int
+    # what each is a sample of, in the words of ``--columns``; empty where only a user can tell
     columns: str
+    # columns for a user to check where only a user can tell; empty if no message holds a number
     proposed: str = ""
 
 

@@ -47,23 +47,18 @@ _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pair
 
 @dataclass(frozen=True)
 class CsvForm:
-    """How a table is written.
+    """How a table is written."""
 
-    Attributes:
-        delimiter: What stands between cells; a space stands for any of spaces and tabs.
-        widths: How many cells a row may have; those that it lacks of `width` are empty.
-        heads: The lines above the first row.
-    """
-
-    delimiter: str
+    delimiter: str  # what stands between cells; a space stands for any of spaces and tabs
     comma: bool
     names: tuple[str, ...]
     first: int
     width: int
     lines: int = 1
     units: tuple[str, ...] = ()
+    # how many cells a row may have; those that it lacks of `width` are empty
     widths: frozenset[int] = frozenset()
-    heads: frozenset[str] = frozenset()
+    heads: frozenset[str] = frozenset()  # lines above the first row
 
 
 def csv_form(

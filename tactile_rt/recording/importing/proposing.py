@@ -27,20 +27,14 @@ ORDERS = {"": "year", "mdy": "month", "dmy": "day"}
 
 @dataclass(frozen=True)
 class ProposedColumns:
-    """What may be in the columns of a file.
+    """What may be in the columns of a file."""
 
-    Attributes:
-        columns: The columns in words; empty where none were found with which the file is read.
-        table: Whether the file is to be read as a table; else as what a board prints.
-        rate_hz: Rate that the header tells, Hz; 0: it tells none.
-    """
-
-    columns: str
-    table: bool
+    columns: str  # columns in words; empty where none were found with which the file is read
+    table: bool  # whether the file is to be read as a table; else as what a board prints
     timed: bool
     said: str
     samples: int = 0
-    rate_hz: float = 0.0
+    rate_hz: float = 0.0  # rate that the header tells, Hz; 0: it tells none
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:

@@ -27,39 +27,30 @@ SHOWN: Final = 8  # channels in text
 
 @dataclass
 class Import:
-    """What a file held, and what of it became samples.
-
-    Attributes:
-        missing: The number of samples that never came, by the device's counter.
-        unit: What `total`, `read` and `passed_over` count: bytes, lines, frames, messages or rows.
-        out_of_order: How many times go back; None where nobody counted.
-        found_hz: Rate by the times of the file; None where it has none.
-        said_hz: Rate that the codec or a user says; None where only times tell it.
-        first_missing: Number of the sample before the first one that is missing.
-        invalid: The number of samples of which an element is invalid.
-        units: SI unit of each channel.
-        ranges: Smallest and largest valid value of each column, SI, by ELEMENT.CHANNEL.
-    """
+    """What a file held, and what of it became samples."""
 
     samples: int = 0
     intact: int = 0
     corrupt: int = 0
-    missing: int = 0
+    missing: int = 0  # number of samples that never came, by the device's counter
     seconds: float = 0.0
     rate_hz: float = 0.0
     notes: list[str] = field(default_factory=list)
+    # what `total`, `read` and `passed_over` count: bytes, lines, frames, messages or rows
     unit: str = "rows"
     total: int = 0
     read: int = 0
     passed_over: int = 0
-    out_of_order: int | None = None
+    out_of_order: int | None = None  # how many times go back; None where nobody counted
     first: str = ""
     last: str = ""
-    found_hz: float | None = None
+    found_hz: float | None = None  # rate by the times of the file; None where it has none
+    # rate that the codec or a user says; None where only times tell it
     said_hz: float | None = None
-    first_missing: int | None = None
-    invalid: int = 0
-    units: dict[str, str] = field(default_factory=dict)
+    first_missing: int | None = None  # number of the sample before the first one that is missing
+    invalid: int = 0  # number of samples of which an element is invalid
+    units: dict[str, str] = field(default_factory=dict)  # SI unit of each channel
+    # smallest and largest valid value of each column, SI, by ELEMENT.CHANNEL
     ranges: dict[str, tuple[float, float] | None] = field(default_factory=dict)
 
 

@@ -59,22 +59,18 @@ SHOWN: Final = 600  # characters of the names that a message tells
 
 @dataclass
 class Table:
-    """Rows as they are read.
-
-    Attributes:
-        rows: The rows, each with as many cells as there are columns: texts or numbers.
-        width: Number of cells of every row that is whole; 0 where rows may be of any.
-        times_ns: The times of the rows that were read so far, ns, of a table that has times beside
-            its columns; None for one that has not.
-        notes: What could not be read, a sentence each; complete once all rows were read.
-    """
+    """Rows as they are read."""
 
     path: Path
     names: tuple[str, ...]
+    # rows, each with as many cells as there are columns: texts or numbers
     rows: Iterable[Sequence[Any]]
+    # times of the rows that were read so far, ns, of a table that has times beside its columns;
+    # None for one that has not
     times_ns: list[int] | None = None
+    # what could not be read, a sentence each; complete once all rows were read
     notes: list[str] = field(default_factory=list)
-    width: int = 0
+    width: int = 0  # number of cells of every row that is whole; 0 where rows may be of any
 
 
 def shown_names(names: Sequence[str]) -> str:

@@ -48,14 +48,10 @@ LINE = "=" * 80
 
 
 class Field(NamedTuple):
-    """A field of a message.
-
-    Attributes:
-        kind: The kind of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``.
-    """
+    """A field of a message."""
 
     name: str
-    kind: str
+    kind: str  # kind of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``
     many: bool
 
 
