@@ -77,7 +77,7 @@ class ContactResponse:
         return float(np.argmax(after >= (base + after.max()) / 2) + 0.5) * 1e-3
 
     def rate_hz(self, part: slice) -> float:
-        """Return the mean rate of a unit in a part of the histogram, in spikes per second."""
+        """Return a unit's mean rate in a part of the histogram, spikes/s."""
         time_s = self.windows * (part.stop - part.start) * 1e-3
         return float(self.histogram[part].sum() / time_s) if time_s else 0.0
 

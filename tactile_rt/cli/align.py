@@ -10,8 +10,7 @@ from rich.table import Column, Table
 
 from tactile_rt.cli.app import add_group, check_output, needing
 from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
-from tactile_rt.cli.progress import progress_bar, share_bar
-from tactile_rt.cli.tables import print_table, told_as_json
+from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
 

@@ -11,8 +11,7 @@ from rich.table import Column, Table
 from tactile_rt.cli.align import align
 from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Page, Seed, Sessions, Stimuli
-from tactile_rt.cli.progress import progress_bar, share_bar
-from tactile_rt.cli.tables import print_table, told_as_json
+from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -12,8 +12,7 @@ import typer
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import show_records
+from tactile_rt.cli.tables import progress_bar, show_records
 from tactile_rt.core.errors import ConfigError, name_some
 
 CHECKOUT = Path(__file__).parents[2]

@@ -12,8 +12,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, open_url
 from tactile_rt.cli.options import STDOUT, Json, Url
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import print_table, told_as_json
+from tactile_rt.cli.tables import print_table, progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError, name_some
 
 if TYPE_CHECKING:

@@ -25,8 +25,7 @@ from rich.text import Text
 
 from tactile_rt.cli.app import app, leaving, needing
 from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import told_as_json
+from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import install_extra
 

@@ -12,8 +12,7 @@ import typer
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, needing, starting
 from tactile_rt.cli.options import Force, Json
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import told_as_json
+from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer
 

@@ -10,8 +10,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import add_group, app, needing
 from tactile_rt.cli.options import STDOUT, Json, Quick
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import print_table, show_records, told_as_json
+from tactile_rt.cli.tables import print_table, progress_bar, show_records, told_as_json
 from tactile_rt.core.errors import ModelError, name_some
 
 model = add_group("model", "Inspect, verify and time a model file.")

@@ -7,8 +7,7 @@ import typer
 
 from tactile_rt.cli.app import add_group, check_output, needing
 from tactile_rt.cli.options import Json
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import show_table, told_as_json
+from tactile_rt.cli.tables import progress_bar, show_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
 objects = add_group("objects", "Download objects to simulate, and check meshes of your own.")

@@ -8,8 +8,7 @@ import typer
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import show_table, told_as_json
+from tactile_rt.cli.tables import progress_bar, show_table, told_as_json
 
 if TYPE_CHECKING:
     from tactile_rt.project.making import MakeProgress

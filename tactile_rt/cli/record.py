@@ -8,8 +8,7 @@ import typer
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leaving, open_url
 from tactile_rt.cli.options import Force, Json, Seconds, Url
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import told_as_json
+from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import no_such
 

@@ -7,8 +7,7 @@ import typer
 
 from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, set_option
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import told_as_json
+from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 
 if TYPE_CHECKING:

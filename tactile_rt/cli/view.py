@@ -10,7 +10,7 @@ import typer
 
 from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, set_option
-from tactile_rt.cli.progress import progress_bar, share_bar
+from tactile_rt.cli.tables import progress_bar, share_bar
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
 

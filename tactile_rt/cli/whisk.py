@@ -9,8 +9,7 @@ import typer
 
 from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Array, Json, set_option
-from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import told_as_json
+from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
 

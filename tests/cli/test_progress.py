@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from tactile_rt.cli import progress
-from tactile_rt.cli.progress import describe_task, progress_bar
+from tactile_rt.cli import tables
+from tactile_rt.cli.tables import describe_task, progress_bar
 from tests.helpers.waiting import until
 
 
@@ -60,7 +60,7 @@ def test_shares_are_per_cent_and_long_times_are_minutes_and_hours(bar):
 
 
 def test_a_log_file_gets_a_line_whenever_one_is_due(monkeypatch):
-    monkeypatch.setattr(progress, "LINE_S", 0.01)
+    monkeypatch.setattr(tables, "LINE_S", 0.01)
     console = Console(file=io.StringIO())
     with progress_bar("[x] reading", console=console) as update:
         until(lambda: console.file.getvalue().startswith("[x] reading: 0 s so far\n"))
