@@ -16,15 +16,10 @@ from tactile_rt.core.settings import take_sets
 
 @dataclass(frozen=True)
 class Spacing:
-    """How the stimuli stand.
+    """How the stimuli stand."""
 
-    Attributes:
-        radius_mm: The radius of the stimuli's arc, mm.
-        step_mm: The vector from a stimulus to the next further one: ``x,y,z``, mm.
-    """
-
-    radius_mm: float = 63.6
-    step_mm: str = "1,1,0"
+    radius_mm: float = 63.6  # radius of the stimuli's arc, mm
+    step_mm: str = "1,1,0"  # vector from a stimulus to the next further one: ``x,y,z``, mm
 
 
 @app.command(epilog="tactile-rt whisk stimuli.npz --set frequency_hz=8")

@@ -48,16 +48,12 @@ Timed = Iterator[tuple[int, Chunk]]
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Options of ``replay:`` of a recording, besides those of its codec.
+    """Options of ``replay:`` of a recording, besides those of its codec."""
 
-    Attributes:
-        speed: Pace of the stream, as a multiple of the recorded one; 0 for as fast as it is read.
-        codec: Name of the codec that decodes raw packets; empty for the recorded one.
-        loop: Whether the recording begins again at its end; numbers and times of samples go on.
-    """
-
+    # pace of the stream, as a multiple of the recorded one; 0 for as fast as it is read
     speed: float = 1.0
-    codec: str = ""
+    codec: str = ""  # name of the codec that decodes raw packets; empty for the recorded one
+    # whether the recording begins again at its end; numbers and times of samples go on
     loop: bool = False
 
 
@@ -297,19 +293,15 @@ class _Decoding:
 
 @dataclass(frozen=True)
 class SweepOptions:
-    """Options of ``replay:`` of a sweep set's object.
+    """Options of ``replay:`` of a sweep set's object."""
 
-    Attributes:
-        speed: The pace as a multiple of real time; 0: as fast as it is read.
-        sweep: The number of the only sweep to stream, from 0; None: all, one after another.
-        rest_s: The rest before each sweep, s, besides the lead that is stored with it: so that a
-            contact ends, and a baseline is taken, before the next.
-        loop: Whether the recording begins again at its end; numbers and times of samples go on.
-    """
-
-    speed: float = 1.0
+    speed: float = 1.0  # pace as a multiple of real time; 0: as fast as it is read
+    # whether the recording begins again at its end; numbers and times of samples go on
     loop: bool = False
+    # number of the only sweep to stream, from 0; None: all, one after another
     sweep: int | None = None
+    # rest before each sweep, s, besides the lead that is stored with it: so that a contact ends,
+    # and a baseline is taken, before the next
     rest_s: float = 0.5
 
     def __post_init__(self) -> None:
