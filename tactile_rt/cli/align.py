@@ -9,7 +9,7 @@ import typer
 from rich.table import Column, Table
 
 from tactile_rt.cli.app import add_group, check_output, needing
-from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
+from tactile_rt.cli.options import Json, Seed, argument, option, set_option
 from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
@@ -19,12 +19,23 @@ if TYPE_CHECKING:
 
 align = add_group("align", "Compare models with recordings of barrel cortex.")
 
-Benchmark = Annotated[Path, typer.Option(help="Benchmark of `align build`.")]
+Page = Annotated[Path | None, option("Also write an HTML page here.", "--out")]
+Stimuli = Annotated[
+    Path | None, option("File of `tactile-rt whisk`. Default: the shipped file of the mouse array.")
+]
+Sessions = Annotated[
+    list[str] | None,
+    option("Only sessions with this in their name; wildcards * and ?.", "--session"),
+]
+Models = Annotated[
+    list[Path], argument("Checkpoints (best.pt), .onnx files, and responses (.npz).")
+]
+Benchmark = Annotated[Path, option("Benchmark of `align build`.")]
 
 
 @align.command("example", epilog="tactile-rt align example brain --set mice=4")
 def write_brain(
-    folder: Annotated[Path, typer.Argument(help="Folder to make.")],
+    folder: Annotated[Path, argument("Folder to make.")],
     seed: Seed = 0,
     sets: Annotated[
         list[str] | None, set_option("An option of the brain: mice=6, trials=60, private=0.3")
@@ -45,23 +56,20 @@ def write_brain(
 @align.command("build", epilog="tactile-rt align build brain/recordings --out benchmark.json")
 def build_benchmark(
     recordings: Annotated[
-        list[Path], typer.Argument(help="NWB files, folders of them, or one published .npz.")
+        list[Path], argument("NWB files, folders of them, or one published .npz.")
     ],
-    out: Annotated[Path, typer.Option(help="Benchmark to write, .json.")],
-    protocol: Annotated[str, typer.Option(help="Protocol: strict or paper-code.")] = "strict",
-    task: Annotated[
-        str | None, typer.Option(help="Only sessions of discrimination or detection.")
-    ] = None,
+    out: Annotated[Path, option("Benchmark to write, .json.")],
+    protocol: Annotated[str, option("Protocol: strict or paper-code.")] = "strict",
+    task: Annotated[str | None, option("Only sessions of discrimination or detection.")] = None,
     sessions: Sessions = None,
     depth: Annotated[
-        str | None, typer.Option(help="Only units of a layer, e.g. L4, or a range in um.")
+        str | None, option("Only units of a layer, e.g. L4, or a range in um.")
     ] = None,
-    cells: Annotated[str | None, typer.Option(help="Only excitatory or inhibitory units.")] = None,
+    cells: Annotated[str | None, option("Only excitatory or inhibitory units.")] = None,
     clock: Annotated[
-        str | None,
-        typer.Option(help="Clock of the spike times: session or recording (see the docs)."),
+        str | None, option("Clock of the spike times: session or recording (see the docs).")
     ] = None,
-    bootstraps: Annotated[int, typer.Option(help="Number of random splits of the trials.")] = 1000,
+    bootstraps: Annotated[int, option("Number of random splits of the trials.")] = 1000,
     seed: Seed = 1234,
     json: Json = None,
 ) -> None:
@@ -131,8 +139,8 @@ def score_models(
 
 @align.command("report", epilog="tactile-rt align report scores.json --out report.html")
 def write_report(
-    scores: Annotated[list[Path], typer.Argument(help="Files of `align score --json`.")],
-    out: Annotated[Path, typer.Option(help="Page to write, .html.")],
+    scores: Annotated[list[Path], argument("Files of `align score --json`.")],
+    out: Annotated[Path, option("Page to write, .html.")],
 ) -> None:
     """Write one HTML page of scores on the same benchmark."""
     import msgspec
@@ -163,16 +171,14 @@ def write_report(
 def decode_stimuli(
     models: Models,
     benchmark: Annotated[
-        Path | None, typer.Option(help="Also decode the mean responses of its animals.")
+        Path | None, option("Also decode the mean responses of its animals.")
     ] = None,
     animals: Annotated[
-        Path | None,
-        typer.Option(help="Also decode recorded animals: a published .npz, or NWB."),
+        Path | None, option("Also decode recorded animals: a published .npz, or NWB.")
     ] = None,
     stimuli: Stimuli = None,
     paper: Annotated[
-        bool,
-        typer.Option("--paper", help="Also hold out one stimulus at a time, as the paper does."),
+        bool, option("Also hold out one stimulus at a time, as the paper does.", "--paper")
     ] = False,
     json: Json = None,
 ) -> None:

@@ -8,9 +8,9 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.align import align
+from tactile_rt.cli.align import Page, Sessions, Stimuli, align
 from tactile_rt.cli.app import check_output, needing
-from tactile_rt.cli.options import Json, Page, Seed, Sessions, Stimuli
+from tactile_rt.cli.options import Json, Seed, argument, option
 from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -39,13 +39,11 @@ def list_datasets(json: Json = None) -> None:
 
 @align.command("fetch", epilog="tactile-rt align fetch 000231 recordings")
 def fetch_recordings(
-    name: Annotated[str, typer.Argument(help="Name of a dataset: see `align datasets`.")],
-    folder: Annotated[
-        Path | None, typer.Argument(help="Folder for small NWB files, one per session.")
-    ] = None,
+    name: Annotated[str, argument("Name of a dataset: see `align datasets`.")],
+    folder: Annotated[Path | None, argument("Folder for small NWB files, one per session.")] = None,
     sessions: Sessions = None,
     listed: Annotated[
-        bool, typer.Option("--list", help="Only list sizes in bytes, SHA-256 and names.")
+        bool, option("Only list sizes in bytes, SHA-256 and names.", "--list")
     ] = False,
     json: Json = None,
 ) -> None:
@@ -90,21 +88,15 @@ def fetch_recordings(
 @align.command("board", epilog="tactile-rt align board run/best.pt --data 000231=recordings")
 def write_board(
     models: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz)."),
+        list[Path] | None, argument("Checkpoints (best.pt), .onnx files, and responses (.npz).")
     ] = None,
     data: Annotated[
-        list[str] | None,
-        typer.Option(help="Recordings, NAME=PATH, e.g. 000231=FOLDER; may be repeated."),
+        list[str] | None, option("Recordings, NAME=PATH, e.g. 000231=FOLDER; may be repeated.")
     ] = None,
-    metric: Annotated[
-        list[str] | None, typer.Option(help="Metric; may be repeated. Default: all.")
-    ] = None,
+    metric: Annotated[list[str] | None, option("Metric; may be repeated. Default: all.")] = None,
     part: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Units: all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."
-        ),
+        option("Units: all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
     ] = None,
     json: Json = None,
     page: Page = None,

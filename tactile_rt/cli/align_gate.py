@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperCommand
 
-from tactile_rt.cli.align import align
+from tactile_rt.cli.align import Stimuli, align
 from tactile_rt.cli.app import needing
-from tactile_rt.cli.options import Json, Stimuli
+from tactile_rt.cli.options import Json, argument, option
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, TactileError
 
@@ -38,16 +38,11 @@ class GateCommand(TyperCommand):
     "gate", cls=GateCommand, epilog="tactile-rt align gate model.onnx --reference run/best.pt"
 )
 def gate_model(
-    model: Annotated[Path, typer.Argument(help="Model to release: .onnx, best.pt or .npz.")],
-    benchmark: Annotated[
-        Path | None, typer.Option(help="Tests 1 and 2: benchmark of `align build`.")
-    ] = None,
-    baseline: Annotated[
-        Path | None, typer.Option(help="Test 3: scores of the previous model on it.")
-    ] = None,
+    model: Annotated[Path, argument("Model to release: .onnx, best.pt or .npz.")],
+    benchmark: Annotated[Path | None, option("Tests 1 and 2: benchmark of `align build`.")] = None,
+    baseline: Annotated[Path | None, option("Test 3: scores of the previous model on it.")] = None,
     reference: Annotated[
-        Path | None,
-        typer.Option(help="Test 4: checkpoint (or .onnx) that it was exported from."),
+        Path | None, option("Test 4: checkpoint (or .onnx) that it was exported from.")
     ] = None,
     stimuli: Stimuli = None,
     json: Json = None,

@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import add_group, check_output, needing, open_url
-from tactile_rt.cli.options import STDOUT, Json
+from tactile_rt.cli.options import STDOUT, Json, argument, option
 from tactile_rt.cli.tables import print_table, show_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -51,15 +51,12 @@ def show(json: Json = None) -> None:
 
 @array.command(epilog="tactile-rt array fit plucks.mcap --array array.toml --out fitted.toml")
 def fit(
-    recording: Annotated[str, typer.Argument(help="An .mcap file, or the URL of a source.")],
-    described: Annotated[Path, typer.Option("--array", help="TOML file of the array.")],
+    recording: Annotated[str, argument("An .mcap file, or the URL of a source.")],
+    described: Annotated[Path, option("TOML file of the array.", "--array")],
     out: Annotated[
-        Path | None,
-        typer.Option(help="File to write with the measured values; may be the array's."),
+        Path | None, option("File to write with the measured values; may be the array's.")
     ] = None,
-    seconds: Annotated[
-        float, typer.Option(min=1, max=3600, help="Read at most this many seconds.")
-    ] = 600.0,
+    seconds: Annotated[float, option("Read at most this many seconds.", min=1, max=3600)] = 600.0,
     json: Json = None,
 ) -> None:
     """Compare an array at rest and plucked with its description.

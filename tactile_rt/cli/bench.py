@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from tactile_rt.cli.app import app, needing
-from tactile_rt.cli.options import Json, Quick
+from tactile_rt.cli.options import Json, Quick, argument, option
 from tactile_rt.cli.tables import progress_bar, show_records
 from tactile_rt.core.errors import ConfigError, name_some
 
@@ -34,14 +34,11 @@ FAULTS = "faults"  # of the daemon's world; takes hours
 @app.command(epilog="tactile-rt bench inference --quick")
 def bench(
     area: Annotated[
-        str | None,
-        typer.Argument(help=f"{', '.join(AREAS)}, or {FAULTS}. Default: all but it."),
+        str | None, argument(f"{', '.join(AREAS)}, or {FAULTS}. Default: all but it.")
     ] = None,
     quick: Quick = False,
     json: Json = None,
-    resume: Annotated[
-        Path | None, typer.Option(help="With faults: file of results to continue from.")
-    ] = None,
+    resume: Annotated[Path | None, option("With faults: file of results to continue from.")] = None,
 ) -> None:
     """Measure speed and accuracy against the stated limits.
 

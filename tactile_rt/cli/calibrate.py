@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, open_url
-from tactile_rt.cli.options import STDOUT, Json, Url
+from tactile_rt.cli.options import STDOUT, Json, Url, argument, option
 from tactile_rt.cli.tables import print_table, progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError, name_some
 
@@ -24,17 +24,14 @@ if TYPE_CHECKING:
 
 LOUDER = 3.0  # noise over that of the last tare that is worth a word
 
-Out = Annotated[
-    Path | None,
-    typer.Option(help="TOML file to write or update. Default: the device's own."),
-]
-Device = Annotated[str, typer.Option(help="Id of the device. Default: the id that it reports.")]
+Out = Annotated[Path | None, option("TOML file to write or update. Default: the device's own.")]
+Device = Annotated[str, option("Id of the device. Default: the id that it reports.")]
 
 
 @app.command(epilog="tactile-rt tare 'serial:///dev/ttyUSB0?codec=bota'")
 def tare(
     source: Url,
-    seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="How long to read, s.")] = 2.0,
+    seconds: Annotated[float, option("How long to read, s.", min=0.01, max=3600)] = 2.0,
     device: Device = "",
     out: Out = None,
     json: Json = None,
@@ -89,15 +86,9 @@ def tare(
 
 @app.command(epilog="tactile-rt calibrate loads.csv --device my-sensor")
 def calibrate(
-    table: Annotated[
-        Path, typer.Argument(help="CSV file: loads fx..mz, and raw_... or start_s,end_s.")
-    ],
-    element: Annotated[
-        str, typer.Option(help="Element that was loaded. Default: the only one.")
-    ] = "",
-    source: Annotated[
-        str, typer.Option(help="URL of the recording that start_s and end_s refer to.")
-    ] = "",
+    table: Annotated[Path, argument("CSV file: loads fx..mz, and raw_... or start_s,end_s.")],
+    element: Annotated[str, option("Element that was loaded. Default: the only one.")] = "",
+    source: Annotated[str, option("URL of the recording that start_s and end_s refer to.")] = "",
     device: Device = "",
     out: Out = None,
     json: Json = None,

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from tactile_rt.cli.app import add_group, app, check_output, leaving, open_url
-from tactile_rt.cli.options import Model, Seconds, set_option
+from tactile_rt.cli.options import Model, Seconds, argument, option, set_option
 from tactile_rt.core.errors import ConfigError, SpecMismatch
 
 Settings = Annotated[
@@ -20,28 +20,22 @@ UNIT = "tactile-rt.service"
 HOMES = ("/home/", "/root/")
 USER = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
 
-File = Annotated[Path, typer.Argument(help="The configuration, e.g. robot.toml.")]
+File = Annotated[Path, argument("The configuration, e.g. robot.toml.")]
 
 config = add_group("config", "Write, check and print configurations of the daemon.")
 
 
 @app.command(epilog="tactile-rt run --source replay:demo --final-only")
 def run(
-    file: Annotated[
-        Path | None, typer.Argument(help="Configuration of the daemon, e.g. robot.toml.")
-    ] = None,
-    source: Annotated[
-        str | None, typer.Option(help="URL of a source, e.g. sim:mouse?objects=mug.")
-    ] = None,
+    file: Annotated[Path | None, argument("Configuration of the daemon, e.g. robot.toml.")] = None,
+    source: Annotated[str | None, option("URL of a source, e.g. sim:mouse?objects=mug.")] = None,
     model: Model = None,
     final_only: Annotated[
-        bool, typer.Option("--final-only", help="Print only the last decision of each touch.")
+        bool, option("Print only the last decision of each touch.", "--final-only")
     ] = False,
     fuse: Annotated[
         float,
-        typer.Option(
-            min=0, max=3600, help="Touches that follow within so many seconds are of one object."
-        ),
+        option("Touches that follow within so many seconds are of one object.", min=0, max=3600),
     ] = 0.0,
     seconds: Seconds = None,
     sets: Settings = None,
@@ -196,7 +190,7 @@ def show(file: File, sets: Settings = None) -> None:
 
 @config.command(epilog="tactile-rt config example robot.toml")
 def example(
-    output: Annotated[Path | None, typer.Argument(help="File to write. Default: print it.")] = None,
+    output: Annotated[Path | None, argument("File to write. Default: print it.")] = None,
 ) -> None:
     """Write an example configuration that explains every key."""
     from tactile_rt.daemon.config import EXAMPLE
@@ -206,7 +200,7 @@ def example(
 
 @config.command(epilog="tactile-rt config alerts alerts.yml")
 def alerts(
-    output: Annotated[Path | None, typer.Argument(help="File to write. Default: print it.")] = None,
+    output: Annotated[Path | None, argument("File to write. Default: print it.")] = None,
 ) -> None:
     """Write Prometheus alert rules for a daemon that serves metrics."""
     from tactile_rt.daemon.metrics import ALERTS
@@ -216,7 +210,7 @@ def alerts(
 
 @config.command("ros2-messages", epilog="tactile-rt config ros2-messages ws/src")
 def ros2_messages(
-    folder: Annotated[Path, typer.Argument(help="The src folder of a ROS 2 workspace.")],
+    folder: Annotated[Path, argument("The src folder of a ROS 2 workspace.")],
 ) -> None:
     """Write tactile_rt_msgs, the ROS 2 package of our message types."""
     import shutil
@@ -254,11 +248,13 @@ def _write(path: Path, text: str) -> None:
 
 @app.command("install-service", epilog="tactile-rt install-service /etc/tactile/robot.toml")
 def install_service(
-    file: Annotated[Path, typer.Argument(help="The configuration, e.g. /etc/tactile/robot.toml.")],
-    out: Annotated[Path, typer.Option(help="New or empty folder to write into.")] = Path(
+    file: Annotated[Path, argument("The configuration, e.g. /etc/tactile/robot.toml.")],
+    out: Annotated[
+        Path, option("New or empty folder to write into.")
+    ] = Path(
         "tactile-service"
     ),
-    user: Annotated[str, typer.Option(help="User that the service runs as.")] = "tactile",
+    user: Annotated[str, option("User that the service runs as.")] = "tactile",
 ) -> None:
     """Write a systemd service that starts the daemon at boot.
 

@@ -24,7 +24,7 @@ from rich.panel import Panel
 from rich.text import Text
 
 from tactile_rt.cli.app import app, leaving, needing
-from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
+from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed, option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import install_extra
@@ -97,15 +97,13 @@ class RecordedPass:
 
 @app.command(epilog="tactile-rt demo --sweeps 5")
 def demo(
-    sweeps: Annotated[
-        int, typer.Option(min=0, help="Stop after this many objects; 0: at Ctrl-C.")
-    ] = 0,
+    sweeps: Annotated[int, option("Stop after this many objects; 0: at Ctrl-C.", min=0)] = 0,
     seconds: Seconds = None,
     model: Model = None,
     seed: Seed = 0,
     fast: Fast = False,
     recorded: Annotated[
-        bool, typer.Option("--recorded", help="Play the recording even if MuJoCo is installed.")
+        bool, option("Play the recording even if MuJoCo is installed.", "--recorded")
     ] = False,
     json: Json = None,
 ) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from tactile_rt.cli.app import app, check_output, leaving, open_url
-from tactile_rt.cli.options import STDOUT, Json, Seconds, Url
+from tactile_rt.cli.options import STDOUT, Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import show_table, told_as_json
 
 WINDOW_S = 1.0
@@ -38,9 +38,9 @@ def list_devices(json: Json = None) -> None:
 @app.command(epilog="tactile-rt doctor --daemon http://127.0.0.1:9464")
 def doctor(
     daemon: Annotated[
-        str, typer.Option(help="Look at a running daemon instead: the URL of its metrics.")
+        str, option("Look at a running daemon instead: the URL of its metrics.")
     ] = "",
-    udev: Annotated[Path | None, typer.Option(help="Write udev rules for the devices.")] = None,
+    udev: Annotated[Path | None, option("Write udev rules for the devices.")] = None,
     json: Json = None,
 ) -> None:
     """Find what keeps devices or a daemon from working, and how to fix it.
@@ -127,10 +127,8 @@ def _look_at_simulator() -> list[Any]:
 
 @app.command(epilog="tactile-rt codecs xela")
 def codecs(
-    codec: Annotated[str, typer.Argument(help="Describe this codec.")] = "",
-    frame: Annotated[
-        str, typer.Option(help="Print the TOML description of this device's frame.")
-    ] = "",
+    codec: Annotated[str, argument("Describe this codec.")] = "",
+    frame: Annotated[str, option("Print the TOML description of this device's frame.")] = "",
     json: Json = None,
 ) -> None:
     """List the device protocols, or describe one of them."""
@@ -168,7 +166,7 @@ def codecs(
 @app.command(epilog="tactile-rt describe replay:demo")
 def describe(
     source: Url,
-    out: Annotated[Path | None, typer.Option(help="File to write. Default: stdout.")] = None,
+    out: Annotated[Path | None, option("File to write. Default: stdout.")] = None,
 ) -> None:
     """Write a source's elements, channels, units and rate as JSON."""
     import msgspec
@@ -248,7 +246,7 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
 
 @app.command(epilog="tactile-rt dump 'serial:/dev/ttyUSB0?baud=115200'")
 def dump(
-    line: Annotated[str, typer.Argument(help="serial:PORT?baud=115200 or can:INTERFACE:CHANNEL.")],
+    line: Annotated[str, argument("serial:PORT?baud=115200 or can:INTERFACE:CHANNEL.")],
     seconds: Seconds = None,
 ) -> None:
     """Print the raw bytes or CAN frames of a line."""

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tactile_rt.cli.app import INTERRUPTED, app, leaving, needing, open_url
-from tactile_rt.cli.options import Fast, Faults, Json, Model, ProjectFolder, set_option
+from tactile_rt.cli.options import Fast, Json, Model, argument, option, set_option
 from tactile_rt.cli.tables import print_table, progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -18,6 +18,11 @@ if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.device import EmulatedDevice
     from tactile_rt.project.folder import Project
     from tactile_rt.sources.hil import LoopReport
+
+Faults = Annotated[Path | None, option("TOML file of the faults to inject.")]
+ProjectFolder = Annotated[
+    Path | None, option("Folder of `tactile-rt new`: its array, device and model.")
+]
 
 LOOK_S = 0.25  # how often the count is renewed
 SWEEPS = 6  # of `hil`, unless told otherwise
@@ -27,21 +32,18 @@ LINGER_S = 0.5  # for the host to read the last samples before the port disappea
 @app.command(epilog="tactile-rt emulate native --source replay:demo --link /tmp/whisker0")
 def emulate(
     codec: Annotated[
-        str | None, typer.Argument(help="Protocol of the device: native, bota, xela, ...")
+        str | None, argument("Protocol of the device: native, bota, xela, ...")
     ] = None,
     source: Annotated[
-        str | None,
-        typer.Option(help="What the device measures, e.g. replay:FILE. Default: made-up presses."),
+        str | None, option("What the device measures, e.g. replay:FILE. Default: made-up presses.")
     ] = None,
     project: ProjectFolder = None,
     wire: Annotated[
-        str | None, typer.Option(help="Wire: serial, slcan or can. Default: serial, else slcan.")
+        str | None, option("Wire: serial, slcan or can. Default: serial, else slcan.")
     ] = None,
-    link: Annotated[
-        Path | None, typer.Option(help="Link to make to the port, e.g. /tmp/whisker0.")
-    ] = None,
+    link: Annotated[Path | None, option("Link to make to the port, e.g. /tmp/whisker0.")] = None,
     bus: Annotated[
-        str | None, typer.Option(help="For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
+        str | None, option("For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
     ] = None,
     faults: Faults = None,
     sets: Annotated[
@@ -50,8 +52,7 @@ def emulate(
     ] = None,
     fast: Fast = False,
     seconds: Annotated[
-        float | None,
-        typer.Option(min=0.001, max=1e9, help="Stop after this many seconds of samples."),
+        float | None, option("Stop after this many seconds of samples.", min=0.001, max=1e9)
     ] = None,
 ) -> None:
     """Emulate a device on a serial port or CAN bus.
@@ -162,24 +163,21 @@ def _count(device: "EmulatedDevice") -> str:
 @app.command(epilog="tactile-rt hil --wire slcan --sweeps 3")
 def hil(
     source: Annotated[
-        str | None,
-        typer.Option(help="What the device measures. Default: sim:mouse, new objects."),
+        str | None, option("What the device measures. Default: sim:mouse, new objects.")
     ] = None,
     wire: Annotated[
-        str | None,
-        typer.Option(help="Wire: serial, slcan or virtual (CAN). Default: serial, or a project's."),
+        str | None, option("Wire: serial, slcan or virtual (CAN). Default: serial, or a project's.")
     ] = None,
     codec: Annotated[
-        str | None, typer.Option(help="Protocol of the device. Default: native, or a project's.")
+        str | None, option("Protocol of the device. Default: native, or a project's.")
     ] = None,
     sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
     faults: Faults = None,
     sweeps: Annotated[
-        int | None, typer.Option(min=1, help=f"Objects that pass, with sim:. Default: {SWEEPS}.")
+        int | None, option(f"Objects that pass, with sim:. Default: {SWEEPS}.", min=1)
     ] = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(min=0.001, max=1e9, help="Stop after this many seconds of the stream."),
+        float | None, option("Stop after this many seconds of the stream.", min=0.001, max=1e9)
     ] = None,
     model: Model = None,
     project: ProjectFolder = None,

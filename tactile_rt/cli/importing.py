@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl
 import typer
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, needing, starting
-from tactile_rt.cli.options import Force, Json
+from tactile_rt.cli.options import Force, Json, argument, option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer
@@ -26,34 +26,27 @@ BINS, PAUSE = 2000, 5  # stretches of time, each drawn by its extremes; typical 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
 def import_file(
-    log: Annotated[Path, typer.Argument(help="Raw bytes, a CAN log, a table of numbers or a bag.")],
+    log: Annotated[Path, argument("Raw bytes, a CAN log, a table of numbers or a bag.")],
     output: Annotated[
-        Path | None, typer.Argument(help="The recording. Default: LOG.mcap in this folder.")
+        Path | None, argument("The recording. Default: LOG.mcap in this folder.")
     ] = None,
     decoded_as: Annotated[
-        str, typer.Option("--as", help="Codec of the device: codec=NAME&OPTION=VALUE.")
+        str, option("Codec of the device: codec=NAME&OPTION=VALUE.", "--as")
     ] = "",
     columns: Annotated[
-        str,
-        typer.Option(help="Columns to read: NAME=ELEMENT.CHANNEL*SCALE:UNIT,... or FILE.toml."),
+        str, option("Columns to read: NAME=ELEMENT.CHANNEL*SCALE:UNIT,... or FILE.toml.")
     ] = "",
-    topic: Annotated[str, typer.Option(help="Topic to read from a bag.")] = "",
-    rate: Annotated[
-        float, typer.Option(min=0, help="Samples per second, if the log has no times.")
-    ] = 0,
-    bus: Annotated[str, typer.Option(help="Bus to read from a log of several, e.g. can0.")] = "",
-    form: Annotated[str, typer.Option(help="Format of the log, if it is detected wrongly.")] = "",
-    delimiter: Annotated[str, typer.Option(help="Column delimiter: character, tab or space.")] = "",
-    decimal: Annotated[str, typer.Option(help="Decimal mark of a table: a comma or a point.")] = "",
-    skip: Annotated[int, typer.Option(min=0, help="Lines of a table to skip.")] = 0,
-    lines: Annotated[
-        int, typer.Option(min=1, max=1000, help="Lines of text per row of a table.")
-    ] = 1,
-    plot: Annotated[
-        Path | None, typer.Option(help="Picture of what came in: .png, .svg or .pdf.")
-    ] = None,
+    topic: Annotated[str, option("Topic to read from a bag.")] = "",
+    rate: Annotated[float, option("Samples per second, if the log has no times.", min=0)] = 0,
+    bus: Annotated[str, option("Bus to read from a log of several, e.g. can0.")] = "",
+    form: Annotated[str, option("Format of the log, if it is detected wrongly.")] = "",
+    delimiter: Annotated[str, option("Column delimiter: character, tab or space.")] = "",
+    decimal: Annotated[str, option("Decimal mark of a table: a comma or a point.")] = "",
+    skip: Annotated[int, option("Lines of a table to skip.", min=0)] = 0,
+    lines: Annotated[int, option("Lines of text per row of a table.", min=1, max=1000)] = 1,
+    plot: Annotated[Path | None, option("Picture of what came in: .png, .svg or .pdf.")] = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Write nothing if anything is odd; exit code 2.")
+        bool, option("Write nothing if anything is odd; exit code 2.", "--strict")
     ] = False,
     force: Force = False,
     json: Json = None,

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from tactile_rt.cli.app import app, check_folder, check_text
-from tactile_rt.cli.options import Force, Json, Seed
+from tactile_rt.cli.options import Force, Json, Seed, argument, option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError, RecordingError
 
@@ -16,28 +16,24 @@ from tactile_rt.core.errors import ConfigError, RecordingError
 def label(
     files: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="RECORDING... OUT",
-            help="Recordings (.mcap), then the folder of the sweep set.",
+        argument(
+            "Recordings (.mcap), then the folder of the sweep set.", metavar="RECORDING... OUT"
         ),
     ],
     labels: Annotated[
-        Path | None,
-        typer.Option(help="CSV file of labels. Default: labels.csv beside them."),
+        Path | None, option("CSV file of labels. Default: labels.csv beside them.")
     ] = None,
     by_name: Annotated[
-        bool, typer.Option("--by-name", help="Take labels from file names: mug-3.mcap is of a mug.")
+        bool, option("Take labels from file names: mug-3.mcap is of a mug.", "--by-name")
     ] = False,
     unlabelled: Annotated[
-        bool,
-        typer.Option("--unlabelled", help="All touches, to pretrain with --recipe simclr."),
+        bool, option("All touches, to pretrain with --recipe simclr.", "--unlabelled")
     ] = False,
     like: Annotated[
-        Path | None,
-        typer.Option(help="Sweep set or model whose sensor and sample period to use."),
+        Path | None, option("Sweep set or model whose sensor and sample period to use.")
     ] = None,
     shares: Annotated[
-        str, typer.Option(help="Shares of the objects in train,validation,test.")
+        str, option("Shares of the objects in train,validation,test.")
     ] = "0.7,0.15,0.15",
     seed: Seed = 0,
     force: Force = False,

@@ -9,13 +9,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import add_group, app, needing
-from tactile_rt.cli.options import STDOUT, Json, Quick
+from tactile_rt.cli.options import STDOUT, Json, Quick, argument, option
 from tactile_rt.cli.tables import print_table, progress_bar, show_records, told_as_json
 from tactile_rt.core.errors import ModelError, name_some
 
 model = add_group("model", "Inspect, verify and time a model file.")
 
-File = Annotated[Path, typer.Argument(help="Model file, .onnx.")]
+File = Annotated[Path, argument("Model file, .onnx.")]
 MANY = 8  # classes named before "..."
 
 
@@ -121,7 +121,7 @@ def verify(file: File, json: Json = None) -> None:
 @model.command(epilog="tactile-rt model bench model.onnx --steps 500")
 def bench(
     file: File,
-    steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
+    steps: Annotated[int, option("Steps to time.", min=10, max=1_000_000)] = 2000,
     json: Json = None,
 ) -> None:
     """Measure a model's size, loading, memory and time per step."""
@@ -164,12 +164,10 @@ def _pairs(values: dict[str, Any]) -> str:
 @app.command("eval", epilog="tactile-rt eval model.onnx sweeps --pictures pictures")
 def evaluate(
     model: File,
-    data: Annotated[Path, typer.Argument(help="A sweep set.")],
-    svm: Annotated[
-        bool, typer.Option("--svm", help="Also fit an RBF SVM on the same windows.")
-    ] = False,
+    data: Annotated[Path, argument("A sweep set.")],
+    svm: Annotated[bool, option("Also fit an RBF SVM on the same windows.", "--svm")] = False,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for pictures of confusion and accuracy over time.")
+        Path | None, option("Folder for pictures of confusion and accuracy over time.")
     ] = None,
     quick: Quick = False,
     json: Json = None,

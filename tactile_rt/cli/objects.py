@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from tactile_rt.cli.app import add_group, check_output, needing
-from tactile_rt.cli.options import Json
+from tactile_rt.cli.options import Json, argument, option
 from tactile_rt.cli.tables import progress_bar, show_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -15,15 +15,11 @@ objects = add_group("objects", "Download objects to simulate, and check meshes o
 
 @objects.command(epilog="tactile-rt objects get real objects")
 def get(
-    wanted: Annotated[
-        str, typer.Argument(metavar="LIST", help="The list: real, real2, or a CSV file.")
-    ],
-    folder: Annotated[Path, typer.Argument(help="Folder to write: FOLDER/CATEGORY/NAME.ply.")],
+    wanted: Annotated[str, argument("The list: real, real2, or a CSV file.", metavar="LIST")],
+    folder: Annotated[Path, argument("Folder to write: FOLDER/CATEGORY/NAME.ply.")],
     clones: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder of cloned repositories and unpacked packages to use instead of GitHub."
-        ),
+        option("Folder of cloned repositories and unpacked packages to use instead of GitHub."),
     ] = None,
     json: Json = None,
 ) -> None:
@@ -54,9 +50,9 @@ def get(
 
 @objects.command(epilog="tactile-rt objects check objects")
 def check(
-    folder: Annotated[Path, typer.Argument(help="Folder: CATEGORY/OBJECT.stl, or ShapeNetCore.")],
+    folder: Annotated[Path, argument("Folder: CATEGORY/OBJECT.stl, or ShapeNetCore.")],
     plot: Annotated[
-        Path | None, typer.Option(help="Picture (.png) to write of all objects, to see them.")
+        Path | None, option("Picture (.png) to write of all objects, to see them.")
     ] = None,
     json: Json = None,
 ) -> None:

@@ -23,39 +23,30 @@ def _check_json(file: Path | None) -> Path | None:
     return file
 
 
+def option(help: str, *names: str, **more: Any) -> Any:
+    """Return an option of a command, of its parameter's name if no others are given."""
+    return typer.Option(*names, help=help, **more)
+
+
+def argument(help: str, **more: Any) -> Any:
+    """Return an argument of a command."""
+    return typer.Argument(help=help, **more)
+
+
 def set_option(help: str) -> Any:
     """Return the option ``--set KEY=VALUE`` of a command, which may be given again."""
-    return typer.Option("--set", metavar="KEY=VALUE", help=f"{help}; may be repeated.")
+    return option(f"{help}; may be repeated.", "--set", metavar="KEY=VALUE")
 
 
-Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
-Models = Annotated[
-    list[Path], typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz).")
-]
+Url = Annotated[str, argument("URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 Json = Annotated[
-    Path | None,
-    typer.Option(help="Also write results as JSON; `-` prints JSON only.", callback=_check_json),
+    Path | None, option("Also write results as JSON; `-` prints JSON only.", callback=_check_json)
 ]
-Model = Annotated[Path | None, typer.Option(help="Model file, .onnx. Default: the shipped model.")]
-Seconds = Annotated[
-    float | None, typer.Option(min=0.001, max=1e9, help="Stop after this many seconds.")
-]
-Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of the random numbers.")]
-Fast = Annotated[bool, typer.Option("--fast", help="Run as fast as possible, not in real time.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace the output if it exists.")]
-Quick = Annotated[bool, typer.Option("--quick", help="Measure less, for a first look.")]
-Faults = Annotated[Path | None, typer.Option(help="TOML file of the faults to inject.")]
-ProjectFolder = Annotated[
-    Path | None, typer.Option(help="Folder of `tactile-rt new`: its array, device and model.")
-]
-Array = Annotated[str, typer.Option(help="Array: mouse, rat, rat-left, ..., or a file.")]
-Accelerator = Annotated[str, typer.Option(help="Processor to train on: auto, cpu, cuda, ...")]
-Page = Annotated[Path | None, typer.Option("--out", help="Also write an HTML page here.")]
-Stimuli = Annotated[
-    Path | None,
-    typer.Option(help="File of `tactile-rt whisk`. Default: the shipped file of the mouse array."),
-]
-Sessions = Annotated[
-    list[str] | None,
-    typer.Option("--session", help="Only sessions with this in their name; wildcards * and ?."),
-]
+Model = Annotated[Path | None, option("Model file, .onnx. Default: the shipped model.")]
+Seconds = Annotated[float | None, option("Stop after this many seconds.", min=0.001, max=1e9)]
+Seed = Annotated[int, option("Seed of the random numbers.", min=0, max=LARGEST_SEED)]
+Fast = Annotated[bool, option("Run as fast as possible, not in real time.", "--fast")]
+Force = Annotated[bool, option("Replace the output if it exists.", "--force")]
+Quick = Annotated[bool, option("Measure less, for a first look.", "--quick")]
+Array = Annotated[str, option("Array: mouse, rat, rat-left, ..., or a file.")]
+Accelerator = Annotated[str, option("Processor to train on: auto, cpu, cuda, ...")]

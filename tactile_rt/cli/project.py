@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactile_rt.cli.app import app, needing
-from tactile_rt.cli.options import Json
+from tactile_rt.cli.options import Json, argument, option
 from tactile_rt.cli.tables import progress_bar, show_table, told_as_json
 
 if TYPE_CHECKING:
@@ -18,13 +18,11 @@ ABOUT = ("top-1", "top-1 at rated noise", "RBF SVM top-1", "points above the SVM
 
 @app.command(epilog="tactile-rt new my-robot --array mouse --classes mug,bottle")
 def new(
-    folder: Annotated[Path, typer.Argument(help="New folder of the project.")],
+    folder: Annotated[Path, argument("New folder of the project.")],
     array: Annotated[
-        str, typer.Option(help="TOML file, or a name of `array list`. Default: an example.")
+        str, option("TOML file, or a name of `array list`. Default: an example.")
     ] = "",
-    classes: Annotated[
-        str, typer.Option(help="Object categories to tell apart, comma-separated.")
-    ] = "",
+    classes: Annotated[str, option("Object categories to tell apart, comma-separated.")] = "",
 ) -> None:
     """Begin a project: a model for your own array, by simulation."""
     with needing("sim"):
@@ -37,13 +35,12 @@ def new(
 
 @app.command(epilog="tactile-rt make my-robot --minutes 60")
 def make(
-    folder: Annotated[Path, typer.Argument(help="Folder of `tactile-rt new`.")],
+    folder: Annotated[Path, argument("Folder of `tactile-rt new`.")],
     minutes: Annotated[
-        float, typer.Option(help="Time for all steps; less time makes a smaller model.")
+        float, option("Time for all steps; less time makes a smaller model.")
     ] = 60.0,
     preview: Annotated[
-        bool,
-        typer.Option("--preview", help="Only try a minute of sweeps, and draw FOLDER/preview.png."),
+        bool, option("Only try a minute of sweeps, and draw FOLDER/preview.png.", "--preview")
     ] = False,
     json: Json = None,
 ) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leaving, open_url
-from tactile_rt.cli.options import Force, Json, Seconds, Url
+from tactile_rt.cli.options import Force, Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import no_such
@@ -23,11 +23,9 @@ TELL_S = 1.0
 @app.command(epilog="tactile-rt record replay:demo touches.mcap --seconds 5")
 def record(
     source: Url,
-    output: Annotated[Path, typer.Argument(help="The recording to write, .mcap.")],
+    output: Annotated[Path, argument("The recording to write, .mcap.")],
     seconds: Seconds = None,
-    note: Annotated[
-        list[str] | None, typer.Option(help="Note to store: NAME=VALUE; may be repeated.")
-    ] = None,
+    note: Annotated[list[str] | None, option("Note to store: NAME=VALUE; may be repeated.")] = None,
     force: Force = False,
     json: Json = None,
 ) -> None:
@@ -105,9 +103,9 @@ def _notes(given: list[str]) -> dict[str, str]:
 
 @app.command(epilog="tactile-rt recover touches.mcap")
 def recover(
-    recording: Annotated[Path, typer.Argument(help="Recording that was cut short or is damaged.")],
+    recording: Annotated[Path, argument("Recording that was cut short or is damaged.")],
     out: Annotated[
-        Path | None, typer.Option(help="File to write. Default: NAME.recovered.mcap beside it.")
+        Path | None, option("File to write. Default: NAME.recovered.mcap beside it.")
     ] = None,
     force: Force = False,
     json: Json = None,
@@ -137,20 +135,18 @@ def recover(
 def convert(
     files: Annotated[
         list[Path],
-        typer.Argument(
+        argument(
+            "Recordings (.mcap), then a .npz, .csv or .h5 file or a folder.",
             metavar="RECORDING... OUTPUT",
-            help="Recordings (.mcap), then a .npz, .csv or .h5 file or a folder.",
         ),
     ],
-    to: Annotated[str, typer.Option(help="Write a folder of this kind: ros2 or lerobot.")] = "",
-    fps: Annotated[int, typer.Option(min=1, max=1000, help="With lerobot: rows per second.")] = 30,
-    task: Annotated[
-        str, typer.Option(help="With lerobot: the task. Default: the note `task`.")
-    ] = "",
+    to: Annotated[str, option("Write a folder of this kind: ros2 or lerobot.")] = "",
+    fps: Annotated[int, option("With lerobot: rows per second.", min=1, max=1000)] = 30,
+    task: Annotated[str, option("With lerobot: the task. Default: the note `task`.")] = "",
     video: Annotated[
         list[str] | None,
-        typer.Option(
-            help="With lerobot: a camera's film, NAME=FILE or NAME=FILE@SECONDS (its start after "
+        option(
+            "With lerobot: a camera's film, NAME=FILE or NAME=FILE@SECONDS (its start after "
             "the first sample); may be repeated."
         ),
     ] = None,

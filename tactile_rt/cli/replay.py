@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 import typer
 
 from tactile_rt.cli.app import app, check_new, leaving
-from tactile_rt.cli.options import Force
+from tactile_rt.cli.options import Force, argument, option
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 
 if TYPE_CHECKING:
@@ -23,22 +23,17 @@ TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # of a decision's message
 
 @app.command(epilog="tactile-rt replay touches.mcap --model model.onnx")
 def replay(
-    files: Annotated[
-        list[Path], typer.Argument(help="A recording, or the rotated files of one source.")
-    ],
+    files: Annotated[list[Path], argument("A recording, or the rotated files of one source.")],
     model: Annotated[
-        Path | None, typer.Option(help="Model file, .onnx. Default: the one that decided live.")
+        Path | None, option("Model file, .onnx. Default: the one that decided live.")
     ] = None,
-    name: Annotated[str, typer.Option(help="Name of the model, if several decided live.")] = "",
-    speed: Annotated[str, typer.Option(help="Speed relative to the recorded one, or max.")] = "max",
+    name: Annotated[str, option("Name of the model, if several decided live.")] = "",
+    speed: Annotated[str, option("Speed relative to the recorded one, or max.")] = "max",
     codec: Annotated[
-        str,
-        typer.Option(help="Decode the raw packets: recorded (as live), NAME or NAME?OPTION=VALUE."),
+        str, option("Decode the raw packets: recorded (as live), NAME or NAME?OPTION=VALUE.")
     ] = "",
-    check: Annotated[
-        bool, typer.Option("--check", help="Compare with the recorded decisions.")
-    ] = False,
-    out: Annotated[Path | None, typer.Option(help="File of decisions. Default: stdout.")] = None,
+    check: Annotated[bool, option("Compare with the recorded decisions.", "--check")] = False,
+    out: Annotated[Path | None, option("File of decisions. Default: stdout.")] = None,
     force: Force = False,
 ) -> None:
     """Run a model on a recording, as it ran or would have run live.

@@ -10,7 +10,7 @@ from urllib.parse import quote, urlencode
 import typer
 
 from tactile_rt.cli.app import app, leaving, starting
-from tactile_rt.cli.options import STDOUT, Json
+from tactile_rt.cli.options import STDOUT, Json, argument, option
 from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -31,23 +31,15 @@ FORMS = {
 
 @app.command(epilog="tactile-rt sniff /dev/ttyUSB0 --ask")
 def sniff(
-    target: Annotated[
-        str,
-        typer.Argument(help="A port, can:INTERFACE:CHANNEL, a log, a table or a bag."),
-    ],
+    target: Annotated[str, argument("A port, can:INTERFACE:CHANNEL, a log, a table or a bag.")],
     seconds: Annotated[
-        float, typer.Option(min=0.05, max=60, help="How long to listen at each baud rate, s.")
+        float, option("How long to listen at each baud rate, s.", min=0.05, max=60)
     ] = 0.5,
-    baud: Annotated[
-        list[int] | None, typer.Option(help="Baud rate to try; may be repeated.")
-    ] = None,
+    baud: Annotated[list[int] | None, option("Baud rate to try; may be repeated.")] = None,
     further: Annotated[
-        list[str] | None,
-        typer.Option("--try", help="Also try codec=NAME&OPTION=VALUE; may be repeated."),
+        list[str] | None, option("Also try codec=NAME&OPTION=VALUE; may be repeated.", "--try")
     ] = None,
-    ask: Annotated[
-        bool, typer.Option("--ask", help="Also send the start command of each codec.")
-    ] = False,
+    ask: Annotated[bool, option("Also send the start command of each codec.", "--ask")] = False,
     json: Json = None,
 ) -> None:
     """Find the protocol of a device, a log, a table or a bag.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactile_rt.cli.app import app, needing
-from tactile_rt.cli.options import Json, set_option
+from tactile_rt.cli.options import Json, argument, option, set_option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 
@@ -16,37 +16,31 @@ if TYPE_CHECKING:
 
 @app.command(epilog="tactile-rt sweep sweeps --set objects.per_category=10")
 def sweep(
-    folder: Annotated[Path, typer.Argument(help="Folder of the set; an unfinished one continues.")],
+    folder: Annotated[Path, argument("Folder of the set; an unfinished one continues.")],
     recipe: Annotated[
         str | None,
-        typer.Option(
-            help="Recipe: wide24, default24, mouse12, paper-lowvar-highfi, "
+        option(
+            "Recipe: wide24, default24, mouse12, paper-lowvar-highfi, "
             "paper-highvar-lowfi, or a TOML file. Default: the folder's own, else wide24."
         ),
     ] = None,
-    profile: Annotated[
-        str | None, typer.Option(help="Accuracy: realtime, dataset (finer), accurate.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the sweep parameters.")] = None,
+    profile: Annotated[str | None, option("Accuracy: realtime, dataset (finer), accurate.")] = None,
+    seed: Annotated[int | None, option("Seed of the sweep parameters.")] = None,
     sets: Annotated[
         list[str] | None,
         set_option("Any key of the recipe: objects.per_category=10, sweeps.draws=2, contacts=true"),
     ] = None,
     split: Annotated[
-        str | None, typer.Option(help="Only these splits, comma-separated: test,withheld.")
+        str | None, option("Only these splits, comma-separated: test,withheld.")
     ] = None,
-    processes: Annotated[int, typer.Option(min=0, help="Processes to run; 0: one per core.")] = 0,
+    processes: Annotated[int, option("Processes to run; 0: one per core.", min=0)] = 0,
     ray: Annotated[
-        str | None,
-        typer.Option(help="Ray cluster: HOST:PORT, local, or auto (a running one, else local)."),
+        str | None, option("Ray cluster: HOST:PORT, local, or auto (a running one, else local).")
     ] = None,
     card: Annotated[
-        bool,
-        typer.Option("--card", help="Also describe the set in a README.md with pictures."),
+        bool, option("Also describe the set in a README.md with pictures.", "--card")
     ] = False,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Only check the set's checksums.")
-    ] = False,
+    verify: Annotated[bool, option("Only check the set's checksums.", "--verify")] = False,
     json: Json = None,
 ) -> None:
     """Simulate sweeps of objects past an array as a training set."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactile_rt.cli.app import app, check_folder, check_text, leaving, open_url
-from tactile_rt.cli.options import Json, Seconds, Url
+from tactile_rt.cli.options import Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
 
@@ -42,24 +42,15 @@ HASTY = "that came too soon after the last touch to be one: wait a second"
 @app.command(epilog="tactile-rt teach 'serial:///dev/ttyUSB0?codec=bota' lesson --classes tap,rub")
 def teach(
     source: Url,
-    folder: Annotated[
-        Path, typer.Argument(help="Folder of the lesson; an existing one continues.")
-    ],
+    folder: Annotated[Path, argument("Folder of the lesson; an existing one continues.")],
     classes: Annotated[
-        str,
-        typer.Option(help="Classes or objects to touch, comma-separated; more can come later."),
+        str, option("Classes or objects to touch, comma-separated; more can come later.")
     ] = "",
     touches: Annotated[
-        int | None,
-        typer.Option(min=2, max=1000, help="Touches of each; default 10, of objects 5."),
+        int | None, option("Touches of each; default 10, of objects 5.", min=2, max=1000)
     ] = None,
-    page: Annotated[
-        str, typer.Option(help="Serve buttons for a browser, e.g. at 127.0.0.1:8791.")
-    ] = "",
-    model: Annotated[
-        str,
-        typer.Option(help="Network to enrol objects on: an .onnx file, or `shipped`."),
-    ] = "",
+    page: Annotated[str, option("Serve buttons for a browser, e.g. at 127.0.0.1:8791.")] = "",
+    model: Annotated[str, option("Network to enrol objects on: an .onnx file, or `shipped`.")] = "",
     seconds: Seconds = None,
     json: Json = None,
 ) -> None:

@@ -7,14 +7,13 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Annotated
 from urllib.parse import urlsplit
 
-import typer
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from tactile_rt.cli.app import app
-from tactile_rt.cli.options import Json
+from tactile_rt.cli.options import Json, argument, option
 from tactile_rt.cli.tables import fitting, print_table, told_as_json
 from tactile_rt.core.errors import ConfigError, SourceError
 
@@ -33,9 +32,9 @@ COLOURS = {
 @app.command(epilog="tactile-rt top --once")
 def top(
     where: Annotated[
-        str, typer.Argument(help="URL of the daemon's metrics, or - for its JSON lines on stdin.")
+        str, argument("URL of the daemon's metrics, or - for its JSON lines on stdin.")
     ] = "http://127.0.0.1:9464",
-    once: Annotated[bool, typer.Option("--once", help="Print once and stop.")] = False,
+    once: Annotated[bool, option("Print once and stop.", "--once")] = False,
     json: Json = None,
 ) -> None:
     """Show sources, models, losses and latencies of a daemon.

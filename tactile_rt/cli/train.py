@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_folder, check_output, needing
-from tactile_rt.cli.options import Accelerator, Json, Seed, set_option
+from tactile_rt.cli.options import Accelerator, Json, Seed, argument, option, set_option
 from tactile_rt.cli.tables import progress_bar, show_table, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import alone_in
@@ -22,32 +22,28 @@ WAITING = 0.1  # share of an epoch: less says nothing that one could do somethin
 
 @app.command(epilog="tactile-rt train sweeps run --epochs 5 --set width=0.25")
 def train(
-    data: Annotated[Path, typer.Argument(help="A sweep set.")],
-    folder: Annotated[Path, typer.Argument(help="Run folder; an interrupted run continues.")],
+    data: Annotated[Path, argument("A sweep set.")],
+    folder: Annotated[Path, argument("Run folder; an interrupted run continues.")],
     also: Annotated[
-        list[Path] | None, typer.Option(help="Another set to learn from; may be repeated.")
+        list[Path] | None, option("Another set to learn from; may be repeated.")
     ] = None,
     begin: Annotated[
-        Path | None,
-        typer.Option("--from", help="Checkpoint to start from; classes may differ."),
+        Path | None, option("Checkpoint to start from; classes may differ.", "--from")
     ] = None,
     recipe: Annotated[
-        str, typer.Option(help="Name (see `recipes`) or TOML file; options override it.")
+        str, option("Name (see `recipes`) or TOML file; options override it.")
     ] = "default",
     encoder: Annotated[
-        str | None,
-        typer.Option(help="zhuang-CELL, resnet18, s4, ..., or a TOML file of a graph."),
+        str | None, option("zhuang-CELL, resnet18, s4, ..., or a TOML file of a graph.")
     ] = None,
-    epochs: Annotated[
-        int | None, typer.Option(min=1, help="Passes over the training split.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of weights, windows and noise.")] = None,
+    epochs: Annotated[int | None, option("Passes over the training split.", min=1)] = None,
+    seed: Annotated[int | None, option("Seed of weights, windows and noise.")] = None,
     sets: Annotated[
         list[str] | None,
         set_option("Any key of the recipe: width=0.25, attender=none, decoder=linear, batch=8"),
     ] = None,
     accelerator: Accelerator = "auto",
-    threads: Annotated[int, typer.Option(min=1, max=1024, help="Number of CPU threads.")] = 1,
+    threads: Annotated[int, option("Number of CPU threads.", min=1, max=1024)] = 1,
     json: Json = None,
 ) -> None:
     """Train an encoder-attender-decoder network on a sweep set."""
@@ -136,12 +132,10 @@ def recipes(json: Json = None) -> None:
 
 @app.command(epilog="tactile-rt probe run/best.pt probed --data sweeps")
 def probe(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of a run, best.pt.")],
-    folder: Annotated[Path, typer.Argument(help="Folder of the probed network.")],
-    data: Annotated[
-        Path | None, typer.Option(help="Sweep set. Default: the one it was trained on.")
-    ] = None,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
+    checkpoint: Annotated[Path, argument("Checkpoint of a run, best.pt.")],
+    folder: Annotated[Path, argument("Folder of the probed network.")],
+    data: Annotated[Path | None, option("Sweep set. Default: the one it was trained on.")] = None,
+    epochs: Annotated[int, option("Passes over the features.", min=1)] = 100,
     seed: Seed = 0,
     sets: Annotated[
         list[str] | None,
@@ -173,22 +167,19 @@ def probe(
 
 @app.command(epilog="tactile-rt export run/best.pt model.onnx")
 def export(
-    checkpoint: Annotated[Path, typer.Argument(help="Checkpoint of a run, best.pt.")],
-    model: Annotated[Path, typer.Argument(help="Model file to write, .onnx.")],
-    name: Annotated[str, typer.Option(help="Name of the model. Default: the file's name.")] = "",
+    checkpoint: Annotated[Path, argument("Checkpoint of a run, best.pt.")],
+    model: Annotated[Path, argument("Model file to write, .onnx.")],
+    name: Annotated[str, option("Name of the model. Default: the file's name.")] = "",
     precision: Annotated[
-        str, typer.Option(help="fp32, fp16 or bf16 (smaller files), int8 (also faster).")
+        str, option("fp32, fp16 or bf16 (smaller files), int8 (also faster).")
     ] = "fp32",
     kind: Annotated[
-        str, typer.Option(help="step: one step of a stream; window: a whole episode at once.")
+        str, option("step: one step of a stream; window: a whole episode at once.")
     ] = "step",
     data: Annotated[
-        list[Path] | None,
-        typer.Option(help="Sweep set it was trained on, if moved; repeat for each set."),
+        list[Path] | None, option("Sweep set it was trained on, if moved; repeat for each set.")
     ] = None,
-    license: Annotated[
-        str, typer.Option(help="Licence to store in the file, e.g. Apache-2.0.")
-    ] = "",
+    license: Annotated[str, option("Licence to store in the file, e.g. Apache-2.0.")] = "",
     json: Json = None,
 ) -> None:
     """Export a trained network as a self-contained ONNX model."""
@@ -222,9 +213,9 @@ def export(
 
 @app.command(epilog="tactile-rt grid wide24 grid --processes 2")
 def grid(
-    plan: Annotated[str, typer.Argument(help="TOML file, or a shipped plan: wide24, wide24-full.")],
-    folder: Annotated[Path, typer.Argument(help="Output folder; finished tasks are kept.")],
-    processes: Annotated[int, typer.Option(min=1, help="Networks to train in parallel.")] = 2,
+    plan: Annotated[str, argument("TOML file, or a shipped plan: wide24, wide24-full.")],
+    folder: Annotated[Path, argument("Output folder; finished tasks are kept.")],
+    processes: Annotated[int, option("Networks to train in parallel.", min=1)] = 2,
     accelerator: Accelerator = "cpu",
     json: Json = None,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactile_rt.cli.app import app, check_output, needing
-from tactile_rt.cli.options import Array, set_option
+from tactile_rt.cli.options import Array, argument, option, set_option
 from tactile_rt.cli.tables import progress_bar, share_bar
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
@@ -25,20 +25,20 @@ WIDTH = 1280  # pixels
 
 @app.command(epilog="tactile-rt view mug-17 --out sweep.png --camera side")
 def view(
-    target: Annotated[str, typer.Argument(help="Object to sweep past: mug-17, or a mesh file.")],
-    out: Annotated[Path, typer.Option(help="Picture (.png, .jpg) or video (.mp4).")] = Path(
+    target: Annotated[str, argument("Object to sweep past: mug-17, or a mesh file.")],
+    out: Annotated[
+        Path, option("Picture (.png, .jpg) or video (.mp4).")
+    ] = Path(
         "sweep.png"
     ),
-    camera: Annotated[str, typer.Option(help="View: front, side, top or oblique.")] = "oblique",
+    camera: Annotated[str, option("View: front, side, top or oblique.")] = "oblique",
     at: Annotated[
-        float | None, typer.Option(help="Time of a picture, ms. Default: of the largest force.")
+        float | None, option("Time of a picture, ms. Default: of the largest force.")
     ] = None,
-    slow: Annotated[
-        float, typer.Option(min=1, max=40, help="Slow-motion factor of a video.")
-    ] = 10.0,
+    slow: Annotated[float, option("Slow-motion factor of a video.", min=1, max=40)] = 10.0,
     array: Array = "mouse",
     profile: Annotated[
-        str, typer.Option(help="Accuracy: realtime, dataset (finer), accurate, mujoco.")
+        str, option("Accuracy: realtime, dataset (finer), accurate, mujoco.")
     ] = "dataset",
     sets: Annotated[
         list[str] | None,

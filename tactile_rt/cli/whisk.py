@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from tactile_rt.cli.app import app, check_output, needing
-from tactile_rt.cli.options import Array, Json, set_option
+from tactile_rt.cli.options import Array, Json, argument, option, set_option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
@@ -24,23 +24,18 @@ class Spacing:
 
 @app.command(epilog="tactile-rt whisk stimuli.npz --set frequency_hz=8")
 def whisk(
-    out: Annotated[Path, typer.Argument(help="The .npz to write; a .json is written beside it.")],
+    out: Annotated[Path, argument("The .npz to write; a .json is written beside it.")],
     stimulus: Annotated[
-        str | None,
-        typer.Option(help="Stimuli: convex-close, ..., comma-separated. Default: all six."),
+        str | None, option("Stimuli: convex-close, ..., comma-separated. Default: all six.")
     ] = None,
     target: Annotated[
-        str | None,
-        typer.Option("--object", help="Object, not a stimulus: mug-3, or a mesh file."),
+        str | None, option("Object, not a stimulus: mug-3, or a mesh file.", "--object")
     ] = None,
     array: Array = "mouse",
     trajectory: Annotated[
-        Path | None,
-        typer.Option(help="CSV file of the trajectory to follow: time_s, theta_deg."),
+        Path | None, option("CSV file of the trajectory to follow: time_s, theta_deg.")
     ] = None,
-    profile: Annotated[
-        str, typer.Option(help="Accuracy: realtime, dataset (finer), accurate.")
-    ] = "dataset",
+    profile: Annotated[str, option("Accuracy: realtime, dataset (finer), accurate.")] = "dataset",
     sets: Annotated[
         list[str] | None,
         set_option(
