@@ -26,16 +26,7 @@ import numpy as np
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import pad, rates_sha256
 from tactile_rt.alignment.rdm import Floats, pearson, rdm
-from tactile_rt.alignment.reliability import (
-    BOOTSTRAPS,
-    SEED,
-    filtered_mean,
-    first_halves,
-    noise_corrected,
-    spearman_brown,
-    split_half,
-    trial_mean,
-)
+from tactile_rt.alignment import reliability
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
@@ -46,8 +37,8 @@ POOLED = "concatenated"  # the published name of all animals as one
 
 def freeze_paper_code(
     rates: Mapping[str, Floats],
-    bootstraps: int = BOOTSTRAPS,
-    seed: int = SEED,
+    bootstraps: int = reliability.BOOTSTRAPS,
+    seed: int = reliability.SEED,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Benchmark:
     """Reliabilities and RDMs of animals, and their consistency.
@@ -83,8 +74,8 @@ def freeze_paper_code(
         others = [rates[other] for other in names if other != name]
         if others:
             source = pad(others)
-            r_xx = split_half(source, first_halves(len(source), bootstraps, seed))
-            r_xy = pearson(rdm(trial_mean(source)), targets[i].chosen.rdm)
+            r_xx = _split_half(source, bootstraps, seed)
+            r_xy = pearson(rdm(reliability.trial_mean(source)), targets[i].chosen.rdm)
             held_out[i] = _score(r_xy, r_xx, halves[name])
         progress((done := done + 1) / steps)
     pairwise = np.full((len(names), len(names)), np.nan)
@@ -106,7 +97,7 @@ def _target(
     name: str, rates: Floats, bootstraps: int, seed: int, halves: dict[str, Floats]
 ) -> Target:
     """Freeze one target; its split-half correlations go into `halves`."""
-    mean = trial_mean(rates)
+    mean = reliability.trial_mean(rates)
     dissimilarities = rdm(mean)
     if not np.isfinite(dissimilarities).all():
         where = [s for s, row in zip(STIMULI, mean, strict=True) if not np.ptp(row) > 0]
@@ -114,19 +105,19 @@ def _target(
             f"animal {name}: no RDM, since the mean response to stimulus "
             f"{', '.join(str(STIMULI.index(s)) for s in where)} is missing or the same in all units"
         )
-    r_yy = halves[name] = split_half(rates, first_halves(len(rates), bootstraps, seed))
-    factor = noise_corrected(1.0, 1.0, r_yy)
+    r_yy = halves[name] = _split_half(rates, bootstraps, seed)
+    factor = reliability.noise_corrected(1.0, 1.0, r_yy)
     there = r_yy[np.isfinite(r_yy)]
-    reliability = float(spearman_brown(there.mean())) if there.size else np.nan
+    corrected = float(reliability.spearman_brown(there.mean())) if there.size else np.nan
     usable = factor[np.isfinite(factor)]
-    filtered = filtered_mean(factor, r_yy)
+    filtered = reliability.filtered_mean(factor, r_yy)
     units = rates.shape[2]
     return Target(
         name=name,
-        chosen=Frozen(dissimilarities, reliability, filtered, units),
+        chosen=Frozen(dissimilarities, corrected, filtered, units),
         unfiltered=Frozen(
             dissimilarities,
-            reliability,
+            corrected,
             float(np.median(usable)) if usable.size else np.nan,
             units,
         ),
@@ -136,5 +127,9 @@ def _target(
     )
 
 
+def _split_half(rates: Floats, bootstraps: int, seed: int) -> Floats:
+    return reliability.split_half(rates, reliability.first_halves(len(rates), bootstraps, seed))
+
+
 def _score(r_xy: Floats, r_xx: Floats, r_yy: Floats) -> float:
-    return filtered_mean(noise_corrected(r_xy, r_xx, r_yy), r_yy, r_xx)
+    return reliability.filtered_mean(reliability.noise_corrected(r_xy, r_xx, r_yy), r_yy, r_xx)

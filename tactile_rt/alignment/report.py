@@ -7,15 +7,7 @@ from html import escape
 import numpy as np
 
 from tactile_rt.alignment.html_page import format_number, join_notes, make_page, make_table
-from tactile_rt.alignment.pictures import (
-    Bar,
-    Level,
-    Point,
-    draw_bars,
-    draw_heat_maps,
-    draw_profiles,
-    draw_scatter,
-)
+from tactile_rt.alignment import pictures
 from tactile_rt.alignment.results import ModelResult, Results
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -120,11 +112,11 @@ def _show_layers(results: Results, model: ModelResult) -> str:
     for layer, fit, row in zip(model.layers, _mean_fits(model), model.corrected, strict=True):
         part, _, name = layer.partition(".")
         columns.append(
-            Bar(name or layer, fit, part, row[list(model.reliable)],
+            pictures.Bar(name or layer, fit, part, row[list(model.reliable)],
                 control.get(layer, math.nan), layer in model.chosen)
         )  # fmt: skip
-    chance = Level("chance, 95th percentile", model.null_95, "#9a5bb5", dash="--")
-    drawn = draw_bars(columns, [*_levels(results), chance], "fit (noise-corrected r)")
+    chance = pictures.Level("chance, 95th percentile", model.null_95, "#9a5bb5", dash="--")
+    drawn = pictures.draw_bars(columns, [*_levels(results), chance], "fit (noise-corrected r)")
     return (
         f"<h3>{escape(model.name)} <small>score {_with_error(model)}, "
         f"p {format_number(model.p, 4)}</small></h3>{drawn}{join_notes(model.notes)}"
@@ -135,8 +127,8 @@ def _compare(results: Results) -> str:
     columns = [_raw_bar(results)]
     for model in results.models:
         mark = model.untrained.score if model.untrained else math.nan
-        columns.append(Bar(model.name, model.score, "decoder", model.per_target, mark))
-    out = ["<h2>Models side by side</h2>", draw_bars(columns, _levels(results), "score")]
+        columns.append(pictures.Bar(model.name, model.score, "decoder", model.per_target, mark))
+    out = ["<h2>Models side by side</h2>", pictures.draw_bars(columns, _levels(results), "score")]
     known = [m for m in results.models if math.isfinite(m.performance)]
     fits = [m for m in known if math.isfinite(m.score)]
     what = ", ".join(sorted({m.performance_of for m in known if m.performance_of}))
@@ -145,21 +137,20 @@ def _compare(results: Results) -> str:
         if len(fits) > 1 and (not by or _differ(fits, by)):
             points = [_point(m, m.performance, by) for m in fits]
             out.append(f"<h3>Neural fit against task performance{word}</h3>")
-            out.append(draw_scatter(points, title, SCORE))
+            out.append(pictures.draw_scatter(points, title, SCORE))
     sized = [m for m in results.models if m.parameters > 0 and math.isfinite(m.score)]
     if len(sized) > 1:
         by = "encoder" if _differ(sized, "encoder") else ""
         out.append(f"<h3>Neural fit against size{', by encoder' * bool(by)}</h3>")
         points = [_point(m, m.parameters, by) for m in sized]
-        out.append(draw_scatter(points, SIZE, SCORE, log=True))
+        out.append(pictures.draw_scatter(points, SIZE, SCORE, log=True))
     both = [m for m in known if m.parameters > 0]
     if len(both) > 1:
         by = "objective" if _differ(both, "objective") else ""
         out.append(f"<h3>Task performance against size{', by loss' * bool(by)}</h3>")
-        points = [
-            Point(m.name, m.parameters, m.performance, group=m.groups.get(by, "")) for m in both
-        ]
-        out.append(draw_scatter(points, SIZE, PERFORMANCE, log=True))
+        named = [(m.name, m.parameters, m.performance, m.groups.get(by, "")) for m in both]
+        points = [pictures.Point(name, x, y, group=group) for name, x, y, group in named]
+        out.append(pictures.draw_scatter(points, SIZE, PERFORMANCE, log=True))
     return "".join([*out, _compare_masking(results)])
 
 
@@ -167,9 +158,9 @@ def _differ(models: Sequence[ModelResult], by: str) -> bool:
     return len({m.groups.get(by) for m in models}) > 1
 
 
-def _point(model: ModelResult, x: float, by: str) -> Point:
+def _point(model: ModelResult, x: float, by: str) -> pictures.Point:
     error = model.sem if math.isfinite(model.sem) else 0.0
-    return Point(model.name, x, model.score, error, model.groups.get(by, ""))
+    return pictures.Point(model.name, x, model.score, error, model.groups.get(by, ""))
 
 
 def _compare_masking(results: Results) -> str:
@@ -220,13 +211,13 @@ def _show_rdms(results: Results) -> str:
         "<p>1 - correlation over units of the responses to two stimuli. Each map has its own "
         "scale, for fits do not depend on it: the darker, the more dissimilar. Shown are the mean "
         "of the reliable animals, the input, and the layer of each model that is chosen most "
-        f"often.</p>{draw_heat_maps(lines, STIMULI)}"
+        f"often.</p>{pictures.draw_heat_maps(lines, STIMULI)}"
         "<h3>The same as lines</h3><p>Each line moved and scaled, for a fit depends on neither: "
-        f"lines that rise and fall together fit.</p>{draw_profiles(lines, STIMULI)}"
+        f"lines that rise and fall together fit.</p>{pictures.draw_profiles(lines, STIMULI)}"
         f"<details><summary>every animal ({len(animals)})</summary>"
-        f"{draw_heat_maps(animals, STIMULI)}</details>"
+        f"{pictures.draw_heat_maps(animals, STIMULI)}</details>"
         f"<details><summary>every other layer ({len(rest)})</summary>"
-        f"{draw_heat_maps(rest, STIMULI) if rest else ''}</details>"
+        f"{pictures.draw_heat_maps(rest, STIMULI) if rest else ''}</details>"
     )
 
 
@@ -250,18 +241,19 @@ def _show_animals(results: Results) -> str:
     return make_table([*head, *names], rows) + join_notes(benchmark.notes)
 
 
-def _levels(results: Results) -> list[Level]:
+def _levels(results: Results) -> list[pictures.Level]:
     a2a = results.benchmark.a2a
     half = a2a.sem if math.isfinite(a2a.sem) else 0.0
     return [
-        Level("all that noise permits", 1.0, "black", dash=":"),
-        Level("animal to animal ± s.e.m.", a2a.mean, "#b98a1a", half),
+        pictures.Level("all that noise permits", 1.0, "black", dash=":"),
+        pictures.Level("animal to animal ± s.e.m.", a2a.mean, "#b98a1a", half),
     ]
 
 
-def _raw_bar(results: Results) -> Bar:
+def _raw_bar(results: Results) -> pictures.Bar:
     raw = results.raw
-    return Bar("raw input", _mean_fits(raw)[0], "raw", raw.corrected[0][list(raw.reliable)])
+    fits = raw.corrected[0][list(raw.reliable)]
+    return pictures.Bar("raw input", _mean_fits(raw)[0], "raw", fits)
 
 
 def _mean_fits(made: Score) -> list[float]:

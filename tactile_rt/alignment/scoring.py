@@ -9,13 +9,7 @@ from numpy.typing import ArrayLike
 from tactile_rt.alignment.benchmark import Benchmark
 from tactile_rt.alignment.json_file import Number
 from tactile_rt.alignment.rdm import PAIRS, Floats, pearson, rdm
-from tactile_rt.alignment.statistics import (
-    held_out,
-    highest,
-    max_statistic,
-    mean_held_out,
-    standard_error,
-)
+from tactile_rt.alignment import statistics
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
@@ -95,16 +89,15 @@ def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> S
     values = corrected[np.ix_(finite, reliable)]
     chosen = np.full(len(targets), -1, dtype=np.intp)
     if strict:
-        _, best = held_out(values)
+        _, best = statistics.held_out(values)
         chosen[reliable] = np.where(best >= 0, finite[best] if finite.size else -1, -1)
     elif values.size:
         chosen[:] = finite[np.unravel_index(np.argmax(values), values.shape)[0]]
     there = (chosen >= 0) & reliable
     per_target = np.full(len(targets), np.nan)
     per_target[there] = corrected[chosen[there], np.flatnonzero(there)]
-    test = max_statistic(
-        rdms, goal[reliable], factor[reliable], mean_held_out if strict else highest
-    )
+    measure = statistics.mean_held_out if strict else statistics.highest
+    test = statistics.max_statistic(rdms, goal[reliable], factor[reliable], measure)
     return Score(
         protocol=benchmark.protocol,
         layers=tuple(names),
@@ -117,7 +110,7 @@ def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> S
         chosen=tuple(names[i] if i >= 0 else "" for i in chosen.tolist()),
         per_target=per_target,
         score=test.statistic,
-        sem=standard_error(per_target, ddof=int(strict)),
+        sem=statistics.standard_error(per_target, ddof=int(strict)),
         p=test.p,
         null_95=test.percentile_95,
     )

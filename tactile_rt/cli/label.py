@@ -45,12 +45,7 @@ def label(
     seconds since the recording's first sample. Touches that cannot be used are counted on stderr.
     """
     from tactile_rt.recording.labelled_set import write_set
-    from tactile_rt.recording.labelling import (
-        find_labelled,
-        intervals_beside,
-        intervals_by_name,
-        intervals_of_all,
-    )
+    from tactile_rt.recording import labelling
     from tactile_rt.recording.labels import LABELS
     from tactile_rt.sets.manifest import SPLITS
     from tactile_rt.sim_backend.datasets.inventory import write_sums
@@ -68,13 +63,13 @@ def label(
     if json is not None and json.resolve() in {one.resolve() for one in beside}:
         raise ConfigError(f"--json {json} holds the labels that are read: name another")
     if by_name:
-        intervals = intervals_by_name(recordings)
+        intervals = labelling.intervals_by_name(recordings)
     elif unlabelled:
-        intervals = intervals_of_all(recordings)
+        intervals = labelling.intervals_of_all(recordings)
     else:
-        intervals = intervals_beside(recordings, labels)
+        intervals = labelling.intervals_beside(recordings, labels)
     with progress_bar("finding touches") as update:
-        touches = find_labelled(
+        touches = labelling.find_labelled(
             recordings, intervals, like,
             lambda one, seconds: update(description=f"{one.name} {seconds:.0f} s"),
         )  # fmt: skip

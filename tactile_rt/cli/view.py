@@ -55,21 +55,15 @@ def view(
             from tactile_rt.sim_backend.sweep import Sweep, usual_distance
             from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
             from tactile_rt.sim_backend.transducer import device_spec, sensor_of
-            from tactile_rt.sim_backend.views.film import (
-                IMAGES,
-                Film,
-                check_suffix,
-                write_image,
-                write_video,
-            )
+            from tactile_rt.sim_backend.views import film
             from tactile_rt.sim_backend.views.footage import VIEWS, record
             from tactile_rt.sim_backend.world import PROFILES
     except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver
         if "MUJOCO_GL" not in os.environ:
             raise
         raise ConfigError(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; unset it") from None
-    suffix = check_suffix(out)
-    if at is not None and suffix not in IMAGES:
+    suffix = film.check_suffix(out)
+    if at is not None and suffix not in film.IMAGES:
         raise ConfigError("--at is the moment of a picture: give --out a .png or .jpg")
     if camera not in VIEWS:
         raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
@@ -87,25 +81,26 @@ def view(
     if not simulation.touches:
         none = f"{thing.name} passes without touching: --set height_mm or distance_mm"
         typer.echo(none, err=True)
-    period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (FPS * slow)))
+    period = PICTURE_MS if suffix in film.IMAGES else max(1, round(1000 / (FPS * slow)))
     with share_bar("simulating") as tell:
         footage = record(simulation, spec, period, tell, sensor)
     detail = f"{camera} view · {thing.name} moves along -y"
-    if suffix not in IMAGES:
+    if suffix not in film.IMAGES:
         detail += f" · {FPS * period / 1000:.2g} x real speed"
     title = (
         f"{thing.name[:40]}, {sweep.size_mm:g} mm large, sweeps past the {len(spec.elements)} "
         f"whiskers of {spec.name[:40]} at {sweep.speed_mm_s:g} mm/s"
     )
-    with closing(Film(footage, camera, title, detail, WIDTH)) as film:
-        if suffix in IMAGES:
-            write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
+    with closing(film.Film(footage, camera, title, detail, WIDTH)) as shown:
+        if suffix in film.IMAGES:
+            moment = footage.strongest if at is None else footage.at(at)
+            film.write_image(out, shown.picture(moment))
             return
         with progress_bar("drawing", total=len(footage)) as update:
 
             def pictures() -> Iterator["NDArray[np.uint8]"]:
-                for picture in film:
+                for picture in shown:
                     yield picture
                     update(advance=1)
 
-            write_video(out, pictures(), FPS)
+            film.write_video(out, pictures(), FPS)

@@ -11,17 +11,7 @@ from tactile_rt.core.errors import ConfigError, RecordingError, explain_errors
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
-from tactile_rt.recording.layout import (
-    DECISIONS,
-    EVENTS,
-    HEALTH,
-    SAMPLES,
-    WIRE,
-    Packet,
-    Raw,
-    decode_packet,
-    decode_samples,
-)
+from tactile_rt.recording import layout
 from tactile_rt.recording.records import MAGIC, read_records
 from tactile_rt.recording.ros2_form import is_in_file_form, name_channel, plain
 
@@ -66,27 +56,29 @@ class Recording:
 
     def chunks(self) -> Generator[Chunk, None, None]:
         """The chunks, as they were recorded."""
-        return self._decoded(SAMPLES, lambda raw: decode_samples(raw.data, self.spec.shape))
+        shape = self.spec.shape
+        return self._decoded(layout.SAMPLES, lambda raw: layout.decode_samples(raw.data, shape))
 
-    def packets(self) -> Iterator[tuple[Packet, int]]:
+    def packets(self) -> Iterator[tuple[layout.Packet, int]]:
         """The raw packets and their arrival, host time in ns; None where the line was opened."""
         wire = self.description.wire
-        return self._decoded(WIRE, lambda raw: (decode_packet(raw.data, wire), raw.t_ns))
+        decode = layout.decode_packet
+        return self._decoded(layout.WIRE, lambda raw: (decode(raw.data, wire), raw.t_ns))
 
     def health(self) -> Iterator[dict[str, Any]]:
         """How source and recorder were, whenever it changed.
 
         The fields are those of docs/reference/recording.md.
         """
-        return self._decoded(HEALTH, _fields)
+        return self._decoded(layout.HEALTH, _fields)
 
     def decisions(self) -> Iterator[dict[str, Any]]:
         """What the daemon's models decided, as it published it."""
-        return self._decoded(DECISIONS, _fields)
+        return self._decoded(layout.DECISIONS, _fields)
 
     def events(self) -> Iterator[dict[str, Any]]:
         """What changed in the daemon meanwhile: contacts, and states of its parts."""
-        return self._decoded(EVENTS, _fields)
+        return self._decoded(layout.EVENTS, _fields)
 
     def skips(self, model: str) -> list[dict[str, Any]]:
         """The stretches that a model skipped as it was behind.
@@ -95,7 +87,7 @@ class Recording:
         """
         return [e for e in self.events() if e.get("type") == "skip" and e.get("model") == model]
 
-    def raw(self, *topics: str) -> Generator[Raw, None, None]:
+    def raw(self, *topics: str) -> Generator[layout.Raw, None, None]:
         """The messages of these channels, undecoded; of none, the file is only checked."""
         from mcap.records import Channel, Message
 
@@ -123,17 +115,17 @@ class Recording:
                         raise ValueError(f"message {expected} of {name} is none")
                     if name in topics:
                         t_ns = record.log_time - about.utc_offset_ns
-                        yield Raw(name, t_ns, plain(name, record.data))
+                        yield layout.Raw(name, t_ns, plain(name, record.data))
                 record = next(records, None)
 
-    def _decoded(self, topic: str, decode: Callable[[Raw], T]) -> Generator[T, None, None]:
+    def _decoded(self, topic: str, decode: Callable[[layout.Raw], T]) -> Generator[T, None, None]:
         for raw in self.raw(topic):
             with _naming(self.path):
                 decoded = decode(raw)
             yield decoded
 
 
-def _fields(raw: Raw) -> dict[str, Any]:
+def _fields(raw: layout.Raw) -> dict[str, Any]:
     return msgspec.json.decode(raw.data, type=dict[str, Any])
 
 

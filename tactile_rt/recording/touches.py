@@ -21,19 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import without_bad_samples
-from tactile_rt.classifier.contact import (
-    BASELINE_SAMPLES,
-    FIRST_GUARD_SAMPLES,
-    MIN_BASELINE_SAMPLES,
-    ContactDetector,
-)
+from tactile_rt.classifier import contact
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.stream import ArraySpec, Chunk, Timing
 
 __all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]
 
-REST = 2 * BASELINE_SAMPLES  # samples before the onset: a whole baseline, measured on a whole one
-SURE = FIRST_GUARD_SAMPLES  # samples by which an onset may be found elsewhere than in the stream
+REST = 2 * contact.BASELINE_SAMPLES  # before the onset: a whole baseline, measured on a whole one
+SURE = contact.FIRST_GUARD_SAMPLES  # by which an onset may be found elsewhere than in the stream
 # why a touch is none to learn from
 ENDS = "before whose window ends the recording ends"
 GAP = "with lost or invalid samples in their window"
@@ -71,7 +66,7 @@ def find_touches(
 
 class _Cutter:
     def __init__(self, spec: ArraySpec, period_ns: int, floor: NDArray[np.float32]) -> None:
-        self._detector = ContactDetector(spec.shape, floor)
+        self._detector = contact.ContactDetector(spec.shape, floor)
         self._samples = Timing.of(period_ns).samples
         self._rest: deque[tuple[NDArray[np.float32], NDArray[np.bool_]]] = deque(maxlen=REST)
         self._touch: _Growing | None = None
@@ -129,7 +124,7 @@ class _Growing:
         window, valid = np.stack(self.values), np.stack(self.valid)
         there = valid.any(axis=0) & self.has_baseline  # elements that measure anything
         quiet = [values for values, trusted in self.rest if trusted[there].all()]
-        gap = not valid[:, there].all() or len(quiet) - self.doubted < MIN_BASELINE_SAMPLES
+        gap = not valid[:, there].all() or len(quiet) - self.doubted < contact.MIN_BASELINE_SAMPLES
         if gap or not there.any():
             return RecordedTouch(self.onset_ns, end_ns, window[:0], GAP)
         # Where there was less rest, what the baseline rests on is there again and again.
@@ -141,7 +136,7 @@ class _Growing:
 
     def _found_in(self, whole: NDArray[np.float32]) -> bool:
         """Whether the onset is found in the touch alone, too."""
-        detector = ContactDetector(self.offset.shape, self.floor)
+        detector = contact.ContactDetector(self.offset.shape, self.floor)
         trusted = np.ones(len(self.has_baseline), np.bool_)
         onsets = (k for k, sample in enumerate(whole) if detector.update(sample, trusted))
         return abs(next(onsets, -1) - REST) <= SURE

@@ -28,19 +28,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.recording import Recording, recover
-from tactile_rt.recording.labels import (
-    LABELS,
-    LabelledInterval,
-    append_label,
-    check_appendable,
-    check_name,
-    drop_torn_label,
-    lines_of,
-    read_labels,
-    relabel,
-    relabel_line,
-    remove_label,
-)
+from tactile_rt.recording import labels
 from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
 from tactile_rt.teaching.model import TOUCH, Enrolment, FewShot, write_features
@@ -151,16 +139,16 @@ class Lesson:
         return lesson
 
     def _read_touches(self, model: Path) -> None:
-        labels = self.folder / LABELS
-        if not labels.exists():
+        file = self.folder / labels.LABELS
+        if not file.exists():
             return
-        self.lost += drop_torn_label(labels)
-        if not labels.stat().st_size:
+        self.lost += labels.drop_torn_label(file)
+        if not file.stat().st_size:
             return  # its first line was torn
         recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
-        lines = lines_of(labels)
-        told = read_labels(labels, [_whole(one) for one in recordings])
-        check_appendable(labels)
+        lines = labels.lines_of(file)
+        told = labels.read_labels(file, [_whole(one) for one in recordings])
+        labels.check_appendable(file)
         for path, intervals in told.items():
             if not intervals:
                 continue
@@ -206,15 +194,16 @@ class Lesson:
             features: (step, feature).
             span_s: where in it, seconds since its first sample.
         """
-        interval = LabelledInterval(label=label, start_s=max(0.0, span_s[0]), end_s=span_s[1])
-        line = append_label(self.folder / LABELS, recording, interval)
+        begin_s, end_s = max(0.0, span_s[0]), span_s[1]
+        interval = labels.LabelledInterval(label=label, start_s=begin_s, end_s=end_s)
+        line = labels.append_label(self.folder / labels.LABELS, recording, interval)
         self.touches.append(TaughtTouch(label, features, recording, line))
 
     def undo(self) -> TaughtTouch | None:
         """Take the last touch back; None: there is none."""
         if not self.touches:
             return None
-        remove_label(self.folder / LABELS, self.touches[-1].line)
+        labels.remove_label(self.folder / labels.LABELS, self.touches[-1].line)
         return self.touches.pop()
 
     def rename(self, old: str, new: str) -> None:
@@ -227,9 +216,9 @@ class Lesson:
             raise ConfigError(f"there is no {old!r}: `list` tells the names")
         if new:
             check_label(new)
-        relabel(self.folder / LABELS, old, new)
+        labels.relabel(self.folder / labels.LABELS, old, new)
         self.touches = [
-            replace(one, label=new, line=relabel_line(one.line, old, new).rstrip("\n"))
+            replace(one, label=new, line=labels.relabel_line(one.line, old, new).rstrip("\n"))
             if one.label == old
             else one
             for one in self.touches
@@ -276,7 +265,7 @@ class Lesson:
             raise ConfigError(f"{self.folder}: {why}")
         told = {
             "taught": {name: names.count(name) for name in dict.fromkeys(names)},
-            "labels_sha256": hash_of(self.folder / LABELS),
+            "labels_sha256": hash_of(self.folder / labels.LABELS),
         }
         return self.taught.learn(
             self.folder / MODEL,
@@ -359,13 +348,14 @@ def _progress(
 def _check_free(folder: Path) -> None:
     if (folder / FEATURES).exists():
         raise ConfigError(f"{folder} holds a lesson already")
-    if (folder / LABELS).exists():
-        raise ConfigError(f"{folder} holds {LABELS}, but no {FEATURES}: teach in another folder")
+    if (folder / labels.LABELS).exists():
+        held = f"{labels.LABELS}, but no {FEATURES}"
+        raise ConfigError(f"{folder} holds {held}: teach in another folder")
 
 
 def check_label(name: str) -> str:
     """The label itself."""
-    if why := check_name(name):
+    if why := labels.check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
     if name in ORDERS or name.partition(" ")[0] in NAMING:
         raise ConfigError(f"label {name!r}: is an order to who teaches; name it otherwise")

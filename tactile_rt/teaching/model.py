@@ -21,13 +21,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, OpenSetRule
-from tactile_rt.classifier.enrolment import (
-    NONE_OF_THESE,
-    EnrolledObject,
-    identify,
-    margins,
-    project,
-)
+from tactile_rt.classifier import enrolment
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_logits, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
@@ -35,15 +29,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing
 from tactile_rt.teaching.features import FeatureNetwork
-from tactile_rt.teaching.head import (
-    ENOUGH,
-    LIMIT,
-    LeaveOneOut,
-    TouchClasses,
-    count_refused,
-    fit_classes,
-    leave_one_out,
-)
+from tactile_rt.teaching import head
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph, with_metadata
 
 __all__ = [
@@ -74,7 +60,7 @@ class FewShot:
     # 0: not known
     changes: float = 0.0
     each = 10  # touches of a class that are worth their time
-    few = ENOUGH  # fewer are told
+    few = head.ENOUGH  # fewer are told
     note = ""  # for the user, before the first touch
 
     @property
@@ -96,13 +82,13 @@ class FewShot:
         """(step, feature) of a touch, from what `write_features`' model said of it."""
         return np.stack([step.embedding for step in steps if step.embedding is not None])
 
-    def leave_one_out(self, features: Floats, labels: Sequence[str]) -> LeaveOneOut:
+    def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
         """Judge every touch by the others alone, at its last step."""
-        return leave_one_out(features[:, -1:], labels, self.network.kinds)
+        return head.leave_one_out(features[:, -1:], labels, self.network.kinds)
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
         """Count the touches of anything else that are refused, each judged without it."""
-        return count_refused(features[:, -1:], labels, self.network.kinds, others[:, -1:])
+        return head.count_refused(features[:, -1:], labels, self.network.kinds, others[:, -1:])
 
     def learn(
         self,
@@ -116,7 +102,7 @@ class FewShot:
     ) -> ModelCard:
         """Write the model of the classes of these touches (touch, step, feature)."""
         graph, network = OnnxGraph(), self.network
-        classes = fit_classes(features, labels, network.kinds, others=others)
+        classes = head.fit_classes(features, labels, network.kinds, others=others)
         found, after = network.build(graph)
         logits = _head(graph, found, after["count"], self.timing, classes)
         graph.output("logits", logits, ["batch", len(classes.labels) + 1])
@@ -165,24 +151,24 @@ class Enrolment:
         assert embedding is not None
         return embedding[None]
 
-    def leave_one_out(self, features: Floats, labels: Sequence[str]) -> LeaveOneOut:
+    def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
         """Judge every touch (touch, 1, unit) by the others alone."""
         rule = self.card.identity
         assert rule is not None
-        touches = project(rule, features[:, -1])
+        touches = enrolment.project(rule, features[:, -1])
         names, own = np.unique(np.asarray(labels), return_inverse=True)
         mine = own[:, None] == np.arange(len(names))  # (touch, object)
         others = mine.sum(axis=0) - mine
         total = mine.T.astype(float) @ touches - mine[..., None] * touches[:, None]
-        above = margins(rule, total / others[..., None], others, touches)
-        return LeaveOneOut(-above[:, None], (above.argmax(axis=1) == own) & (above[mine] >= 0))
+        above = enrolment.margins(rule, total / others[..., None], others, touches)
+        return head.LeaveOneOut(-above[:, None], (above.argmax(axis=1) == own) & (above[mine] >= 0))
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
         """Count the touches of anything else that are of none of the objects."""
         found = self._enrol(features, labels)
         assert self.card.identity is not None
-        names = [identify(self.card.identity, found, [other[-1]])[0] for other in others]
-        return names.count(NONE_OF_THESE)
+        names = [enrolment.identify(self.card.identity, found, [other[-1]])[0] for other in others]
+        return names.count(enrolment.NONE_OF_THESE)
 
     def learn(
         self,
@@ -205,11 +191,11 @@ class Enrolment:
         write_whole(path, lambda file: file.write(data))
         return card
 
-    def _enrol(self, features: Floats, labels: Sequence[str]) -> tuple[EnrolledObject, ...]:
-        own = np.asarray(labels)
-        return tuple(
-            EnrolledObject.of(one, features[own == one, -1]) for one in dict.fromkeys(labels)
-        )
+    def _enrol(
+        self, features: Floats, labels: Sequence[str]
+    ) -> tuple[enrolment.EnrolledObject, ...]:
+        own, enrol = np.asarray(labels), enrolment.EnrolledObject.of
+        return tuple(enrol(one, features[own == one, -1]) for one in dict.fromkeys(labels))
 
 
 def write_features(path: Path, taught: FewShot) -> ModelCard:
@@ -221,7 +207,9 @@ def write_features(path: Path, taught: FewShot) -> ModelCard:
     return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
 
 
-def _head(g: OnnxGraph, features: str, count: str, timing: Timing, classes: TouchClasses) -> str:
+def _head(
+    g: OnnxGraph, features: str, count: str, timing: Timing, classes: head.TouchClasses
+) -> str:
     """(batch, class and unknown) logits: half of each squared distance, and of the reach."""
     done = g("Div", count, g.constant(float(timing.substeps)))
     step = g("Cast", g("Sub", done, g.constant(1.0)), to=7)
@@ -232,7 +220,7 @@ def _head(g: OnnxGraph, features: str, count: str, timing: Timing, classes: Touc
         return g("Gather", g.constant(values), step, axis=0)
 
     found = g("Mul", g("Sub", features, now(classes.mean)), now(1 / classes.scale))
-    found = g("Clip", found, g.constant(-LIMIT), g.constant(LIMIT))
+    found = g("Clip", found, g.constant(-head.LIMIT), g.constant(head.LIMIT))
     away = g("Sub", g("Unsqueeze", found, g.integers(1)), now(classes.centres))  # b, class, feature
     along = g("MatMul", away, now(classes.axes))
     whole = g("ReduceSum", g("Mul", away, away), g.integers(2), keepdims=0)

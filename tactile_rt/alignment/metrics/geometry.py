@@ -17,13 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tactile_rt.alignment.metrics import Measure
-from tactile_rt.alignment.metrics.halves import (
-    bins_of,
-    ceiling_of,
-    half_means,
-    means_of,
-    sessions_of,
-)
+from tactile_rt.alignment.metrics import halves
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import UPPER, Floats, pearson, rdm
 
@@ -61,15 +55,15 @@ def rsa_time(animal: Animal) -> Measure:
 
 def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
     """RDMs (bin, 15) of an animal and the ceiling (bin,) of each; None without a time course."""
-    sessions = sessions_of(animal)
-    bins = bins_of(sessions) if sessions else 0
+    sessions = halves.sessions_of(animal)
+    bins = halves.bins_of(sessions) if sessions else 0
     if not bins:
         return None
-    goal = rdm(means_of(sessions, bins).swapaxes(0, 1))
-    whole = np.concatenate([half_means(s, bins) for s in sessions], axis=-1)
-    halves = rdm(np.moveaxis(whole, 3, 0))  # (bin, division, 2, 15)
-    r = pearson(halves[:, :, 0], halves[:, :, 1])
-    return goal, np.array([ceiling_of(row) for row in r])
+    goal = rdm(halves.means_of(sessions, bins).swapaxes(0, 1))
+    whole = np.concatenate([halves.half_means(s, bins) for s in sessions], axis=-1)
+    parts = rdm(np.moveaxis(whole, 3, 0))  # (bin, division, 2, 15)
+    r = pearson(parts[:, :, 0], parts[:, :, 1])
+    return goal, np.array([halves.ceiling_of(row) for row in r])
 
 
 def cka(animal: Animal) -> Measure:
@@ -81,13 +75,13 @@ def _compare_means(
     animal: Animal, form: Callable[[Floats], Floats], agree: Callable[[Floats, Floats], Floats]
 ) -> Measure:
     """Measure how mean responses agree in a form such as their RDM."""
-    sessions = sessions_of(animal)
+    sessions = halves.sessions_of(animal)
     if not sessions:
         return NOTHING
-    goal = form(means_of(sessions, 0)[:, 0])
-    halves = form(np.concatenate([half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
+    goal = form(halves.means_of(sessions, 0)[:, 0])
+    parts = form(np.concatenate([halves.half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
     return Measure(
-        ceiling_of(agree(halves[:, 0], halves[:, 1])),
+        halves.ceiling_of(agree(parts[:, 0], parts[:, 1])),
         lambda layer: float(agree(form(mean_pattern(layer)), goal)),
     )
 
