@@ -92,12 +92,6 @@ def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, done, tmp_
     assert model["score"] is not None and model["turing"] == model["turing_why"] == ""
 
 
-def test_the_gate_on_one_animal_is_inconclusive(call, frozen):
-    code, out, _ = call("align", "gate", MODEL, "--benchmark", frozen / "1.json")
-    assert code == 2
-    assert "validity: inconclusive" in out
-
-
 def test_what_the_gate_cannot_read_is_an_input_error(call, frozen, tmp_path):
     broken = tmp_path / "broken.onnx"
     broken.write_bytes(b"no model")

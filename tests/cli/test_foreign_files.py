@@ -21,13 +21,13 @@ N = 20
 TIMES = [k / 100 for k in range(N)]  # s
 FX = [0.5 * k - 3 for k in range(N)]  # N
 FY = [-0.25 * k for k in range(N)]
-COLUMNS, NAMED = "time:s,A.fx:N,A.fy:N", "t=time:s,Fx=A.fx:N,Fy=A.fy:N"
+COLUMNS = "time:s,A.fx:N,A.fy:N"
 
 
-def rows(line, *, header="", end="\n", times=TIMES, digits="{:.4f}"):
+def rows(line, *, header="", times=TIMES, digits="{:.4f}"):
     """A table of time, fx and fy; `line` joins three texts."""
     told = [[digits.format(x) for x in row] for row in zip(times, FX, FY, strict=True)]
-    return header + "".join(line(*row) + end for row in told)
+    return header + "".join(line(*row) + "\n" for row in told)
 
 
 def joined(by):
@@ -40,31 +40,17 @@ def comma(text):
 
 # name: (file's name, what is in it, arguments)
 TABLES = {
-    "comma": ("a.csv", rows(joined(",")), ["--columns", COLUMNS]),
-    "semicolon": ("a.csv", rows(joined(";")), ["--columns", COLUMNS]),
-    "tab": ("a.txt", rows(joined("\t")), ["--columns", COLUMNS]),
     "spaces, aligned": (
         "a.txt", rows(lambda *c: "".join(f"{x:>14}" for x in c)), ["--columns", COLUMNS]
     ),
-    "pipe": ("a.txt", rows(joined("|")), ["--columns", COLUMNS]),
     "decimal comma": ("a.csv", comma(rows(joined(";"))), ["--columns", COLUMNS]),
-    "decimal comma, tab": ("a.txt", comma(rows(joined("\t"))), ["--columns", COLUMNS]),
-    "header": ("a.csv", rows(joined(","), header="t,Fx,Fy\n"), ["--columns", NAMED]),
     "quoted header": (
         "a.csv", rows(joined(","), header='"time (s)","F x","F y"\n'), ["--columns", COLUMNS]
-    ),
-    "units in a row": (
-        "a.csv", rows(joined(","), header="t,Fx,Fy\ns,N,N\n"), ["--columns", COLUMNS]
     ),
     "remarks above": (
         "a.csv", rows(joined(","), header="# made by logger 3\n# 2024-05-10\n"),
         ["--columns", COLUMNS],
     ),
-    "windows line ends": ("a.csv", rows(joined(","), end="\r\n"), ["--columns", COLUMNS]),
-    "byte order mark": (
-        "a.csv", rows(joined(","), header="\ufefft,Fx,Fy\n"), ["--columns", COLUMNS]
-    ),
-    "utf-16": ("a.txt", rows(joined("\t")).encode("utf-16"), ["--columns", COLUMNS]),
     "exponents": ("a.csv", rows(joined(","), digits="{:.6E}"), ["--columns", COLUMNS]),
     "milliseconds": (
         "a.csv", rows(joined(","), times=[1e3 * t for t in TIMES]),
@@ -98,7 +84,7 @@ TABLES = {
 
 def imported(done, folder, name, content, arguments):
     path = folder / name
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    path.write_text(content)
     out = folder / "out.mcap"
     said, _ = done("import", path, out, *arguments)
     return concatenate(list(Recording(out))), Recording(out).description.spec, said
@@ -113,13 +99,6 @@ def test_a_table_is_read(done, tmp_path, name):
     np.testing.assert_allclose((whole.t_ns - whole.t_ns[0]) / 1e9, TIMES, atol=1e-4)
     assert whole.valid.all() and f"{N} intact, 0 corrupt, 0 missing" in said
     assert spec.rate_hz == pytest.approx(100, rel=0.01)
-
-
-def test_a_cell_that_is_empty_is_no_value_and_a_short_row_is_damage(done, tmp_path):
-    text = "0.00,1,2\n0.01,,2\n0.02,1\n0.03,nan,2\n0.04,1,2\n0.05,1,2\n"
-    whole, _, said = imported(done, tmp_path, "a.csv", text, ["--columns", COLUMNS])
-    assert "1 corrupt" in said
-    assert whole.valid[:, 0].tolist() == [True, False, False, True, True]
 
 
 def frames(form):
@@ -170,7 +149,7 @@ def test_a_log_of_a_bus_is_read(done, tmp_path, name):
         assert np.diff(whole.t_ns) == pytest.approx(1e7, abs=2e4)
 
 
-def wrench_bag(folder, form, count=N):
+def wrench_bag(folder, form):
     """A bag of so many wrenches, at 100 Hz by their headers' times."""
     store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
     if form == "ros1":
@@ -184,7 +163,7 @@ def wrench_bag(folder, form, count=N):
     header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     with writer:
         topic = writer.add_connection("/ft/wrench", kind.__msgtype__, typestore=store)
-        for k in range(count):
+        for k in range(N):
             stamp = time(sec=UTC + k // 100, nanosec=k % 100 * 10_000_000)
             head = header(**seq, stamp=stamp, frame_id="tool0")
             load = wrench(force=vector(x=0.5 * k - 3, y=-0.25 * k, z=1.0), torque=vector(0, 0, -k))
@@ -201,14 +180,3 @@ def test_a_bag_is_read(done, tmp_path, form):
     assert whole.values[:, 0].tolist() == [[0.5 * k - 3, -0.25 * k, 1, 0, 0, -k] for k in range(N)]
     assert np.diff(whole.t_ns).tolist() == [10_000_000] * (N - 1)
     assert f"{N} intact, 0 corrupt, 0 missing" in said
-
-
-@pytest.mark.parametrize("part", [0.8, 0.5])
-def test_what_is_left_of_a_bag_that_was_cut_is_read(done, tmp_path, part):
-    path = wrench_bag(tmp_path, "mcap", 4000) / "a.mcap"
-    path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
-    out = tmp_path / "out.mcap"
-    _, err = done("import", path, out)
-    whole = concatenate(list(Recording(out)))
-    assert 1000 < len(whole) < 4000 and "its end is missing or damaged" in err
-    assert np.array_equal(whole.values[:, 0, 0], [0.5 * k - 3 for k in range(len(whole))])

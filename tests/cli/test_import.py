@@ -33,23 +33,6 @@ def test_what_is_there_is_replaced_only_if_forced(call, refused, raw):
     assert call("import", "raw.bin", "--as", "codec=bota", "--force")[0] == 0
 
 
-def test_half_a_log_has_a_note(call, cwd):
-    frames = [f for p in wire_of(make_codec("can", "aft200", {})) for f in p]
-    text = "".join(
-        f"({k / 2000:.6f}) can0 {f.id:03X}#{f.data.hex()}\n" for k, f in enumerate(frames)
-    )
-    (cwd / "can.log").write_text(text[:-4])
-    code, said, told = call("import", "can.log", "out.mcap", "--as", "codec=aft200")
-    assert code == 0 and "39 samples in, 79 intact" in said
-    assert told == "can.log: passed over, no line of a candump log: 1 (line 80)\n"
-
-
-def test_a_table_and_a_rate(call, cwd):
-    (cwd / "t.csv").write_text("Fx;Fy\n" + "1,5;2\n" * 9)
-    code, said, _ = call("import", "t.csv", "--columns", "Fx=S.fx,Fy=S.fy", "--rate", "50")
-    assert code == 0 and "9 samples in" in said and "at 50 Hz" in said
-
-
 @pytest.mark.parametrize(
     ("options", "why"),
     [
