@@ -187,7 +187,8 @@ def _session(
         contacts = np.empty(0)
     start = begin
     if window == "contact":
-        start = _first_contacts(contacts, begin, stop)
+        touched = np.append(contacts, np.inf)[np.searchsorted(contacts, begin)]
+        start = np.where(touched < stop, touched, np.nan)
         drop(~np.isfinite(start), "no contact before the choice")
     first, last = begin[kept].min(), stop[kept].max()
     units, usable = parts.usable_units(units, first, last, notes)
@@ -217,13 +218,6 @@ def _session(
         begin=begin[rows],
     )
     return Reading(session, [f"session {name}: {note}" for note in notes], task, response)
-
-
-def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:
-    """Time of the first contact in [start, stop), NaN without one."""
-    padded = np.append(contacts, np.inf)
-    first = padded[np.searchsorted(contacts, start)]
-    return np.where(first < stop, first, np.nan)
 
 
 def _rates(

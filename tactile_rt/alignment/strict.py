@@ -149,7 +149,10 @@ def freeze_strict(
                 unfiltered=every.freeze(),
                 reliable=bool(chosen.reliability >= MINIMUM_RELIABILITY),
                 trials=sum(len(s.stimulus) for s in sessions),
-                sha256=_sha256([one for one, _ in ordered]),
+                sha256=rates_sha256(
+                    {f"{i} rates": s.rates for i, (s, _) in enumerate(ordered)}
+                    | {f"{i} stimulus": s.stimulus for i, (s, _) in enumerate(ordered)}
+                ),
             )
         )
         progress(done / len(animals))
@@ -164,11 +167,6 @@ def freeze_strict(
         seed=seed,
         notes=tuple(notes),
     )
-
-
-def _sha256(sessions: Sequence[NeuralSession]) -> str:
-    arrays = {f"{i} rates": s.rates for i, s in enumerate(sessions)}
-    return rates_sha256(arrays | {f"{i} stimulus": s.stimulus for i, s in enumerate(sessions)})
 
 
 def _pools(

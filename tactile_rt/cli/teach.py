@@ -99,8 +99,12 @@ def teach(
         began = time.process_time()
         card = lesson.learn()
         orders.end(f"{folder / MODEL} knows {', '.join(lesson.taught_enough)}")
-    for line in (*teacher.summary(), *_losses(opened)):
+    for line in teacher.summary():
         typer.echo(line)
+    stats = opened.stats
+    if stats.corrupt or stats.missing:
+        lost = f"{stats.corrupt} damaged, {stats.missing} missing samples"
+        typer.echo(f"lost on the wire: {lost}")
     learnt = lesson.taught_enough
     told = {
         "model": folder / MODEL,
@@ -111,8 +115,8 @@ def teach(
             name: {"right": good, "of": count} for name, count, good in teacher.progress.classes
         },
         "anything_else": dict(zip(("refused", "of"), teacher.progress.others, strict=True)),
-        "corrupt": opened.stats.corrupt,
-        "missing": opened.stats.missing,
+        "corrupt": stats.corrupt,
+        "missing": stats.missing,
     }
     told_as_json(told, json)
     others = len(card.classes) - (0 if card.enrolled else len(learnt))
@@ -259,13 +263,6 @@ def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, st
     finally:
         over.set()
         reader.join()
-
-
-def _losses(source: "Source") -> list[str]:
-    stats = source.stats
-    if not stats.corrupt and not stats.missing:
-        return []
-    return [f"lost on the wire: {stats.corrupt} damaged, {stats.missing} missing samples"]
 
 
 def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":

@@ -72,7 +72,11 @@ def whisk(
     animal = load_array(array)
     kinds = (Whisk, Placing, Spacing, MeshDetail)
     regular, placing, spacing, mesh = take_sets("whisk", sets or (), *kinds)
-    moves = read_trajectory(trajectory, animal.whiskers) if trajectory else regular
+    moves, followed = regular, dict[str, str]()
+    if trajectory:
+        moves = read_trajectory(trajectory, animal.whiskers)
+        sha256 = hashlib.sha256(trajectory.read_bytes()).hexdigest()
+        followed = {"file": trajectory.name, "sha256": sha256}
     pieces, described = {}, {}
     # The stimuli stand on the right of the head, those of an array of the left on its left.
     left = all(w.base[0] < 0 for w in animal.whiskers)
@@ -111,7 +115,7 @@ def whisk(
     parameters: dict[str, Any] = {
         "parameters": described,
         "approximate": target is None,
-        "trajectory": _described(trajectory) if trajectory else asdict(moves),
+        "trajectory": followed if trajectory else asdict(moves),
         "head": asdict(head),
         "profile": {"name": profile, **asdict(PROFILES[profile])},
     }
@@ -137,8 +141,3 @@ def whisk(
             err=True,
         )
     typer.echo(f"{out} and {beside}: {len(felt)} stimuli", err=True)
-
-
-def _described(trajectory: Path) -> dict[str, str]:
-    sha256 = hashlib.sha256(trajectory.read_bytes()).hexdigest()
-    return {"file": trajectory.name, "sha256": sha256}

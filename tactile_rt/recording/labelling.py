@@ -183,12 +183,13 @@ def find_labelled(
                 of = [i for i in mine if i.start_s <= onset_s < i.end_s]
                 touched.update(of)
                 why = touch.flaw if of else OUTSIDE
+                numbers = hashlib.sha256(touch.values.tobytes()).digest()
                 begun = {i.thing for i in mine if onset_s < i.start_s <= end_s}
                 if len({i.thing for i in of}) > 1:
                     why = DISPUTED
                 elif of and not why and begun - {of[0].thing}:
                     why = MIXED
-                elif of and not why and met.setdefault(_digest(touch), one) != one:
+                elif of and not why and met.setdefault(numbers, one) != one:
                     why = AGAIN
                 if why:
                     reasons[why].append(f"{one.name} at {onset_s:.2f} s")
@@ -240,10 +241,6 @@ class _Counted:
                 told = int(chunk.t_ns[-1])
                 self._report(self._recording, (told - self.first_ns) / NS_PER_S)
             yield chunk
-
-
-def _digest(touch: RecordedTouch) -> bytes:
-    return hashlib.sha256(touch.values.tobytes()).digest()
 
 
 def _sums(recordings: Sequence[Path]) -> dict[Path, str]:
