@@ -138,45 +138,28 @@ def resonance(cone: Cone, axis: int = 1, cells: int = 2000) -> float:
 
 @dataclass(frozen=True)
 class Peg:
-    """A rigid peg along z pressed on a whisker, sliding along it so slowly that all is balanced.
+    """A rigid peg along z pressed on a whisker, sliding along it so slowly that all is balanced."""
 
-    Attributes:
-        side: +1: from above, on the concave side of a curved whisker; -1: from below.
-        x: of its centre, mm.
-        depth: how far along y it has moved past first touch, mm.
-        friction: Coulomb coefficient, with a sign: positive when the peg slides distally, so that
-            it drags the whisker along its length, negative when proximally.
-        radius: mm.
-    """
-
-    side: int
-    x: float
-    depth: float
+    side: int  # +1: from above, on the concave side of a curved whisker; -1: from below
+    x: float  # of its centre, mm
+    depth: float  # how far along y it has moved past first touch, mm
+    # coulomb coefficient, with a sign: positive when the peg slides distally, so that it drags the
+    # whisker along its length, negative when proximally
     friction: float = 0.0
-    radius: float = 1.0
+    radius: float = 1.0  # mm
 
 
 @dataclass(frozen=True)
 class Bent:
-    """An elastica on a peg.
+    """An elastica on a peg."""
 
-    Attributes:
-        centre: (2,) of the peg, mm.
-        s: arc length at the contact, mm.
-        direction: of the whisker there, rad.
-        normal: normal force, N.
-        force: (2,) on the whisker, N.
-        moment: that it exerts on the clamp, N mm.
-        contact: (2,) point where the surfaces touch, mm.
-    """
-
-    centre: Floats
-    s: float
-    direction: float
-    normal: float
-    force: Floats
-    moment: float
-    contact: Floats
+    centre: Floats  # (2,) of the peg, mm
+    s: float  # arc length at the contact, mm
+    direction: float  # of the whisker there, rad
+    normal: float  # normal force, N
+    force: Floats  # (2,) on the whisker, N
+    moment: float  # that it exerts on the clamp, N mm
+    contact: Floats  # (2,) point where the surfaces touch, mm
 
 
 def touching(cone: Cone, peg: Peg) -> tuple[float, float]:

@@ -22,22 +22,17 @@ T0 = 5_000_000_000
 
 @dataclass(frozen=True)
 class CodecCase:
-    """One codec under contract.
+    """One codec under contract."""
 
-    Attributes:
-        make: a new codec that knows its spec.
-        signal: (n, element, channel) what the emulated device measures, n >= 20, all different.
-        tolerance: by which a decoded value may differ, by channel or for all.
-        checked: whether a damaged frame is recognised (a checksum, or a header and footer).
-        resync: intact frames that may be lost after damage until samples are decoded again.
-        settles: whether after any damage all values are right again from the third sample on.
-    """
-
-    make: Callable[[], Codec[Any]]
+    make: Callable[[], Codec[Any]]  # a new codec that knows its spec
+    # (n, element, channel) what the emulated device measures, n >= 20, all different
     signal: Callable[[], np.ndarray]
+    # by which a decoded value may differ, by channel or for all
     tolerance: float | Sequence[float] = 0.0
+    # whether a damaged frame is recognised (a checksum, or a header and footer)
     checked: bool = True
-    resync: int = 2
+    resync: int = 2  # intact frames that may be lost after damage until samples are decoded again
+    # whether after any damage all values are right again from the third sample on
     settles: bool = True
 
 

@@ -36,19 +36,12 @@ OF_A_SHELL = re.compile(r"[|&;<>$*]")
 
 @dataclass(frozen=True)
 class Block:
-    """One fenced block.
+    """One fenced block."""
 
-    Attributes:
-        language: The word after the fence.
-        title: The name of the file that it is, or that of a terminal; empty for neither.
-        text: The lines of the block.
-        line: The line of the page that the fence is in.
-    """
-
-    language: str
-    title: str
-    text: str
-    line: int
+    language: str  # word after the fence
+    title: str  # name of the file that it is, or that of a terminal; empty for neither
+    text: str  # lines of the block
+    line: int  # line of the page that the fence is in
 
 
 def blocks(page: str) -> list[Block]:

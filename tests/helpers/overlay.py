@@ -20,19 +20,13 @@ SHORT = 1 << 20  # bytes of a file that are compared; of longer ones the length 
 
 @dataclass(frozen=True)
 class Changed:
-    """What a command left.
+    """What a command left."""
 
-    Attributes:
-        code: The exit code of the command.
-        said: The output and the errors of the command.
-        before: What each path that differs was: kind and mode, owner, group, content; or None.
-        after: What each path that differs is now.
-    """
-
-    code: int
-    said: str
+    code: int  # exit code of the command
+    said: str  # output and the errors of the command
+    # what each path that differs was: kind and mode, owner, group, content; or None
     before: dict[str, list | None]
-    after: dict[str, list | None]
+    after: dict[str, list | None]  # what each path that differs is now
 
 
 def changes(setup: str, command: str) -> Changed:

@@ -22,25 +22,20 @@ AT_ONCE_S = 0.5  # nobody sleeps that long by accident, and a busy machine is fo
 
 @dataclass(frozen=True)
 class Case:
-    """One source under contract.
+    """One source under contract."""
 
-    Attributes:
-        open: Opens the source, in a `with`.
-        samples: Number of samples before the end; None when that is the source's own affair.
-        rate_tolerance: Share by which the measured rate may be off the nominal one.
-        settling_s: Time that the stream as a whole may be too short, s: a device's clock is known
-            by prompt arrivals, and on a busy machine the first ones are not.
-        endless: Whether the source never ends by itself, as devices do not, and is to be closed
-            after `samples`.
-        stands_still: Whether the source leaves samples out, and counts them, where the processor
-            is taken from it for too long.
-    """
-
-    open: Callable[[], AbstractContextManager[Source]]
+    open: Callable[[], AbstractContextManager[Source]]  # opens the source, in a `with`
+    # number of samples before the end; None when that is the source's own affair
     samples: int | None = None
-    rate_tolerance: float = 1e-3
+    rate_tolerance: float = 1e-3  # share by which the measured rate may be off the nominal one
+    # time that the stream as a whole may be too short, s: a device's clock is known by prompt
+    # arrivals, and on a busy machine the first ones are not
     settling_s: float = 0.0
+    # whether the source never ends by itself, as devices do not, and is to be closed after
+    # `samples`
     endless: bool = False
+    # whether the source leaves samples out, and counts them, where the processor is taken from it
+    # for too long
     stands_still: bool = False
 
 

@@ -23,35 +23,22 @@ FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
 @dataclass(frozen=True)
 class Import:
-    """One module named by another.
+    """One module named by another."""
 
-    Attributes:
-        module: The full name of the imported module, or what stands for it where it is not one
-            of ours.
-        name: The name taken from it; empty where the module itself is imported.
-        line: The line of the import in the file.
-        by_name: Whether it is imported by a string.
-    """
-
+    # full name of the imported module, or what stands for it where it is not one of ours
     module: str
-    name: str
-    line: int
-    by_name: bool = False
+    name: str  # name taken from it; empty where the module itself is imported
+    line: int  # line of the import in the file
+    by_name: bool = False  # whether it is imported by a string
 
 
 @dataclass(frozen=True, eq=False)
 class SourceModule:
-    """A file of source.
+    """A file of source."""
 
-    Attributes:
-        name: The module's full name, such as `tactile_rt.core.stream`.
-        path: The file that it was read from.
-        tree: The syntax tree of the whole file.
-    """
-
-    name: str
-    path: Path
-    tree: ast.Module
+    name: str  # module's full name, such as `tactile_rt.core.stream`
+    path: Path  # file that it was read from
+    tree: ast.Module  # syntax tree of the whole file
 
     @property
     def room(self) -> str:
