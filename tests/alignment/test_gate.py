@@ -9,17 +9,7 @@ import pytest
 from msgspec.structs import replace as change
 from scipy import stats
 
-from tactile_rt.alignment.gate import (
-    FAIL,
-    INCONCLUSIVE,
-    PASS,
-    Check,
-    exit_code,
-    mice_of,
-    neural_checks,
-    regression,
-    turing,
-)
+from tactile_rt.alignment import gate
 from tactile_rt.alignment.scoring import score
 from tactile_rt.alignment.strict import freeze_strict
 from tests.helpers import brains
@@ -64,25 +54,25 @@ def codes(checks):
 def test_an_aligned_model_passes_a_random_one_fails_and_chance_is_inconclusive(world):
     benchmark, aligned, random = world
     chance = change(aligned, p=0.06)
-    for made, code in ((aligned, PASS), (random, FAIL), (chance, INCONCLUSIVE)):
-        checks = neural_checks(made, benchmark)
-        assert codes(checks) == {"validity": PASS, "turing": code}
-        assert exit_code(checks) == code
+    for made, code in ((aligned, gate.PASS), (random, gate.FAIL), (chance, gate.INCONCLUSIVE)):
+        checks = gate.neural_checks(made, benchmark)
+        assert codes(checks) == {"validity": gate.PASS, "turing": code}
+        assert gate.exit_code(checks) == code
 
 
 def test_a_model_without_an_rdm_is_inconclusive(world):
     benchmark, aligned, _ = world
     flat = change(aligned, rdms=np.full((2, 15), np.nan))
-    assert codes(neural_checks(flat, benchmark))["turing"] == INCONCLUSIVE
+    assert codes(gate.neural_checks(flat, benchmark))["turing"] == gate.INCONCLUSIVE
     one = change(aligned, rdms=np.stack([aligned.rdms[0], np.full(15, np.nan)]))
-    assert codes(neural_checks(one, benchmark))["turing"] == PASS
+    assert codes(gate.neural_checks(one, benchmark))["turing"] == gate.PASS
 
 
 def test_the_power_stands_beside_the_verdict(world):
     benchmark, aligned, _ = world
-    power = mice_of(benchmark).power()
-    said = next(c for c in neural_checks(aligned, benchmark) if c.name == "turing").why
-    assert turing(aligned, mice_of(benchmark)).why in said
+    power = gate.mice_of(benchmark).power()
+    said = next(c for c in gate.neural_checks(aligned, benchmark) if c.name == "turing").why
+    assert gate.turing(aligned, gate.mice_of(benchmark)).why in said
     assert f"{power.passes:.0%} pass" in said
     assert all(f"{share:.0%} at {lost:.0%}" in said for lost, share in power.fails.items())
 
@@ -92,49 +82,49 @@ def test_one_animal_is_inconclusive():
     shared = brains.geometry(rng)
     benchmark = freeze_strict(brains.animals(rng, 1, shared=shared), 50)
     made = score(benchmark, {"encoder.0": brains.responses(rng, shared, 60)})
-    checks = neural_checks(made, benchmark, made.rdms)
-    assert codes(checks) == dict.fromkeys(("validity", "turing", "regression"), INCONCLUSIVE)
-    assert exit_code(checks) == INCONCLUSIVE
+    checks = gate.neural_checks(made, benchmark, made.rdms)
+    assert codes(checks) == dict.fromkeys(("validity", "turing", "regression"), gate.INCONCLUSIVE)
+    assert gate.exit_code(checks) == gate.INCONCLUSIVE
 
 
 def test_a_model_is_no_worse_than_itself(world):
     benchmark, aligned, random = world
-    mice = mice_of(benchmark)
-    assert regression(aligned, mice, aligned.rdms).code == PASS
-    assert regression(aligned, mice, random.rdms).code == PASS
-    assert regression(random, mice, aligned.rdms).code == FAIL
-    assert regression(random, mice, np.full((2, 15), np.nan)).code == INCONCLUSIVE
+    mice = gate.mice_of(benchmark)
+    assert gate.regression(aligned, mice, aligned.rdms).code == gate.PASS
+    assert gate.regression(aligned, mice, random.rdms).code == gate.PASS
+    assert gate.regression(random, mice, aligned.rdms).code == gate.FAIL
+    assert gate.regression(random, mice, np.full((2, 15), np.nan)).code == gate.INCONCLUSIVE
 
 
 @pytest.mark.parametrize(
     "drop, spread, code",
     [
-        (0.2, 0.02, FAIL),
-        (0.03, 0.001, PASS),  # certain, but small
-        (0.06, 0.4, INCONCLUSIVE),  # not to be told from none, nor from much
-        (-0.2, 0.02, PASS),
+        (0.2, 0.02, gate.FAIL),
+        (0.03, 0.001, gate.PASS),  # certain, but small
+        (0.06, 0.4, gate.INCONCLUSIVE),  # not to be told from none, nor from much
+        (-0.2, 0.02, gate.PASS),
     ],
 )
 def test_regression(world, monkeypatch, drop, spread, code):
     """Fits as they may be; the tests are Student's, from another source."""
     benchmark, aligned, _ = world
-    mice = mice_of(benchmark)
+    mice = gate.mice_of(benchmark)
     drops = drop + spread * np.array([1, -1, 1, -1, 1, -1])
     fits = {0: np.zeros(6) + drops * mice.ceiling, 1: np.zeros(6)}
     found = mice.compare(aligned.rdms[None])
     calls = iter((0, 1))
     monkeypatch.setattr(mice, "compare", lambda rdms: replace(found, fits=fits[next(calls)][None]))
-    check = regression(aligned, mice, aligned.rdms)
+    check = gate.regression(aligned, mice, aligned.rdms)
     assert check.code == code
     low, high = stats.t.interval(0.75, 5, drops.mean(), stats.sem(drops))
     assert f"[{low:+.3f}, {high:+.3f}]" in check.why
-    assert (high < 0.05) == (code == PASS)
+    assert (high < 0.05) == (code == gate.PASS)
 
 
 def test_exit_code_of_every_combination():
-    for these in itertools.product((PASS, FAIL, INCONCLUSIVE), repeat=3):
-        expected = FAIL if FAIL in these else max(these)
-        assert exit_code([Check("x", code, "") for code in these]) == expected
+    for these in itertools.product((gate.PASS, gate.FAIL, gate.INCONCLUSIVE), repeat=3):
+        expected = gate.FAIL if gate.FAIL in these else max(these)
+        assert gate.exit_code([gate.Check("x", code, "") for code in these]) == expected
 
 
 def written(path, encoder, attender, decoder, width=1 / 32, trained=True):
@@ -188,7 +178,7 @@ def damaged(source, path, matching):
 def test_a_faithful_export_passes(exported):
     reference, path = exported
     check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
-    assert check.code == PASS
+    assert check.code == gate.PASS
     assert [row.layer for row in rows] == [*reference.traces, "output"]
     assert min(row.pearson for row in rows) >= 0.9999
     assert max(row.difference for row in rows) <= 1e-5
@@ -230,7 +220,7 @@ def test_a_file_averages_the_steps_of_its_checkpoint(tmp_path, encoder, attender
         assert onnx_layers(path, felt)[0].first == reference.first
     found = export_layers(path, late, reference)
     assert {name: found.first[name] for name in reference.first} == reference.first
-    assert fidelity_check(reference, found)[0].code == PASS
+    assert fidelity_check(reference, found)[0].code == gate.PASS
 
 
 def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
@@ -244,7 +234,7 @@ def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
     monkeypatch.setattr("tactile_rt.alignment.onnx_activations.onnx_layers", late)
     found = export_layers(path, FELT, reference)
     assert {name: found.first[name] for name in reference.first} == reference.first
-    assert fidelity_check(reference, found)[0].code == PASS
+    assert fidelity_check(reference, found)[0].code == gate.PASS
 
 
 @pytest.mark.parametrize("precision", ["fp16", "bf16"])
@@ -256,7 +246,7 @@ def test_a_gpt_of_weights_in_16_bits_passes(tmp_path, precision):
     reference = network_layers(model, FELT)
     layers = export_layers(path, FELT, reference)
     assert layers.precision == precision
-    assert fidelity_check(reference, layers)[0].code == PASS
+    assert fidelity_check(reference, layers)[0].code == gate.PASS
 
 
 def test_layers_that_are_alike_in_an_export_are_not_compared_and_it_says_so(tmp_path):
@@ -265,7 +255,7 @@ def test_layers_that_are_alike_in_an_export_are_not_compared_and_it_says_so(tmp_
     model = written(path, "gru", "gpt", "linear", trained=False)
     reference = network_layers(model, FELT)
     check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
-    assert check.code == PASS and "layers could not be compared" in check.why
+    assert check.code == gate.PASS and "layers could not be compared" in check.why
     assert "attender.block0" not in {row.layer for row in rows}
 
 
@@ -274,13 +264,13 @@ def test_an_int8_export_passes_and_a_damaged_one_fails(exported, quantised, tmp_
     layers = export_layers(quantised, FELT, reference)
     assert layers.precision == "int8"
     check, rows = fidelity_check(reference, layers)
-    assert check.code == PASS
+    assert check.code == gate.PASS
     assert len(rows) == len(reference.traces) + 1
     assert min(row.pearson for row in rows) >= 0.98
 
     bad = damaged(quantised, tmp_path / "bad.onnx", lambda name, v: v.dtype in (np.int8, np.uint8))
     check, _ = fidelity_check(reference, export_layers(bad, FELT, reference))
-    assert check.code == FAIL
+    assert check.code == gate.FAIL
 
 
 def test_one_damaged_layer_is_named(exported, tmp_path):
@@ -288,7 +278,7 @@ def test_one_damaged_layer_is_named(exported, tmp_path):
     last = reference.logits.shape[-1]
     bad = damaged(path, tmp_path / "bad.onnx", lambda name, v: last in v.shape)
     check, rows = fidelity_check(reference, export_layers(bad, FELT, reference))
-    assert check.code == FAIL
+    assert check.code == gate.FAIL
     assert {row.layer for row in rows if not row.kept} == {"decoder.logits", "output"}
     assert "decoder.logits" in check.why or "output" in check.why
 
@@ -296,7 +286,7 @@ def test_one_damaged_layer_is_named(exported, tmp_path):
 def test_another_network_fails(exported):
     reference, _ = exported
     check, _ = fidelity_check(reference, onnx_layers(shipped_model(), FELT)[0])
-    assert check.code == FAIL
+    assert check.code == gate.FAIL
 
 
 def test_a_small_difference_misses_single_precision_but_not_int8(exported):
@@ -308,8 +298,8 @@ def test_a_small_difference_misses_single_precision_but_not_int8(exported):
         for n, t in same.traces.items()
     }
     other = replace(same, traces=moved)
-    assert fidelity_check(reference, other)[0].code == FAIL
-    assert fidelity_check(reference, replace(other, precision="int8"))[0].code == PASS
+    assert fidelity_check(reference, other)[0].code == gate.FAIL
+    assert fidelity_check(reference, replace(other, precision="int8"))[0].code == gate.PASS
 
 
 def test_an_rdm_that_says_nothing_is_not_compared():
