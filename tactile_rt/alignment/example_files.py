@@ -206,9 +206,8 @@ def _head(file: "h5py.File", animal: str) -> None:
     file["session_description"] = "made up: a synthetic session of known truth"
     file["session_start_time"] = file["timestamps_reference_time"] = DATE
     file["file_create_date"] = _text([DATE])
-    for name in ("acquisition", "analysis", "general", "intervals", "processing", "stimulus"):
-        file.create_group(name)
-    for name in ("stimulus/presentation", "stimulus/templates"):
+    stimulus = "stimulus/presentation", "stimulus/templates"
+    for name in ("acquisition", "analysis", "general", "intervals", "processing", *stimulus):
         file.create_group(name)
     subject = _group(file, "general/subject", "Subject")
     subject["subject_id"], subject["species"] = animal, "none: synthetic"

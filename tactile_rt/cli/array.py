@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -88,7 +87,7 @@ def fit(
         ],
         json,
     ):
-        _show(fitted.findings, Console())
+        _show(fitted.findings)
     if out is not None:
         write_whole(out, lambda file: file.write(fitted.text.encode()))
         values = sum(len(f.edits) for f in fitted.findings)
@@ -100,11 +99,11 @@ def fit(
         )
 
 
-def _show(findings: "list[ArrayFinding]", console: Console) -> None:
+def _show(findings: "list[ArrayFinding]") -> None:
     table = Table("quantity", "unit", "described", "measured", "ratio", box=None)
     for f in findings:
         table.add_row(*map(escape, f.words()))
-    print_table(table, console)
+    print_table(table)
     for f in findings:
         if f.note:
-            console.print(f"{escape(f.what)}: {escape(f.note)}", soft_wrap=True)
+            typer.echo(f"{f.what}: {f.note}")

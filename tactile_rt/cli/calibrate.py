@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -71,7 +70,7 @@ def tare(
         "untared": measured.untared, "louder": louder,
     }  # fmt: skip
     if not told_as_json(told, json):
-        _show_tare(measured, Console())
+        _show_tare(measured)
     if untared:
         typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
     if louder:
@@ -144,7 +143,7 @@ def calibrate(
         "lines": loads.lines, **vars(fit),
     }  # fmt: skip
     if not told_as_json(told, json):
-        _show_fit(fit, loads, Console())
+        _show_fit(fit, loads)
     if made:
         _show_uncalibrated(made)
         said = f"matrix of {made.device}, element {element}, written to {path}"
@@ -239,7 +238,7 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _show_tare(measured: "Tare", console: Console) -> None:
+def _show_tare(measured: "Tare") -> None:
     import numpy as np
 
     spec = measured.spec
@@ -255,10 +254,10 @@ def _show_tare(measured: "Tare", console: Console) -> None:
             *map(escape, (channel, unit, span, f"{np.median(noise[:, c]):.2g}")),
             escape(f"{names[most]} {noise[most, c]:.2g}"),
         )
-    print_table(table, console)
+    print_table(table)
 
 
-def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
+def _show_fit(fit: "Fit", loads: "LoadTable") -> None:
     table = Table("axis", "unit", "full scale", "residual RMS", "of full scale", "R²", box=None)
     rows = zip(fit.axes, loads.units, fit.full_scale, fit.rms, fit.r_squared, strict=True)
     for axis, unit, full, rms, explained in rows:
@@ -266,20 +265,19 @@ def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
         table.add_row(
             axis, unit, f"{full:.4g}", f"{rms:.2g}", share, f"{explained:.6f}" if full else "-"
         )
-    print_table(table, console)
-    console.print(
+    print_table(table)
+    typer.echo(
         f"{len(loads.lines)} loads; condition number {fit.condition:.3g} of the readings, "
-        f"{fit.load_condition:.3g} of the loads",
-        soft_wrap=True,
+        f"{fit.load_condition:.3g} of the loads"
     )
     for row in fit.worst[:3]:
         left = ", ".join(
             f"{a} {r:+.2g} {u}"
             for a, r, u in zip(fit.axes, fit.residuals[row], loads.units, strict=True)
         )
-        console.print(f"worst: line {loads.lines[row]}, off by {left}", soft_wrap=True)
+        typer.echo(f"worst: line {loads.lines[row]}, off by {left}")
     for warning in fit.warnings:
-        console.print(f"[yellow]warning[/]: {escape(warning)}", soft_wrap=True)
+        typer.echo(f"{typer.style('warning', fg='yellow')}: {warning}")
 
 
 def _show_uncalibrated(calibration: "Calibration") -> None:
