@@ -48,5 +48,4 @@ Seed = Annotated[int, option("Seed of the random numbers.", min=0, max=LARGEST_S
 Fast = Annotated[bool, option("Run as fast as possible, not in real time.", "--fast")]
 Force = Annotated[bool, option("Replace the output if it exists.", "--force")]
 Quick = Annotated[bool, option("Measure less, for a first look.", "--quick")]
-Array = Annotated[str, option("Array: mouse, rat, rat-left, ..., or a file.")]
 Accelerator = Annotated[str, option("Processor to train on: auto, cpu, cuda, ...")]
