@@ -23,10 +23,10 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from tactile_rt.alignment import reliability
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import pad, rates_sha256
 from tactile_rt.alignment.rdm import Floats, pearson, rdm
-from tactile_rt.alignment import reliability
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 

@@ -6,8 +6,8 @@ from html import escape
 
 import numpy as np
 
-from tactile_rt.alignment.html_page import format_number, join_notes, make_page, make_table
 from tactile_rt.alignment import pictures
+from tactile_rt.alignment.html_page import format_number, join_notes, make_page, make_table
 from tactile_rt.alignment.results import ModelResult, Results
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.core.stream.stimuli import STIMULI

@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tactile_rt.alignment import statistics
 from tactile_rt.alignment.benchmark import Benchmark
 from tactile_rt.alignment.json_file import Number
 from tactile_rt.alignment.rdm import PAIRS, Floats, pearson, rdm
-from tactile_rt.alignment import statistics
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 

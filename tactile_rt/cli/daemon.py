@@ -249,11 +249,7 @@ def _write(path: Path, text: str) -> None:
 @app.command("install-service", epilog="tactile-rt install-service /etc/tactile/robot.toml")
 def install_service(
     file: Annotated[Path, argument("The configuration, e.g. /etc/tactile/robot.toml.")],
-    out: Annotated[
-        Path, option("New or empty folder to write into.")
-    ] = Path(
-        "tactile-service"
-    ),
+    out: Annotated[Path, option("New or empty folder to write into.")] = Path("tactile-service"),
     user: Annotated[str, option("User that the service runs as.")] = "tactile",
 ) -> None:
     """Write a systemd service that starts the daemon at boot.

@@ -44,8 +44,8 @@ def label(
     The columns of labels.csv: recording,start_s,end_s,label and, optionally, object; times are
     seconds since the recording's first sample. Touches that cannot be used are counted on stderr.
     """
-    from tactile_rt.recording.labelled_set import write_set
     from tactile_rt.recording import labelling
+    from tactile_rt.recording.labelled_set import write_set
     from tactile_rt.recording.labels import LABELS
     from tactile_rt.sets.manifest import SPLITS
     from tactile_rt.sim_backend.datasets.inventory import write_sums

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -195,11 +195,9 @@ def export(
         raise ConfigError(f"--kind is {kind!r}, not one of step, window")
     with needing("train"):
         from tactile_rt.export.release import release
-    whole = "window" if kind == "window" else "step"
+    form: Literal["step", "window"] = "window" if kind == "window" else "step"
     with progress_bar("calibrating, exporting and checking parity"):
-        card = release(
-            checkpoint, model, name or model.stem, precision, whole, data or (), license
-        )
+        card = release(checkpoint, model, name or model.stem, precision, form, data or (), license)
     size, found = model.stat().st_size / 1e6, card.figures
     told = {"model": model, "megabytes": size, "temperature": card.temperature, **found}
     told_as_json(told, json)

@@ -30,11 +30,7 @@ WIDTH = 1280  # pixels
 @app.command(epilog="tactile-rt view mug-17 --out sweep.png --camera side")
 def view(
     target: Annotated[str, argument("Object to sweep past: mug-17, or a mesh file.")],
-    out: Annotated[
-        Path, option("Picture (.png, .jpg) or video (.mp4).")
-    ] = Path(
-        "sweep.png"
-    ),
+    out: Annotated[Path, option("Picture (.png, .jpg) or video (.mp4).")] = Path("sweep.png"),
     camera: Annotated[str, option("View: front, side, top or oblique.")] = "oblique",
     at: Annotated[
         float | None, option("Time of a picture, ms. Default: of the largest force.")

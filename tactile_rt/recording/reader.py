@@ -10,8 +10,8 @@ import msgspec
 from tactile_rt.core.errors import ConfigError, RecordingError, explain_errors
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.recording import layout
+from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.recording.records import MAGIC, read_records
 from tactile_rt.recording.ros2_form import is_in_file_form, name_channel, plain
 

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.classifier import contact
+from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.stream import ArraySpec, Chunk, Timing
 

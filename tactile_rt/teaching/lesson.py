@@ -27,8 +27,7 @@ from tactile_rt.classifier.model_file import hash_of, load_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import ArraySpec
-from tactile_rt.recording import Recording, recover
-from tactile_rt.recording import labels
+from tactile_rt.recording import Recording, labels, recover
 from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
 from tactile_rt.teaching.model import TOUCH, Enrolment, FewShot, write_features

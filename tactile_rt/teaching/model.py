@@ -19,17 +19,17 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from tactile_rt.classifier import enrolment
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, OpenSetRule
-from tactile_rt.classifier import enrolment
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, probe_logits, read_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Timing
-from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching import head
+from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph, with_metadata
 
 __all__ = [

@@ -6,11 +6,11 @@ import re
 import numpy as np
 import pytest
 
+from tactile_rt.alignment.clock import CLOCKS
 from tactile_rt.alignment.datasets import fetching
 from tactile_rt.alignment.datasets.fetching import PublishedFile, fetch, published_files
 from tactile_rt.alignment.example import Brain
 from tactile_rt.alignment.example_files import write_example
-from tactile_rt.alignment.clock import CLOCKS
 from tactile_rt.alignment.nwb import WINDOWS, read_session
 from tactile_rt.core.errors import ConfigError
 from tests.helpers.archive import Archive

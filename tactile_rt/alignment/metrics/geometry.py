@@ -16,8 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tactile_rt.alignment.metrics import Measure
-from tactile_rt.alignment.metrics import halves
+from tactile_rt.alignment.metrics import Measure, halves
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import UPPER, Floats, pearson, rdm
 
