@@ -89,7 +89,7 @@ def call(capsys, monkeypatch):
 
     A message that must be cut to its longest fails the test: it is to be written shorter.
     """
-    from tactile_rt.cli import main, progress
+    from tactile_rt.cli import main, tables
     from tactile_rt.core import errors
 
     def check_length(message, shorten=errors.shorten):
@@ -99,7 +99,7 @@ def call(capsys, monkeypatch):
     monkeypatch.setattr(errors, "shorten", check_length)
 
     # A slow machine must not add lines of progress to what a test expects on stderr.
-    monkeypatch.setattr(progress, "LINE_S", threading.TIMEOUT_MAX)
+    monkeypatch.setattr(tables, "LINE_S", threading.TIMEOUT_MAX)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
