@@ -8,9 +8,9 @@ told, never left out in silence. `labelled_set` makes a sweep set of them.
 
 import hashlib
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -22,6 +22,7 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.core.stream.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.recording.labels import LABELS, LabelledInterval, label_of_file, read_labels
 from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.replay import prepare_replay
 from tactile_rt.recording.touches import RecordedTouch, find_touches
 from tactile_rt.sets.manifest import UNLABELLED, SweepManifest
 
@@ -173,13 +174,12 @@ def find_labelled(
     met: dict[bytes, Path] = {}  # the recording of each touch, by its numbers
     for one, recording in zip(recordings, opened, strict=True):
         mine, touched = list(intervals.get(one, ())), set()
-        with closing(recording.chunks()) as chunks:
-            stream = _Counted(one, chunks, report)
-            for touch in find_touches(recording.spec, stream.chunks(), period_ns, floor):
+        begin_ns = next((int(chunk.t_ns[0]) for chunk in recording), 0)
+        with prepare_replay(str(one.absolute()), {"speed": "0"}).open() as source:
+            followed = _follow(source, begin_ns, partial(report, one))
+            for touch in find_touches(recording.spec, followed, period_ns, floor):
                 found.found[one] += 1
-                onset_s, end_s = (
-                    (t - stream.first_ns) / NS_PER_S for t in (touch.onset_ns, touch.end_ns)
-                )
+                onset_s, end_s = ((t - begin_ns) / NS_PER_S for t in (touch.onset_ns, touch.end_ns))
                 of = [i for i in mine if i.start_s <= onset_s < i.end_s]
                 touched.update(of)
                 why = touch.flaw if of else OUTSIDE
@@ -198,8 +198,8 @@ def find_labelled(
         for interval in mine:
             if interval not in touched:
                 silent.append(interval.where or str(one))
-        if stream.lost:
-            found.left_out.append(f"samples missing in {one.name}: {stream.lost}")
+        if source.stats.missing:
+            found.left_out.append(f"samples missing in {one.name}: {source.stats.missing}")
         if not mine:
             found.left_out.append(f"no interval of {one.name} is labelled")
     unused = [f"touches {why}: {len(at)}, first {at[0]}" for why, at in reasons.items()]
@@ -215,32 +215,16 @@ def find_labelled(
     return found
 
 
-class _Counted:
-    """A recording's chunks, of which one knows when they began and what is missing.
-
-    Attributes:
-        first_ns: The stream time of the first sample, ns.
-    """
-
-    def __init__(
-        self, recording: Path, chunks: Iterator[Chunk], report: Callable[[Path, float], None]
-    ) -> None:
-        self._recording, self._chunks, self._report = recording, chunks, report
-        self.first_ns = self.lost = 0
-
-    def chunks(self) -> Iterator[Chunk]:
-        after: int | None = None
-        told = 0
-        for chunk in self._chunks:
-            if after is None:
-                self.first_ns = told = int(chunk.t_ns[0])
-                after = int(chunk.seq[0])
-            self.lost += max(0, int(chunk.seq[-1]) + 1 - after - len(chunk))
-            after = int(chunk.seq[-1]) + 1
-            if chunk.t_ns[-1] - told >= TELL_NS:
-                told = int(chunk.t_ns[-1])
-                self._report(self._recording, (told - self.first_ns) / NS_PER_S)
-            yield chunk
+def _follow(
+    source: Iterable[Chunk], begin_ns: int, report: Callable[[float], None]
+) -> Iterator[Chunk]:
+    """Yield the chunks, and report how far they are, s since their beginning."""
+    told = begin_ns
+    for chunk in source:
+        if chunk.t_ns[-1] - told >= TELL_NS:
+            told = int(chunk.t_ns[-1])
+            report((told - begin_ns) / NS_PER_S)
+        yield chunk
 
 
 def _sums(recordings: Sequence[Path]) -> dict[Path, str]:
