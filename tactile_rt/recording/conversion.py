@@ -221,7 +221,6 @@ class _PatientFile(io.FileIO):
 
 
 BAG_VERSION = 5  # of metadata.yaml: the newest that ROS 2 Humble reads; later ones read it, too
-NS = 10**9
 
 
 class _File(NamedTuple):

@@ -43,7 +43,6 @@ __all__ = [
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
 LARGER, NOISES = 3.0, 1e3  # times the largest load felt, or the noise, that may come later
-TINY = 1e-12  # least posterior
 MAYBE = 0.5  # posterior of `unknown` above which a touch is unknown
 
 Floats = NDArray[np.float64]

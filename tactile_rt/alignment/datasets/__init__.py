@@ -17,7 +17,6 @@ from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import added, added_names
 from tactile_rt.core.settings import no_such
-from tactile_rt.core.stream.stimuli import STIMULI
 
 __all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
 
@@ -47,7 +46,6 @@ class NeuralDataset:
 
     Attributes:
         license: The SPDX name of its license; empty for a set of the user's own.
-        conditions: The names of its six conditions, in the order of the stimulus axis.
         about: Sentences on what is compared and what that leaves out.
         read: The function that reads downloaded files or folders. It takes them, the input of the
             six stimuli, and a function to call with the share done, 0 to 1, and raises
@@ -66,7 +64,6 @@ class NeuralDataset:
     size: str
     about: str
     read: Reader
-    conditions: tuple[str, ...] = STIMULI
     listing: str = ""
     counts: tuple[int, int] | None = None
 
