@@ -2,7 +2,7 @@
 
 A dataset says where its recordings come from (title, citation, license, size), and reads what its
 user downloaded or fetched: animals, and the input of the models if it is not the six stimuli that
-ship. Its six conditions stand on the axis of `STIMULI`, under names of their own. Recordings are
+ship. Its six conditions stand on the axis of `STIMULI`. Recordings are
 never bundled. Datasets of other packages are found by the entry points
 ``tactile_rt.alignment_datasets``.
 """
