@@ -29,14 +29,10 @@ TIE = 1e-9
 
 @dataclass(frozen=True)
 class Decoded:
-    """Accuracies, each beside the mean over relabelled stimuli and the share that reaches it.
+    """Shares of held-out stimuli that are decoded rightly, NaN where nothing is decoded.
 
-    Attributes:
-        shape, distance: Shares of held-out stimuli whose shape or distance is decoded rightly, 0 to
-            1; NaN where nothing is decoded.
-        shape_chance, distance_chance: Mean accuracies over all relabellings of the stimuli, 0 to 1.
-        shape_p, distance_p: Shares of relabellings that are right at least as often as the true
-            labels, 0 to 1.
+    Beside each: the mean over all relabellings of the stimuli, and the share of these that are
+    right at least as often as the true labels.
     """
 
     shape: float

@@ -37,22 +37,15 @@ MODELS = {"another-mouse": 0.0, "lost-25": 0.25, "lost-50": 0.5, "random": 1.0}
 
 @dataclass(frozen=True)
 class Brain:
-    """Who is recorded, and how much of it is shared.
-
-    Attributes:
-        sessions: The number of sessions of each mouse; each records units of its own.
-        private: The share of the variance of a mouse's features that is its own, 0 to 1.
-        tuning: The standard deviation over stimuli of the logarithm of a unit's rate.
-        distance, shape, own: The weights of the three parts of the shared geometry: distance,
-            shape, and what is particular to each stimulus.
-    """
+    """Who is recorded, and how much of it is shared."""
 
     mice: int = 11
-    sessions: int = 2
+    sessions: int = 2  # of each mouse, with units of their own
     units: int = 45
     trials: int = 40
-    private: float = 0.15
-    tuning: float = 0.32
+    private: float = 0.15  # share of the variance of a mouse's features that is its own, 0 to 1
+    tuning: float = 0.32  # standard deviation over stimuli of the logarithm of a unit's rate
+    # weights in the shared geometry of distance, shape, and what is particular to each stimulus
     distance: float = 1.0
     shape: float = 0.5
     own: float = 0.7

@@ -159,11 +159,6 @@ class Demonstration:
         fast: as fast as the simulation goes, instead of in real time.
         recorded: play the recording instead.
 
-    Attributes:
-        target: The object that `decision` is about; None before the first touch.
-        decision: The latest decision of the model; None before the first one.
-        outcomes: The outcomes of the objects that have passed, in order.
-
     Raises:
         ModelError, SpecMismatch: the model cannot be used on the mouse array.
     """
@@ -196,9 +191,9 @@ class Demonstration:
         self.classifier = Classifier(model, self._source.spec)
         self._class_of = self.classifier.card.class_of
         self._session = Session(self._source, self.classifier)
-        self.target: Any = None
-        self.decision: Classification | None = None
-        self.outcomes: list[SweepOutcome] = []
+        self.target: Any = None  # what `decision` is about
+        self.decision: Classification | None = None  # the latest
+        self.outcomes: list[SweepOutcome] = []  # of the objects that have passed, in order
         self._latencies: deque[float] = deque(maxlen=LATENCIES_KEPT)
         self._first_ns = self._now_ns = 0  # stream time
         self._base_ns = 0  # stream time from which passes count

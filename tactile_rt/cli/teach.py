@@ -136,13 +136,10 @@ class Orders:
 
     Args:
         at: host and port of the page; None: no page.
-
-    Attributes:
-        teacher: The teacher whose state the page shows; None: there is none yet.
     """
 
     def __init__(self, at: tuple[str, int] | None) -> None:
-        self.teacher: Teacher | None = None
+        self.teacher: Teacher | None = None  # whose state the page shows
         self._orders: queue.Queue[str] = queue.Queue()
         self._at = at
         self._page: TeachingPage | None = None

@@ -140,15 +140,6 @@ class RecordingWriter:
         dropped: samples and packets that could not be recorded before.
         syncer: what syncs the file; None: the thread that calls.
 
-    Attributes:
-        begun_ns: The host monotonic time at which the file was begun, ns.
-        stats: The counts so far; `dropped_samples` and `dropped_packets` are the caller's to keep.
-        flushed: The extent that the operating system has, which a kill of the process leaves.
-        unsynced_ns: The host monotonic time since which something waits for the medium, ns; 0:
-            nothing does.
-        failed: The error with which a sync failed; None while none has.
-        done: Whether the file is closed, and its last sync has ended.
-
     Raises:
         FileExistsError: there is such a file.
         ConfigError: it is to be replaced, and is being recorded right now.
@@ -166,13 +157,15 @@ class RecordingWriter:
         syncer: Syncer | None = None,
     ) -> None:
         self.path, self.begun_ns = path, time.monotonic_ns()
+        # of which `dropped_samples` and `dropped_packets` are the caller's to keep
         self.stats = WriterStats(dropped_samples=dropped[0], dropped_packets=dropped[1])
         self._source, self._device = source, device_of(source)
         self._told: tuple[Any, ...] = ()  # the health that was last written
-        self.flushed, self._synced, self._newest_ns = Extent(), Extent(), 0
-        self.unsynced_ns = 0
-        self.failed: OSError | None = None
-        self.done = False
+        self.flushed = Extent()  # what the operating system has, which a kill of the process leaves
+        self._synced, self._newest_ns = Extent(), 0
+        self.unsynced_ns = 0  # host time since which something waits for the medium; 0: nothing
+        self.failed: OSError | None = None  # of a sync
+        self.done = False  # whether it is closed, and its last sync has ended
         self._syncer, self._waiting, self._name_synced = syncer, False, False
         target = path.resolve() if force else path  # a link is followed, not replaced
         special = force and target.exists() and not target.is_file()  # a pipe, /dev/null

@@ -48,31 +48,23 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TouchClasses:
-    """What tells classes apart, step by step. Standardised features are (f - mean) / scale.
+    """What tells classes apart, step by step.
 
-    Attributes:
-        mean, scale: (step, feature) The numbers by which features are standardised; then they are
-            limited to 5.
-        centres: (step, class, feature) The means of the classes, standardised.
-        axes: (step, feature, axis) The directions in which touches of a class differ, each
-            as long as a unit along it weighs less than a unit across all.
-        rest: (step,) The variance in all other directions.
-        share: (class,) The part of the squared distance from a class that is left when what comes
-            from its mean of few touches is taken off.
-        reach: (step,) The squared distance from the nearest class beyond which a touch is unknown.
-        temperature: The number by which half of the squared distances is divided, so that
-            posteriors mean what they say.
+    Standardised features are (f - mean) / scale, limited to 5.
     """
 
     labels: tuple[str, ...]
-    mean: Floats
-    scale: Floats
-    centres: Floats
+    mean: Floats  # (step, feature)
+    scale: Floats  # (step, feature)
+    centres: Floats  # (step, class, feature) means of the classes, standardised
+    # (step, feature, axis) directions in which touches of a class differ, each as long as a unit
+    # along it weighs less than a unit across all
     axes: Floats
-    rest: Floats
+    rest: Floats  # (step,) variance in all other directions
+    # (class,) of a squared distance: what is left when the part from a mean of few touches is off
     share: Floats
-    reach: Floats
-    temperature: float
+    reach: Floats  # (step,) squared distance from the nearest class beyond which all is unknown
+    temperature: float  # divides half of the squared distances: posteriors mean what they say
 
     def distances(self, features: Floats) -> Floats:
         """(touch, step, class) squared distances of touches (touch, step, feature)."""
@@ -146,10 +138,7 @@ def count_refused(
 def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeaveOneOut:
     """Judge every touch by what is learnt from others: of many, a tenth of each class at a time.
 
-    Args:
-        features: (touch, step, feature) of all touches.
-        labels: (touch,) the class of each; at least two touches of each class.
-        kinds: as `fit_classes` takes them.
+    Takes what `fit_classes` takes; at least two touches of each class.
     """
     _check_enough(labels)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)

@@ -29,12 +29,6 @@ class Listener:
         felt: makes features of a touch's steps.
         hasty_ns: how soon after the end of a contact another is taken for its rest, ns.
 
-    Attributes:
-        classifier: The classifier that runs the features, and knows whether something is touched.
-        largest: (channel,) The largest reading within a contact, either way from the baseline.
-        hasty: The number of touches that came so soon after another that they may be its rest; they
-            are not given.
-
     Raises:
         SpecMismatch: the stream is of another array than the lesson.
     """
@@ -51,13 +45,14 @@ class Listener:
         # samples between two of the classifier's, whose readings can be seen after each of them
         self._together = max(1, round(spec.rate_hz * self.classifier.card.period_ns / NS_PER_S))
         self._first_ns: int | None = None
+        # (channel,) within a contact, either way from the baseline
         self.largest = np.zeros(spec.shape[1], np.float32)
         self._heard = 0  # samples since the last hint
         self._strongest, self._where = 0.0, ""  # since then, in units of the noise
         self._steps: list[Classification] = []
         self._released_ns = -LONG_AGO_NS  # stream time
         self._counts = True  # the touch under way
-        self.hasty = 0
+        self.hasty = 0  # touches so soon after another that they may be its rest; not given
 
     def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
@@ -105,7 +100,7 @@ class Listener:
         self._heard, self._strongest = 0, 0.0
         if not heard:
             return "no sample came for a while: is the device still on?"
-        if self.touching:
+        if self.classifier.detector.contact:
             return "it has been touched all the while: let go for a second"
         if not self.classifier.detector.ready:
             return "there was no second at rest yet: let go"
@@ -114,11 +109,6 @@ class Listener:
             f"no touch was noticed: the strongest reading was {strongest:.1f} times the noise "
             f"({self._where}), and {FELT:g} is felt: {advice}"
         )
-
-    @property
-    def touching(self) -> bool:
-        """Whether something is touched now."""
-        return self.classifier.detector.contact
 
     def seconds(self, t_ns: int) -> float:
         """Stream time in seconds since the first sample."""

@@ -19,12 +19,7 @@ CONTROL = "/control"  # what tests say to the server
 
 
 class Archive:
-    """A server of a folder's files that runs until the context is left.
-
-    Attributes:
-        folder: Its files are looked at anew with every request.
-        port: On the loopback interface.
-    """
+    """A server of a folder's files, looked at anew with every request; runs in the context."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

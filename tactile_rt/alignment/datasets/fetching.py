@@ -55,15 +55,11 @@ class RangeFile(io.RawIOBase):
 
     Args:
         size: in bytes; a server that has another size has another file.
-
-    Attributes:
-        error: The first error of a request, in words; empty: none.
-        transferred: The bytes that came so far.
     """
 
     def __init__(self, pool: "urllib3.PoolManager", url: str, size: int) -> None:
-        self.error = ""
-        self.transferred = 0
+        self.error = ""  # the first one of a request, in words
+        self.transferred = 0  # bytes
         self._pool, self._url, self._size = pool, url, size
         self._blocks: dict[int, bytes] = {}
         self._place = 0
