@@ -73,7 +73,7 @@ PARTS = np.array(
 
 @dataclass(frozen=True, eq=False)
 class BesideMice:
-    """Models beside mice. Fits are mean correlations with single mice, corrected for their noise."""
+    """Models beside mice. Fits are mean correlations with mice, corrected for their noise."""
 
     fits: Floats  # (model, mouse) fit to each mouse, of a layer that was chosen on the others
     fit: Floats  # (model,) mean fit of each model; NaN where no layer has an RDM

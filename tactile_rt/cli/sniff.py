@@ -12,7 +12,7 @@ import typer
 from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.cli.options import STDOUT, Json, argument, option
 from tactile_rt.cli.tables import print_table, told_as_json
-from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.errors import ConfigError, SpecMismatch
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 NOTHING = 1  # exit code: nothing fits
 SHOWN = 6  # fits
 DESCRIBE = "frames of one length can be described: codec=binary_frame"
+DOUBTFUL = 0.1  # damaged frames to an intact one, in text
 GUESSED_HZ = 100  # where nothing tells the time
 FORMS = {
-    "raw": "bytes as they are", "hex": "bytes in hexadecimal",
+    "hex": "bytes in hexadecimal",
     "terminal": "lines of text and when each came",
 }  # fmt: skip
 
@@ -210,7 +211,8 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     if path.is_dir():
         raise ConfigError(f"{path} is a folder, and no bag: name a file")
     log = read_log(path)
-    typer.echo(f"{path}: {FORMS.get(log.form, f'a CAN log ({log.form})')}", err=True)
+    if log.form != "raw":
+        typer.echo(f"{path}: {FORMS.get(log.form, f'a CAN log ({log.form})')}", err=True)
     of_bus = log.wire == "can"
     begun: Any = [] if of_bus else bytearray()
     for packet, _ in log.packets():
@@ -219,7 +221,9 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
             break
     data = b"" if of_bus else bytes(begun)
     fits = sniff_frames(begun, further) if of_bus else sniff_bytes(data, further)
-    if fits:
+    # Of text that has rows, frames of which many are damaged are a coincidence.
+    doubtful = log.form == "raw" and data.isascii() and b"\0" not in data
+    if fits and not (doubtful and fits[0].corrupt > DOUBTFUL * fits[0].intact):
         _show(fits, told)
         fields = fits[0].fields
         if not fits[0].described:
@@ -260,6 +264,8 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
 def _sniff_bag(path: Path, told: _Told) -> None:
     from rich.table import Table
 
+    from tactile_rt.classifier.model_card import element_order
+    from tactile_rt.classifier.model_file import read_model, shipped_model
     from tactile_rt.recording import Recording
     from tactile_rt.recording.importing.bag import bag_topics, is_recording
     from tactile_rt.recording.ros2 import messages
@@ -267,7 +273,12 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     if is_recording(path):
         about = Recording(path).description
         told.say(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
-        told.go_on("run", "--source", f"replay:{path}")
+        try:
+            element_order(read_model(shipped_model())[0].array, about.spec)
+        except SpecMismatch:
+            told.go_on("teach", f"replay:{path}?speed=0", "lesson", "--classes", "A,B")
+        else:
+            told.go_on("run", "--source", f"replay:{path}")
         return
     topics = bag_topics(path)
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")

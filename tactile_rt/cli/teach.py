@@ -194,6 +194,9 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
         raise SpecMismatch(f"{error}, or teach in another folder") from None
     typer.echo(_greeting(lesson, source))
     _say(lesson.taught.note)
+    if not source.live and teacher.wanted:
+        order = f"{teacher.each} touches of each, in this order: {', '.join(teacher.wanted)}"
+        _say(f"a recording is taken to hold {order}; --touches tells another number")
     path = lesson.next_recording()
     orders.listen()
     with StreamWriter(path, source, url=url) as writer, closing(_hear(source, orders)) as coming:

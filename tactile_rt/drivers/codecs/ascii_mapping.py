@@ -52,12 +52,18 @@ MOST_BITS: Final = 53  # of a counter: what a float64 holds
 
 _G: Final = 9.80665  # m/s^2
 _SCALES: Final[dict[str, dict[str, float]]] = {  # SI unit: units on the wire, and SI units in each
-    "N": {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "kN": 1e3, "daN": 10.0, "gf": 1e-3 * _G, "kgf": _G},
+    "N": {
+        "N": 1.0, "mN": 1e-3, "uN": 1e-6, "kN": 1e3, "daN": 10.0, "gf": 1e-3 * _G, "kgf": _G,
+        "lbf": 0.45359237 * _G,
+    },
     "N m": {
         "N m": 1.0, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "kNm": 1e3, "Nmm": 1e-3, "Ncm": 1e-2,
         "kgfm": _G,
     },
-    "Pa": {"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "mbar": 1e2},
+    "Pa": {
+        "Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "mbar": 1e2,
+        "psi": 0.45359237 * _G / 0.0254**2,
+    },
     "T": {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9}, "K": {"K": 1.0, "degC": 1.0},
     "rad": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180},
     "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}, "V": {"V": 1.0, "mV": 1e-3, "uV": 1e-6},

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
 from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 
-__all__ = ["guess_columns", "guess_line_columns"]
+__all__ = ["guess_columns", "guess_line_columns", "list_unread_units"]
 
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
@@ -58,7 +58,7 @@ _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
         (_BEGIN + r"(?:t|m|torques?|moment|tau)[\W_]*([xyz])" + _END, "m{}", "Nm"),
         (_BEGIN + r"(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])" + _END, "b{}", ""),
         (_BEGIN + r"(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
-        (r"^(?:force|load|weight)$", "force", ""),
+        (r"^(?:force|load|weight)(?=\d*$)", "force", ""),
         (r"(?<=[\W_])([xyz])(?:$|[\W_])", "{}", ""),
         (_BEGIN + r"(?:pressure|press)(?:$|[\W_])", "pressure", ""),
         (r"(?:^|(?<=\d))([xyz])$", "{}", ""),
@@ -75,6 +75,7 @@ _LABELLED: Final = re.compile(
     r"([A-Za-z_][\w ()\[\]/°%]*?(?:\s*[\[(][^\d\])=:][^\])=:]*[\])])?)\s*[:=\[]\s*([^\s,;|\]]+)"
     rf"(?: (?:{'|'.join(map(re.escape, [*UNITS, *_ALIASES, 'C']))})(?= ))?"
 )
+_WEIGHED: Final = re.compile(r"force|load|weight|mass|cell|grip|press", re.IGNORECASE)
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
 _NAMED: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
 
@@ -101,6 +102,13 @@ def guess_columns(
     plain = {k: f"T{i}.value" for i, k in enumerate(measured)}
     words = _by_names(names, measured) if names else plain
     return [words.get(k, kinds[k] or "-") for k in range(width)], time is not None
+
+
+def list_unread_units(names: Sequence[str], words: Sequence[str]) -> list[str]:
+    """List what stands in brackets behind names of measurements that keep their own unit."""
+    alone = [n for n, w in zip(names, words, strict=False) if w.endswith(":1")]
+    told = [unit.strip() for name in alone for unit in _BRACKET.findall(name)]
+    return [unit for unit in dict.fromkeys(told) if unit not in ("", "-", "1")]
 
 
 def guess_line_columns(data: bytes) -> list[str] | None:
@@ -236,12 +244,14 @@ def _place_time(
     known = known or [k for k, name in enumerate(names) if _IN_SECONDS.search(name)]
     for k in [*known, *(() if known else range(len(series)))]:
         v = series[k]
+        if v is not None and k in known:  # a foot, or a second head, is among them
+            v = v[np.isfinite(v)]
         if v is None or len(v) < 2 or not np.isfinite(v).all():
             continue
         steps = np.diff(v)
         rising = (steps >= 0).all() and v[-1] > v[0]
         if k in known:
-            if rising or (steps >= 0).mean() > MOSTLY:
+            if rising or (steps >= 0).mean() > MOSTLY or (steps < 0).all():  # the newest first
                 return k, f"time:{_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
             # a ramp of a measurement is as steady hardly ever, and none counts from 1970
@@ -319,14 +329,13 @@ def _parsed(name: str) -> tuple[str, str, str]:
     bare = _bare(name)
     if not unit and (tail := _TAIL_UNIT.search(bare)):
         unit, bare = _ALIASES.get(tail[1].lower(), tail[1]), bare[: tail.start()]
+    unit = "gf" if unit == "g" and _WEIGHED.search(bare) else unit  # and no acceleration
     for pattern, channel, usual in _QUANTITY:
         if (found := pattern.search(bare)) is None:
             continue
         axis = next((g for g in found.groups() if g), "").lower()
         if channel == "temperature" and unit not in ("K", "degC"):
             unit = ""  # F is farad, and no unit of a temperature
-        elif channel == "force" and unit == "g":
-            unit = "gf"
         rest = bare[: found.start()] + " " + bare[found.end() :]
         rest = re.sub(r"(?i)(?:^|\W)(?:field|wrench|data|msg)(?=\W|$)", " ", rest)
         element = _PLAIN.sub("_", rest).strip("_-") or "S"

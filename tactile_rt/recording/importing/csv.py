@@ -35,9 +35,11 @@ _REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a s
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
-    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|%|m?bar|counts?"
+    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|lbf|psi|%|m?bar|counts?"
     r"|(?:[munkhcM\u00b5]|da)?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)|[muk]?N[ .*\u00b7-]?[mc]?m"
 )
+THOUSAND: Final = " (a thousand?)"
+_THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+\s*")
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
 _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
     r"[\[(](?=[\s\[(]*(?:[-+.]*\d|nan\b))(?=[^\])]*[\s,;])"
@@ -108,16 +110,29 @@ def read_table(path: Path, form: CsvForm) -> Table:
 
 
 def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
+    order: list[int] = []  # of the columns, where another header stands
+    shortest = length = LONGEST  # of all lines but the last; of the last
+    cut: list[str] = []
     with open_log_file(table.path) as file, _text(file) as text:
-        for line in _joined(text, form.first, form.lines):
+        for k, line in enumerate(_joined(text, form.first, form.lines, cut), start=1):
             if _REMARK.match(line) or not line.strip(" \t,;") or line.strip() in form.heads:
                 continue
+            table.line = form.first + k * form.lines
+            shortest, length = min(shortest, length), len(line)
             cells = _cells(line, form.delimiter, form.comma)
+            words = [c.strip(' "') for c in cells]
+            if len(words) == len(form.names) and set(words) == set(form.names):
+                order = [words.index(name) for name in form.names]
+                if order != sorted(order):
+                    table.notes.append(f"columns stand in another order from line {table.line} on")
+                continue
             lack = form.width - len(cells)
             ended = lack == 1 and line.rstrip(" ").endswith(form.delimiter)
             if lack and (ended or len(cells) in form.widths):
                 cells = [*cells, *[""] * lack][: form.width]
-            yield cells
+            yield [cells[k] for k in order] if len(order) == len(cells) else cells
+        if cut and length < shortest:
+            table.notes.append(f"its last line, {cut[0]!r:.40}, has no end: it may be cut")
         if getattr(getattr(file, "raw", None), "broken", False):
             table.notes.append("it is cut short or damaged: what unpacks of it was read")
 
@@ -132,11 +147,19 @@ def _text(file: Any) -> TextIOWrapper:
     return TextIOWrapper(file, encoding, "replace", newline="")
 
 
-def _joined(text: TextIOWrapper, skip: int, lines: int) -> Iterator[str]:
-    """The rows' texts, ``lines`` of the file each, after those that are skipped."""
+def _joined(
+    text: TextIOWrapper, skip: int, lines: int, cut: list[str] | None = None
+) -> Iterator[str]:
+    """The rows' texts, ``lines`` of the file each, after those that are skipped.
+
+    Args:
+        cut: gets the last line, if that has no end.
+    """
     begun: list[str] = []
     # a line ends as anybody ends lines; one that does not end is cut
     for line in islice(iter(lambda: text.readline(LONGEST), ""), skip, None):
+        if cut is not None and line[-1] not in "\r\n" and len(line) < LONGEST:
+            cut.append(line)
         line = re.sub(r"\u2212(?=[.,]?\d)", "-", line)  # a minus of typographers
         for part in line.rstrip("\r\n").split("\r"):
             begun.append(part)
@@ -159,6 +182,8 @@ def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
         cells = [x for c in cells for x in (_split_list(c) if _LIST.search(c) else (c,))]
     if len(cells) > 1 and line.rstrip(" ").endswith(delimiter):
         del cells[-1]  # a delimiter at the end of each line
+    if comma:  # where 1.000 is a thousand, or the decimal mark is another after all
+        cells = [c + THOUSAND if _THOUSANDS.fullmatch(c) else c for c in cells]
     return [c.replace(",", ".") if comma and _COMMA.fullmatch(c) else c for c in cells]
 
 
@@ -170,7 +195,7 @@ def _split_list(cell: str) -> list[str]:
 
 def _is_there(cell: str) -> bool:
     """Whether this may stand where numbers do."""
-    return number(cell.strip() or "nan") is not None or _is_number(cell)
+    return number(cell.strip() or "nan") is not None or _is_number(cell) or THOUSAND in cell
 
 
 def _is_number(cell: str) -> bool:

@@ -10,7 +10,12 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
-from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, guess_line_columns
+from tactile_rt.drivers.codecs.column_guess import (
+    LOOKED_AT,
+    guess_columns,
+    guess_line_columns,
+    list_unread_units,
+)
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
@@ -93,6 +98,8 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     said = f"{path} is a table of {form.width} columns"
     left = [n for n, word in zip(form.names, words, strict=False) if word == "-"]
     said += f" (left out: {shown_names(left)})" if left else ""
+    unread = list_unread_units(names, words)
+    said += f"; units that are not read: {shown_names(unread)}" if unread else ""
     if not any("." in word for word in words if not word.startswith("time")):
         none = f"no number of a measurement in {shown_names(left)}"
         return ProposedColumns("", True, timed, none) if left and timed else None

@@ -70,6 +70,7 @@ class Table:
     times_ns: list[int] | None = None
     # what could not be read, a sentence each; complete once all rows were read
     notes: list[str] = field(default_factory=list)
+    line: int = 0  # number of the line of a text that was read last
     width: int = 0  # number of cells of every row that is whole; 0 where rows may be of any
 
 
@@ -150,7 +151,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         if rate_hz and not 0.8 < told / rate_hz < 1.2:
             account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
         if told > FASTEST_HZ:
-            account.notes.append(f"{told:.4g} Hz by its times is too fast: in days (time:days)?")
+            account.notes.append(f"{told:.4g} Hz by its times is too fast: another unit of time?")
         spec = replace(spec, rate_hz=rate_hz or told)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     session = {"imported": table.path.name, "columns": columns}
@@ -232,7 +233,7 @@ def _read(
                 counts.append(int(count))
         except (ValueError, OverflowError) as error:
             corrupt += 1
-            complaint = complaint or str(error)
+            complaint = complaint or (f"line {table.line}: " if table.line else "") + str(error)
             continue
         rows.append(row)
         times.append(t_ns)
@@ -265,9 +266,9 @@ def _time(cell: Any, column: Column) -> int:
         ns = (Decimal(text) * Decimal(column.scale) + Decimal(column.offset)) * NS[column.kind]
         if abs(ns) < 1 << 62:
             return round(ns)
+        hint = f": too large for time:{column.kind}"
     except InvalidOperation:  # it is no number
-        pass
-    hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
+        hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
     raise ValueError(f"{cell!r:.40} is no time{hint}")
 
 

@@ -85,12 +85,17 @@ def import_wire(
     if stats.duplicates:
         account.notes.append(f"{stats.duplicates} samples came twice")
     came_hz = (account.samples + account.missing - 1) / (account.seconds or 1.0)
-    if account.samples >= FEW and not getattr(codec, "claims_rate", True):
-        if f"{came_hz:.4g}" != f"{account.rate_hz:.4g}":
-            return import_wire(log, output, fields, float(f"{came_hz:.6g}"))
-    account.said_hz = account.rate_hz
+    claimed = getattr(codec, "claims_rate", True)
     if account.found_hz is not None:
         account.found_hz = came_hz
+        other = f"{came_hz:.4g}" != f"{account.rate_hz:.4g}"
+        if account.samples >= FEW and not claimed and other:
+            made = import_wire(log, output, fields, float(f"{came_hz:.6g}"))
+            made.said_hz = None
+            return made
+    elif not claimed:
+        account.notes.append(f"nothing tells their rate: {account.rate_hz:g} Hz, or say --rate")
+    account.said_hz = account.rate_hz if claimed else None
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
         account.notes.append(
             f"they came at {came_hz:.4g} Hz, not at {account.rate_hz:g} Hz as is claimed: --rate "
@@ -108,6 +113,8 @@ def _count(log: LineLog, decoded: "_Decoded", account: Import) -> None:
     account.passed_over = account.total - account.read
     account.out_of_order = log.back.n
     account.found_hz = 1.0 if decoded.timed else None
+    if decoded.clock_steps:
+        account.notes.append(f"the device's clock goes back {decoded.clock_steps} times")
     if decoded.corrupt.n:
         account.notes.append(f"corrupt frames: {decoded.corrupt}")
 
@@ -206,6 +213,12 @@ class _Decoded:
     def unfinished(self) -> int:
         """Count the bytes after the last sample or line of text."""
         return int(getattr(self._codec, "unfinished", self._rest))
+
+    @property
+    def clock_steps(self) -> int:
+        """Count how often the device's own clock went back or began anew."""
+        clock = self._stamper.clock
+        return clock.steps if isinstance(clock, DeviceTime) else 0
 
     def _take(self, packet: Any, t_ns: int | None) -> Samples | None:
         """Feed a packet, and note what it damages."""

@@ -28,7 +28,14 @@ from tactile_rt.core.files import check_no_pointer
 from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.mesh_formats import MOST_NODES, check_number, load_meshes
 
-__all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
+__all__ = [
+    "MESH_SUFFIXES",
+    "UNREAD_SUFFIXES",
+    "check_mesh_file",
+    "mesh_content",
+    "read_parts",
+    "read_triangles",
+]
 
 MOST_UNPACKED: Final = 256 << 20  # bytes of an archive ...
 MOST_RATIO: Final = 100  # ... and times its own size; XML of numbers has 10
@@ -186,6 +193,7 @@ READERS: Final[dict[str, Callable[[Path, bytes], list[trimesh.Trimesh]]]] = {
     ".3mf": _read_3mf,
 }
 MESH_SUFFIXES = tuple(READERS)
+UNREAD_SUFFIXES = (".step", ".stp", ".iges", ".igs", ".fbx", ".3ds", ".wrl", ".usdz", ".blend")
 
 
 def check_mesh_file(path: Path) -> None:

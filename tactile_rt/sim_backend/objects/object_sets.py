@@ -25,7 +25,7 @@ import msgspec
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import check_columns, convert, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
-from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
+from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES, UNREAD_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
@@ -133,7 +133,11 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
         named = [(called.get(p.parents[2].name, p.parents[2].name), p.parents[1].name, p)
                  for p in shapenet]  # fmt: skip
         return ObjectSet(folder, _named(folder, named), replace(detail, up=detail.up or "y"))
-    plain = sorted(p for p in folder.glob("[!.]*/[!.]*") if p.suffix.lower() in MESH_SUFFIXES)
+    files = sorted(folder.glob("[!.]*/[!.]*"))
+    plain = [p for p in files if p.suffix.lower() in MESH_SUFFIXES]
+    read = {p.with_suffix("") for p in plain}
+    unread = [p for p in files if p.suffix.lower() in UNREAD_SUFFIXES]
+    plain += [p for p in unread if p.with_suffix("") not in read]  # which are named, and why
     if not plain:
         raise ConfigError(
             f"{folder}: holds no objects: expected category/object.obj (or "
