@@ -232,4 +232,5 @@ def test_a_recording_is_known(call, cwd):
     (cwd / "raw.bin").write_bytes(spoken("serial", "bota"))
     call("import", "raw.bin", "--as", "codec=bota")
     code, said, _ = call("sniff", "raw.mcap")
-    assert code == 0 and next_command(said) == ["run", "--source", "replay:raw.mcap"]
+    teach = ["teach", "replay:raw.mcap?speed=0", "lesson", "--classes", "A,B"]
+    assert code == 0 and next_command(said) == teach, "the model that ships is of another array"

@@ -211,7 +211,7 @@ BAD_COLUMNS = [
     ("A0fx", "columns[0]: 'A0fx' is no column: write ELEMENT.CHANNEL"),
     ("A0.fx,A0.fx", "columns: A0.fx stands there twice"),
     ("A0.fx,A1.fy", "columns: no column A0.fy; every element needs every channel"),
-    ("A0.fx:lbf", "columns[0]: unknown unit 'lbf'; there are N, mN"),
+    ("A0.fx:ozf", "columns[0]: unknown unit 'ozf'; there are N, mN"),
     ("A0.fx*big", "columns[0]: scale must be a number other than 0, not 'big'"),
     ("count:99,A0.fx", "columns[0]: a counter has 1 to 53 bits, not 99"),
     ("count,A0.fx,count", "columns: count stands there twice"),

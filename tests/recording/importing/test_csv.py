@@ -65,6 +65,29 @@ def test_a_table_is_read_as_it_is_written(table, name):
     assert about.spec.rate_hz == 100 and about.spec.units == ("N", "N")
 
 
+def test_a_thousand_with_a_point_is_no_one(table):
+    lines = ["t;F\n", *(f"0,{k:02d};{v}\n" for k, v in enumerate(["999", *["1.000"] * (N - 1)]))]
+    made, chunk, _ = table(lines, "t=time:s,F=S.v:1")
+    assert chunk.values.ravel().tolist() == [999.0] and made.corrupt == N - 1
+    assert "line 3: '1.000 (a thousand?)' is no number" in made.notes[0]
+
+
+def test_columns_that_change_places_are_read_by_their_names(table):
+    second = "".join(f"{-k},{N + k},{k}\n" for k in range(N))
+    first = "".join(f"{k},{k},{-k}\n" for k in range(N))
+    made, chunk, _ = table(f"t,x,y\n{first}y,t,x\n{second}", "t=time:s,x=S.fx,y=S.fy")
+    assert made.notes == [f"columns stand in another order from line {N + 2} on"]
+    assert chunk.values[:, 0].tolist() == [[k, -k] for k in (*range(N), *range(N))]
+
+
+def test_a_last_line_that_is_cut_in_a_number_is_told(table):
+    text = "t,x\n" + "".join(f"{k / 100:.2f},{1000 + k}\n" for k in range(N))
+    assert table(text, "t=time:s,x=S.fx")[0].notes == []
+    assert table(text[:-1], "t=time:s,x=S.fx")[0].notes == [], "it is whole"
+    (note,) = table(text[:-3], "t=time:s,x=S.fx")[0].notes
+    assert note == "its last line, '0.49,10', has no end: it may be cut"
+
+
 def test_a_column_that_is_seldom_there_is_a_column(table):
     lines = (f"{k / 100},nan,{20 + k if k % 10 == 0 else ''}\n" for k in range(N))
     columns = "t=time:s,fx=A0.value:1,temp=T0.value:1"
