@@ -15,7 +15,7 @@ import typer
 from tactile_rt.cli.app import app, check_folder, check_text, leaving, open_url
 from tactile_rt.cli.options import Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.core.errors import ConfigError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
     from tactile_rt.core.stream import Chunk, Source
@@ -29,6 +29,7 @@ HINT_S = 20.0  # without a touch, before it is said how strong the readings are;
 SILENT_S = 3.0  # without a sample, in a lesson: it is said at once
 RESTS = 3  # tries to be at rest
 PAGE_S = 1.5  # a page asks twice a second
+DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 RESTING = f"touch nothing for {REST_S:g} s"
 HELP = (
     "type and press Enter: a name or its number, n the next, u takes a touch back, q learns; "
@@ -306,14 +307,14 @@ def _address(given: str) -> tuple[str, int]:
 
 def _begun(folder: Path, source: "Source") -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
-    from tactile_rt.calibration.taring import record
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.listener import find_motion, measure_changes, measured_floor
     from tactile_rt.teaching.model import FewShot
 
+    chunks: list[Chunk] = []
     for _ in range(RESTS):
         typer.echo(RESTING)
-        chunks = record(source, REST_S)
+        chunks = _take_rest(source) or chunks
         if not (moved := find_motion(chunks, source.spec)):
             break
         typer.echo(f"that was no rest: {moved} moved")
@@ -321,6 +322,26 @@ def _begun(folder: Path, source: "Source") -> "Lesson":
         typer.echo("going on without a rest: light touches will be missed")
     taught = FewShot(source.spec, measured_floor(chunks), measure_changes(chunks))
     return Lesson.begun(folder, taught)
+
+
+def _take_rest(source: "Source") -> "list[Chunk]":
+    from tactile_rt.core.stream import EndOfStream
+
+    chunks: list[Chunk] = []
+    samples, needed = 0, REST_S * source.spec.rate_hz
+    heard = time.monotonic()
+    while samples < needed:
+        try:
+            chunk = source.read(POLL_S)
+        except EndOfStream:
+            break
+        if chunk is not None and len(chunk):
+            chunks.append(chunk)
+            samples += len(chunk)
+            heard = time.monotonic()
+        elif time.monotonic() - heard > DEAF_S:
+            raise SourceError(f"no sample came for {DEAF_S:g} s: is the device on, and its codec?")
+    return chunks
 
 
 def _greeting(lesson: "Lesson", source: "Source") -> str:
