@@ -2,7 +2,7 @@
 
 source --> push ----+
                     +--> bounded queue --(thread)--> RecordingWriter --> FILE.mcap
-device --> tap -----+
+device --> tap -----+                                (or one after another)
 """
 
 import errno
@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -20,6 +19,7 @@ from tactile_rt.core.stream import Chunk, Source
 from tactile_rt.drivers.device_source import device_of
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet, encode_packet, encode_samples
+from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Syncer
 from tactile_rt.recording.writer import RecordingWriter, WriterStats
 
@@ -52,6 +52,12 @@ class StreamWriter:
         flush_s: between two writes to the file.
         sync_s: between two syncs, which put the file on the medium; 0: only at its end.
         queue_bytes: that may wait for the disk.
+        rotate_mb: begin a new file beyond so many MB; 0: never. Files that are rotated are named by
+            their beginning, too: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
+        rotate_s: begin a new file after so many seconds; 0: never.
+
+    Attributes:
+        path: The path of the file that is being written, or was last.
 
     Raises:
         ConfigError: the file is there already, its folder is not, or the extra is not installed.
@@ -68,34 +74,45 @@ class StreamWriter:
         flush_s: float = FLUSH_S,
         sync_s: float = SYNC_S,
         queue_bytes: int = QUEUE_BYTES,
+        rotate_mb: float = 0.0,
+        rotate_s: float = 0.0,
     ) -> None:
-        self.path = Path(path)
+        self.path, self.files = Path(path), 0
         self._source, self._device = source, device_of(source)
-        # It is synced at once, so a power cut hardly ever leaves a name without a description.
+        self._url, self._session = url, dict(session or {})
+        rotation = Rotation(self.path.parent, self.path.stem, rotate_mb, rotate_s)
+        self._rotation = rotation if rotate_mb or rotate_s else None
         self._flush_s, self._sync_s, self._sync_at = flush_s, sync_s, 0.0
+        self._past: list[RecordingWriter] = []  # closed, and perhaps not on the medium yet
         self._syncer = Syncer()
         self._queue = BoundedQueue[Entry](size=queue_bytes, measure=_measure, kinds=(SAMPLES, WIRE))
         self._stop, self._asked, self._flushed = (threading.Event() for _ in range(3))
         self._error: Exception | None = None
         self._closed = False
+        self._prelude: list[tuple[Packet, int]] = []
         try:
             with _explained(self.path):
-                self.about = describe(source, url, session)
-                self._writer = RecordingWriter(
-                    self.path, source, self.about, force=force, syncer=self._syncer
-                )
+                self._now = (WriterStats(), self._begin(force))  # of finished files; the open one
         except BaseException:
             self._syncer.close()
             raise
         self._thread = threading.Thread(target=self._run, name="tactile-rt-recorder", daemon=True)
         self._thread.start()
         if self._device is not None:
+            self._device.tap(lambda packet, t_ns: self._prelude.append((packet, t_ns)))
+            for packet, t_ns in self._prelude:
+                self._packet(packet, t_ns)
             self._device.tap(self._packet)
 
     @property
     def stats(self) -> WriterStats:
-        """What became of what was to be recorded; from any thread."""
-        return replace(self._counted().stats)
+        """What became of what was to be recorded, over all files; from any thread."""
+        (past, writer), dropped = self._now, self._queue.dropped
+        done = writer.stats
+        return WriterStats(
+            past.samples + done.samples, past.packets + done.packets,
+            dropped[SAMPLES], dropped[WIRE], past.bytes + done.bytes,
+        )  # fmt: skip
 
     def push(self, chunk: Chunk) -> None:
         """Record a chunk; returns at once, but lets a source that is not live wait for the disk.
@@ -150,7 +167,8 @@ class StreamWriter:
         except OSError as error:  # also what is still buffered may find no room
             self._error = self._error or error
         self._syncer.close()
-        self._error = self._error or writer.failed
+        for file in (*self._past, writer):
+            self._error = self._error or file.failed
         if self._error is not None:
             raise self._broken()
 
@@ -175,6 +193,21 @@ class StreamWriter:
     def _packet(self, packet: Packet, t_ns: int) -> None:
         each = 1 if isinstance(packet, bytes) else FRAME_BYTES
         self._queue.put((WIRE, packet, t_ns, ITEM_BYTES + each * len(packet or ())))
+
+    def _begin(self, force: bool) -> RecordingWriter:
+        """Begin the first file, or the next; it is described as the source is now."""
+        self.about = describe(self._source, self._url, self._session)
+        if self._rotation is None:
+            writer = RecordingWriter(
+                self.path, self._source, self.about, force=force, syncer=self._syncer
+            )
+        else:
+            writer = self._rotation.begin(
+                self._source, self.about, prelude=self._prelude, syncer=self._syncer
+            )
+        self._sync_at = 0.0  # so a power cut hardly ever leaves a name without a description
+        self.path, self.files = writer.path, self.files + 1
+        return writer
 
     # in the thread
 
@@ -203,7 +236,7 @@ class StreamWriter:
 
     def _write(self, topic: str, what: Any, t_ns: int, size: int) -> None:
         encoded = encode_samples(what) if topic == SAMPLES else encode_packet(what, self.about.wire)
-        self._writer.add(topic, encoded, t_ns)
+        self._now[1].add(topic, encoded, t_ns)
 
     def _flush(self) -> float:
         writer = self._counted()
@@ -213,18 +246,26 @@ class StreamWriter:
         else:
             writer.flush()
         _check_there(writer)
-        if writer.failed is not None:
-            raise writer.failed
+        for file in (*self._past, writer):
+            if file.failed is not None:
+                raise file.failed
+        self._past = [file for file in self._past if not file.done]
+        if self._rotation is not None and self._rotation.is_due(writer):
+            writer.close()
+            self._past.append(writer)
+            past = self.stats
+            self._now = past, self._begin(False)
         return time.monotonic() + self._flush_s
 
     def _is_sync_due(self) -> bool:
         return self._sync_s > 0 and time.monotonic() >= self._sync_at
 
     def _counted(self) -> RecordingWriter:
-        """Tell the file what was dropped."""
-        dropped, stats = self._queue.dropped, self._writer.stats
-        stats.dropped_samples, stats.dropped_packets = dropped[SAMPLES], dropped[WIRE]
-        return self._writer
+        """The open file, told what was dropped since it was begun."""
+        (past, writer), dropped = self._now, self._queue.dropped
+        writer.stats.dropped_samples = dropped[SAMPLES] - past.dropped_samples
+        writer.stats.dropped_packets = dropped[WIRE] - past.dropped_packets
+        return writer
 
 
 def _check_there(writer: RecordingWriter) -> None:
