@@ -42,9 +42,9 @@ def call_command(*arguments: str) -> tuple[int, str, str]:
     """Call `tactile-rt` in this process; return its exit code, stdout and stderr."""
     import typer.main
 
-    from tactile_rt.cli import main, progress
+    from tactile_rt.cli import main, tables
 
-    progress.LINE_S = threading.TIMEOUT_MAX
+    tables.LINE_S = threading.TIMEOUT_MAX
     if not hasattr(typer.main.get_command, "cache_info"):  # made once, not for each of hundreds
         typer.main.get_command = cache(typer.main.get_command)
     out, err, argv, code = io.TextIOWrapper(io.BytesIO()), io.StringIO(), sys.argv, 0

@@ -189,7 +189,7 @@ def progress_bar(
 
 @contextmanager
 def share_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar of work that tells which share of it is done, 0 to 1."""
+    """Show the share of work that is done, 0 to 1, as a bar."""
     with progress_bar(what, total=1.0) as update:
         yield lambda share: update(completed=share)
 

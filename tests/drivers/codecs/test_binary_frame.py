@@ -204,7 +204,7 @@ MISTAKES = [
     ('sync = "A5 5A"\nends = "0D"', "", r"bytes that each frame begins with, or ends"),
     ('elements = ["A0", "A1", "B0", "B1"]   #', "elements = [2, 2, 2]  #", r"rows \(26 at most\)"),
     ('elements = ["A0", "A1", "B0", "B1"]   #', "elements = [2, 101]  #", r"100 columns at most"),
-    ('unit = "kPa"', 'unit = "psi"', r"values\[1\]: unknown unit 'psi'; there are N, mN"),
+    ('unit = "kPa"', 'unit = "torr"', r"values\[1\]: unknown unit 'torr'; there are N, mN"),
     ("scale = 0.5", "scale = 0", r"values\[1\]: scale must be numbers other than 0"),
     ("scale = 0.5", "scale = [1.0, 2.0]", r"scale: one for all channels, or one for each"),
     ('type = "uint8"\nelements', 'type = "uint9"\nelements', r":\d+: values\[1\]\.type"),
