@@ -228,6 +228,23 @@ def test_what_is_nothing_at_all_is_one_line(refused, cwd):
     assert "is a folder" in refused("sniff", ".")
 
 
+def test_a_time_is_one_also_from_its_end_and_above_a_foot(call, cwd):
+    rows = [f"{k / 100},{k}\n" for k in range(60)]
+    for text in ("".join([*rows, "mean,29.5\n"]), "".join(rows[::-1])):
+        (cwd / "t.csv").write_text(f"t,F [furlong]\n{text}")
+        code, said, _ = call("sniff", "t.csv")
+        assert code == 0 and "units that are not read: furlong" in said
+        assert next_command(said)[-1] == "t=time:s,F [furlong]=F.value:1"
+
+
+def test_text_with_rows_is_no_protocol_of_which_much_is_damaged(call, cwd):
+    (cwd / "t.csv").write_text(
+        "t,F,note\n" + "".join(f'{k / 100:.2f},{k},"a\nb"\n' for k in range(99))
+    )
+    code, said, _ = call("sniff", "t.csv")
+    assert code == 1 and "most lines are no rows" in said and "ati" not in said
+
+
 def test_a_recording_is_known(call, cwd):
     (cwd / "raw.bin").write_bytes(spoken("serial", "bota"))
     call("import", "raw.bin", "--as", "codec=bota")

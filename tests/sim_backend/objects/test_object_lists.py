@@ -95,6 +95,10 @@ def test_objects_come_out_of_a_folder_of_clones(shapes, tmp_path: Path, call) ->
     ]
     code, out, _ = call("objects", "check", tmp_path / "got")
     assert code == 0 and "chair" in out
+    for name in ("bolt.step", "one.step"):  # of the other there is a mesh
+        (tmp_path / "got" / "chair" / name).write_text("ISO-10303-21;")
+    code, _, said = call("objects", "check", tmp_path / "got")
+    assert code == 1 and "bolt.step: unknown mesh format" in said and "one.step" not in said
 
 
 def test_a_second_list_takes_nothing_away_of_the_first(shapes, tmp_path: Path, call) -> None:
