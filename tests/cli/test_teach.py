@@ -143,7 +143,7 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
             "touches kept: 0, too few",
         ),
     ):
-        code, _, err = call("teach", *arguments, "--seconds", "2")
+        code, _, err = call("teach", *arguments, "--seconds", "60")
         assert code == 2 and said in err and err.count("\n") == 1, (arguments, err)
     assert (folder / LABELS).exists()
 
