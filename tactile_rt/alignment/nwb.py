@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment import nwb_parts as parts
-from tactile_rt.alignment.clock import ContactResponse, contact_response
+from tactile_rt.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.alignment.neural import NeuralSession
 from tactile_rt.alignment.rdm import Floats, stimulus_index
 from tactile_rt.alignment.selection import Selection
@@ -123,6 +123,9 @@ def read_session(
     selection: Selection | None = None,
 ) -> Reading:
     """One NWB file; see `read_nwb`."""
+    for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
+        if value not in known:
+            raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
     h5py = _import_h5py()
     check_no_pointer(path)
     with explain_errors(ConfigError, f"{path}: cannot be read as NWB ("):

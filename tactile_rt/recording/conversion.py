@@ -21,7 +21,6 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -46,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["about_text", "convert", "write_bag"]
 
 COLUMNS = ("seq", "t_ns", "values", "valid")
-BLOCK = 1 << 10  # chunks that are written at once
+BLOCK = 1 << 14  # samples that are written at once
 PIECE = 1024  # samples that HDF5 stores together, with a checksum
 
 
@@ -169,12 +168,18 @@ def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
 
 
 def _read_blocks(recording: Recording) -> Iterator[Chunk]:
-    """Read the samples, some `BLOCK` chunks at a time; refuse a recording without any."""
-    chunks, n = iter(recording), 0
-    while parts := list(islice(chunks, BLOCK)):
-        n += len(parts)
-        yield concatenate(parts)
-    if not n:
+    """Read the samples, some `BLOCK` at a time; refuse a recording without any."""
+    waiting: list[Chunk] = []
+    n = total = 0
+    for chunk in recording:
+        waiting.append(chunk)
+        n, total = n + len(chunk), total + len(chunk)
+        if n >= BLOCK:
+            yield concatenate(waiting)
+            waiting, n = [], 0
+    if waiting:
+        yield concatenate(waiting)
+    if not total:
         raise RecordingError(f"{recording.path} has no samples")
 
 
