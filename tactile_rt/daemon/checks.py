@@ -6,6 +6,7 @@ Nothing is opened, and no device is asked; files that are named must be there.
 import ipaddress
 import os
 import re
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -239,6 +240,8 @@ def _check_folder(loaded: Loaded, folder: str) -> None:
     above = next((p for p in place.parents if os.path.lexists(p)), None)
     if above is not None and not os.path.isdir(above):
         loaded.refuse(["recorder", "folder"], f"{folder!r}: {above} is not a folder")
+    elif above is not None and not shutil.disk_usage(above).total:  # as of /proc and /sys
+        loaded.refuse(["recorder", "folder"], f"{folder!r}: {above} is on no disk")
 
 
 def _addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:

@@ -51,6 +51,7 @@ GLB_JSON: Final = struct.Struct("<4sIIII")  # head of the file and of its first 
 DRACO: Final = b"DRACO"
 NO_GLTF: Final = (ValueError, KeyError, TypeError, AttributeError, IndexError)
 POINT = 1e-9  # of all extents: smaller is none
+STRAY, AWAY = 5e-3, 3.0  # share of the area that may not make a mesh so many times longer
 TO_Z_UP: Final = {  # from the axis that points up
     "x": np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
@@ -131,10 +132,10 @@ def _read_buffers(path: Path, scene: Any) -> Iterator[bytes]:
         elif uri:
             beside = path.parent / unquote(uri)
             if not beside.is_file():
-                raise ValueError(f"{uri}, which it names, is not beside it; copy both")
+                raise ConfigError(f"{path}: {uri}, which it names, is not beside it; copy both")
             check_no_pointer(beside)
             if beside.stat().st_size < buffer["byteLength"]:
-                raise ValueError(f"{uri}, which it names, is cut short; copy it again")
+                raise ConfigError(f"{path}: {uri}, which it names, is cut short; copy it again")
             yield beside.read_bytes()
 
 
@@ -215,7 +216,7 @@ def mesh_content(path: Path) -> bytes:
     """Return the bytes of a mesh file and of the files of numbers that a .gltf names."""
     content = path.read_bytes()
     if path.suffix.lower() == ".gltf" and content.count(b"{") <= MOST_OBJECTS:
-        with suppress(*NO_GLTF, RecursionError):
+        with suppress(*NO_GLTF, RecursionError, ConfigError):
             content += b"".join(_read_buffers(path, json.loads(content)))
     return content
 
@@ -238,6 +239,14 @@ def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
     largest = max(mesh.extents.max(), np.abs(mesh.bounds).max())
     if np.sort(mesh.extents)[1] <= POINT * largest:
         raise ConfigError(f"{paths[0]}: all its triangles lie on one line; export it again")
+    axis = mesh.extents.argmax()
+    order = mesh.triangles_center[:, axis].argsort()
+    area = mesh.area_faces[order].cumsum()
+    first, last = np.searchsorted(area, [STRAY * area[-1], (1 - STRAY) * area[-1]])
+    most = np.ptp(mesh.triangles[order[first : last + 1], :, axis])
+    if mesh.extents[axis] > AWAY * most:
+        long = f"{mesh.extents[axis]:.3g} long, but nearly all of it within {most:.3g}"
+        raise ConfigError(f"{paths[0]}: {long}; delete what lies far from the rest")
     return mesh
 
 

@@ -200,6 +200,12 @@ def test_triangles_on_a_line_are_refused(tmp_path: Path) -> None:
     refuse(path, "all its triangles lie on one line")
 
 
+def test_a_crumb_far_from_the_object_is_refused(tmp_path: Path) -> None:
+    both = [box((0, 0, 0), (1, 0.5, 0.5)), box((99, 0, 0), (0.01, 0.01, 0.01))]
+    path = save(trimesh.util.concatenate(both), tmp_path / "crumb.stl")
+    refuse(path, "99.5 long, but nearly all of it within 1; delete what lies far from the rest")
+
+
 def test_which_way_is_up_can_be_said(tmp_path: Path) -> None:
     mesh = box((0, 0, 0), (1, 0.5, 0.25))
     path = save(mesh, tmp_path / "brick.stl")
