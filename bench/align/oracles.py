@@ -67,7 +67,7 @@ def by_rsa(session: NeuralSession, layer: Floats) -> float:
 
 def by_rsa_time(session: NeuralSession, layer: Floats) -> float:
     """The metric ``rsa-time``, in bins in which the animal is reliable, by rsatoolbox."""
-    from tactile_rt.alignment.metrics.geometry import time_course
+    from tactile_rt.alignment.metrics.rsa_cka import time_course
 
     assert session.course is not None
     found = time_course(Animal("mouse", (session,)))

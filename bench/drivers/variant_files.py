@@ -517,8 +517,8 @@ def _read_session(path: Path) -> tuple[Any, Sequence[str]]:
 
 def make_recordings(folder: Path) -> Iterator[Variant]:
     """Yield recordings, each with one thing changed."""
-    from tactile_rt.recording.importing.csv import csv_form, read_table
     from tactile_rt.recording.importing.table import import_table
+    from tactile_rt.recording.importing.table_form import csv_form, read_table
 
     table, path, out = next(make_texts(folder, "table")), folder / "made.csv", folder / "made.mcap"
     path.write_bytes(table.content())

@@ -24,7 +24,7 @@ from bench.perception.scores import Figures, robustness, score
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation.coverage import (
+from tactile_rt.models.evaluation.measured_coverage import (
     Coverage,
     measure_coverage,
     measure_names,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from bench.perception.data import Data
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.export.release import fit_temperature
+from tactile_rt.export.decision_thresholds import fit_temperature
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance

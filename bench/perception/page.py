@@ -22,7 +22,7 @@ from bench.perception.data import NAME, SHAPES_FILE, Data
 from bench.perception.folds import KINDS, TEST_KINDS
 from bench.perception.methods import Method
 from bench.perception.scores import Figures
-from tactile_rt.models.evaluation.coverage import NAMES_LEFT, Coverage
+from tactile_rt.models.evaluation.measured_coverage import NAMES_LEFT, Coverage
 from tactile_rt.models.evaluation.measures import Interval
 
 PAGE = Path("docs/reference/realtouch-2.md")

@@ -15,7 +15,7 @@ from tactile_rt.alignment.datasets import NeuralDataset
 from tactile_rt.alignment.json_file import Number
 from tactile_rt.alignment.layers import Layers
 from tactile_rt.alignment.metrics import METRICS, Measure, find_metric
-from tactile_rt.alignment.metrics.halves import LONGEST, bins_of, means_of, sessions_of
+from tactile_rt.alignment.metrics.noise_ceiling import LONGEST, bins_of, means_of, sessions_of
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.alignment.selection import part_of

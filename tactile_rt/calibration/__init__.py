@@ -2,18 +2,24 @@
 
 output = mirror(map(matrix @ (raw - tare)))
 
-correction         what one device needs, applied to its chunks
-calibrated_source  the same on a whole source, which may be declared to be another array's
-files              stored per device id, as TOML that people can read
-taring             offsets and noise, measured while nothing is touched
-fitting            tables of known loads, and the matrix that they give
+device_calibration  what one device needs, applied to its chunks: tare, matrix, mapping, mirror
+calibrated_source   the same on a whole source, which may be declared to be another array's
+files               stored per device id, as TOML that people can read
+tare_measurement    offsets and noise, measured while nothing is touched
+calibration_fit     tables of known loads, and the matrix that they give
 """
 
 from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declared
-from tactile_rt.calibration.correction import Calibration, Mirror
+from tactile_rt.calibration.calibration_fit import (
+    Fit,
+    LoadTable,
+    calibrate,
+    raw_readings,
+    read_loads,
+)
+from tactile_rt.calibration.device_calibration import Calibration, Mirror
 from tactile_rt.calibration.files import calibration_path, load_calibration, save_calibration
-from tactile_rt.calibration.fitting import Fit, LoadTable, calibrate, raw_readings, read_loads
-from tactile_rt.calibration.taring import Tare, tare
+from tactile_rt.calibration.tare_measurement import Tare, tare
 
 __all__ = [
     "CalibratedSource",

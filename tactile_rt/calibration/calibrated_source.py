@@ -4,7 +4,7 @@ import re
 from dataclasses import replace
 from typing import Any
 
-from tactile_rt.calibration.correction import Calibration
+from tactile_rt.calibration.device_calibration import Calibration
 from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 __all__ = ["CalibratedSource", "declare", "declared"]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.calibration.correction import Calibration, Mirror, check_device
+from tactile_rt.calibration.device_calibration import Calibration, Mirror, check_device
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.settings import SettingNode, convert, nearest, read_toml

@@ -37,10 +37,10 @@ from tactile_rt.classifier.decision_rules import (
 from tactile_rt.classifier.enrolment import identify
 from tactile_rt.classifier.model_card import decided, kind_columns, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.skips import CatchUp, Skip, Skips
 from tactile_rt.classifier.stepper import Stepper
-from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 

@@ -72,7 +72,7 @@ def fit(
     check_source(url)
     with needing("sim"):
         from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
-    from tactile_rt.calibration.taring import record
+    from tactile_rt.calibration.tare_measurement import record
     from tactile_rt.core.files import write_whole
     from tactile_rt.core.stream import concatenate
 

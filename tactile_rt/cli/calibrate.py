@@ -171,7 +171,7 @@ def _existing(path: Path, device: str) -> "Calibration | None":
 
 def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
     """The raw samples that the times of a table are of."""
-    from tactile_rt.calibration.taring import record
+    from tactile_rt.calibration.tare_measurement import record
     from tactile_rt.core.stream import concatenate
 
     if not url:

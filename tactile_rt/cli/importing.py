@@ -86,9 +86,9 @@ def import_file(
             from tactile_rt.drivers.logs import read_log
             from tactile_rt.recording.importing.bag import import_bag
             from tactile_rt.recording.importing.bag_file import is_bag
-            from tactile_rt.recording.importing.csv import csv_form, read_table
             from tactile_rt.recording.importing.report import report_lines
             from tactile_rt.recording.importing.table import import_table
+            from tactile_rt.recording.importing.table_form import csv_form, read_table
             from tactile_rt.recording.importing.wire import import_wire
 
             if is_bag(log):

@@ -113,7 +113,7 @@ def _sniff_port(
 ) -> None:  # fmt: skip
     from tactile_rt.drivers.links import SerialLink
     from tactile_rt.drivers.sniffing import ask_devices, hear_port, line_speeds, sniff_bytes
-    from tactile_rt.recording.importing.proposing import propose_line_columns
+    from tactile_rt.recording.importing.table_guess import propose_line_columns
 
     speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
     found: list[tuple[CodecFit, int]] = []
@@ -242,7 +242,7 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
 
 def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     """Propose the columns of a table, or of what a board prints; whether there are any."""
-    from tactile_rt.recording.importing.proposing import propose_columns, propose_line_columns
+    from tactile_rt.recording.importing.table_guess import propose_columns, propose_line_columns
 
     proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     if proposed is None:

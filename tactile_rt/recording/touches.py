@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier import contact
 from tactile_rt.classifier.classifier import without_bad_samples
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.stream import ArraySpec, Chunk, Timing
 
 __all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]

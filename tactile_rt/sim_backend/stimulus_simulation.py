@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.packages import VERSION

@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError, SourceError, TactileError
 from tactile_rt.core.settings import convert, read_toml, refusal
 from tactile_rt.core.stream import (

@@ -19,7 +19,7 @@ from tactile_rt.alignment.board_page import board_page
 from tactile_rt.alignment.datasets import DATASETS, dataset_names, find_dataset
 from tactile_rt.alignment.layers import Layers
 from tactile_rt.alignment.metrics import find_metric
-from tactile_rt.alignment.metrics.geometry import NOTHING
+from tactile_rt.alignment.metrics.rsa_cka import NOTHING
 from tactile_rt.alignment.stimuli_input import read_stimuli
 from tactile_rt.core.errors import ConfigError
 from tests.helpers import brains

@@ -9,8 +9,8 @@ import pytest
 from bench.align import oracles
 from tactile_rt.alignment.metrics import METRICS, MINIMUM_CEILING, find_metric, metric_names
 from tactile_rt.alignment.metrics.crossnobis import distances
-from tactile_rt.alignment.metrics.geometry import cka, rsa, time_course
-from tactile_rt.alignment.metrics.halves import bins_of, divisions, half_means
+from tactile_rt.alignment.metrics.noise_ceiling import bins_of, divisions, half_means
+from tactile_rt.alignment.metrics.rsa_cka import cka, rsa, time_course
 from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.selection import LAYERS_UM, part_of
 from tactile_rt.core.errors import ConfigError

@@ -563,7 +563,7 @@ def test_too_few_samples_say_how_long_it_takes() -> None:
 
 
 def test_a_silent_source_is_not_waited_for(monkeypatch) -> None:
-    monkeypatch.setattr("tactile_rt.calibration.taring.PATIENCE_S", 0.0)
+    monkeypatch.setattr("tactile_rt.calibration.tare_measurement.PATIENCE_S", 0.0)
     for source in (Silent(small_spec(), []), ArraySource(small_spec(), [])):
         with pytest.raises(SourceError, match="no sample came"):
             tare(source, 0.01)

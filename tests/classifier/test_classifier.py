@@ -219,7 +219,7 @@ def test_the_same_touch_at_the_model_s_rate_and_at_1_khz_gives_the_same_decision
     model: Path,
 ) -> None:
     """The resampler's output is fed to a second classifier, as a sensor of the model's rate."""
-    from tactile_rt.classifier.timebase import Resampler
+    from tactile_rt.classifier.resampler import Resampler
 
     fast = cut(signal([(1500, 3000, 0.1)], 3000), SPEC.rate_hz)
     resampler = Resampler(PERIOD_NS, SPEC.rate_hz)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk
 from tactile_rt.core.stream.sensor_spec import (

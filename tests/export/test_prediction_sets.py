@@ -5,7 +5,7 @@ import pytest
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, mass_above
 from tactile_rt.core.errors import RecordingError
-from tactile_rt.export.release import fit_open_set, fit_prediction_sets
+from tactile_rt.export.decision_thresholds import fit_open_set, fit_prediction_sets
 
 STEPS, CLASSES = 22, 10
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactile_rt.calibration.correction import Mirror
+from tactile_rt.calibration.device_calibration import Mirror
 from tactile_rt.models.augmentation import (
     Tactile,
     _blurred,

@@ -12,7 +12,7 @@ from tactile_rt.classifier.decision_rules import MASS_ABOVE, POSTERIOR, UNKNOWN,
 from tactile_rt.classifier.decision_rules import OpenSetRule as Rule
 from tactile_rt.core.stream import Timing
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation.coverage import measure_coverage, named_faults
+from tactile_rt.models.evaluation.measured_coverage import measure_coverage, named_faults
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import Sweeps
 from tactile_rt.testing import small_spec

@@ -14,8 +14,9 @@ from tactile_rt.classifier.model_card import kind_columns
 from tactile_rt.classifier.model_file import file_outputs, load_model, verify_model
 from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.core.stream import Chunk
+from tactile_rt.export.decision_thresholds import fit_names
 from tactile_rt.export.identity import fit_gaussians, identity_thresholds
-from tactile_rt.export.release import fit_names, release
+from tactile_rt.export.release import release
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, read_splits, windows
 from tactile_rt.models.evaluation.measures import cut_windows, macro_accuracy

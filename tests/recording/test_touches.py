@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.contact import ContactDetector
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.stream import NS_PER_S, concatenate
 from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models.onsets import find_onsets

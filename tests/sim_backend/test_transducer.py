@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_rt import testing
 from tactile_rt.classifier.contact import ContactDetector
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits

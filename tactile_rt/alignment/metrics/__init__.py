@@ -5,10 +5,10 @@ is expected to reach (the ceiling), and a function that measures a layer. Whatev
 animal alone is thus computed once for all layers and models. Metrics of other packages are found
 by the entry points ``tactile_rt.alignment_metrics``.
 
-halves      means of random halves of the trials, over which ceilings are estimated
-geometry    rsa, rsa-time and cka: the similarity of two geometries
-crossnobis  distances that noise does not lengthen
-linear      what a linear readout of a layer predicts of every unit
+noise_ceiling  means of random halves of the trials, over which ceilings are estimated
+rsa_cka        rsa, rsa-time and cka: the similarity of two geometries
+crossnobis     distances that noise does not lengthen
+linear         what a linear readout of a layer predicts of every unit
 """
 
 from collections.abc import Callable
@@ -56,11 +56,11 @@ Metric = Callable[[Animal], Measure]
 # name: (where the function is, what it says in a line)
 METRICS = {
     "rsa": (
-        f"{__name__}.geometry:rsa",
+        f"{__name__}.rsa_cka:rsa",
         "correlation of the dissimilarities (1 - r) of the stimuli, mean over time",
     ),
     "rsa-time": (
-        f"{__name__}.geometry:rsa_time",
+        f"{__name__}.rsa_cka:rsa_time",
         "the same in each bin of 45 ms by itself, mean over bins",
     ),
     "crossnobis": (
@@ -68,7 +68,7 @@ METRICS = {
         "correlation of distances in units of the noise, cross-validated",
     ),
     "cka": (
-        f"{__name__}.geometry:cka",
+        f"{__name__}.rsa_cka:cka",
         "centred kernel alignment, linear, without the bias of few stimuli",
     ),
     "linear": (

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.alignment.metrics import Measure
-from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
-from tactile_rt.alignment.metrics.halves import ceiling_of, divisions, sessions_of
+from tactile_rt.alignment.metrics.noise_ceiling import ceiling_of, divisions, sessions_of
+from tactile_rt.alignment.metrics.rsa_cka import NOTHING, mean_pattern
 from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.rdm import UPPER, Floats, pearson
 from tactile_rt.core.stream.stimuli import STIMULI

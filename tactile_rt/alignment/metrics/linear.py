@@ -16,8 +16,8 @@ perfect model reaches it in expectation.
 import numpy as np
 
 from tactile_rt.alignment.metrics import MINIMUM_CEILING, Measure
-from tactile_rt.alignment.metrics.geometry import NOTHING, mean_pattern
-from tactile_rt.alignment.metrics.halves import bins_of, means_of, sessions_of, values_of
+from tactile_rt.alignment.metrics.noise_ceiling import bins_of, means_of, sessions_of, values_of
+from tactile_rt.alignment.metrics.rsa_cka import NOTHING, mean_pattern
 from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.stream.stimuli import STIMULI

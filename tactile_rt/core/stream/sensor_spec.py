@@ -288,7 +288,7 @@ def channel_limits(
 
 
 def _averaged(rate_hz: float, period_ns: int) -> float:
-    """What the resampler leaves of white noise: see `classifier.timebase.Resampler`."""
+    """What the resampler leaves of white noise: see `classifier.resampler.Resampler`."""
     reach = max(period_ns / NS_PER_S * rate_hz, 1.0)  # of the kernel either side, in samples
     apart: Iterable[float] = np.arange(-math.ceil(reach) + 1, math.ceil(reach))
     weights = 1 + np.cos(np.pi * np.asarray(apart) / reach)

@@ -12,7 +12,7 @@ import numpy as np
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.dbc_mapping import FramePart, Signal, read_mapping
+from tactile_rt.drivers.codecs.dbc_file import FramePart, Signal, read_mapping
 from tactile_rt.drivers.codecs.framing import Rounds
 
 __all__ = ["CanDbc", "CanDbcOptions"]

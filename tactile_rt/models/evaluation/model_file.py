@@ -18,7 +18,7 @@ from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
-from tactile_rt.models.evaluation.coverage import (
+from tactile_rt.models.evaluation.measured_coverage import (
     NAMES_LEFT,
     measure_coverage,
     measure_names,

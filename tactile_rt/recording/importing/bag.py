@@ -23,7 +23,6 @@ from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.logs import Occurrences
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.bag_file import OpenBag, open_bag
-from tactile_rt.recording.importing.proposing import propose_fields
 from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
 from tactile_rt.recording.importing.table import (
     BESIDE,
@@ -32,6 +31,7 @@ from tactile_rt.recording.importing.table import (
     mapping_of,
     shown_names,
 )
+from tactile_rt.recording.importing.table_guess import propose_fields
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.ros2 import messages

@@ -21,7 +21,7 @@ from bench.perception.page import PAGE, figures, made
 from bench.perception.scores import Figures, score
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation.coverage import Coverage
+from tactile_rt.models.evaluation.measured_coverage import Coverage
 from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD
 from tactile_rt.sets.objects import write_object

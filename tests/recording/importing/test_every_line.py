@@ -11,8 +11,8 @@ from tactile_rt.core.stream import concatenate
 from tactile_rt.drivers.logs import read_log
 from tactile_rt.recording import Recording
 from tactile_rt.recording.checking import compare_decoding
-from tactile_rt.recording.importing.csv import csv_form, read_table
 from tactile_rt.recording.importing.table import import_table
+from tactile_rt.recording.importing.table_form import csv_form, read_table
 from tactile_rt.recording.importing.wire import import_wire
 
 N = 40

@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError, RecordingError, SourceError, TactileError
 from tactile_rt.sets.manifest import SPLITS, SweepManifest
 from tactile_rt.sets.objects import read_object, read_sweeps

@@ -113,7 +113,7 @@ class Calibration:
         gain: (channel,) output unit per raw unit, of elements without a matrix; empty: none.
         tare: (channel,) offset in raw units by raw element; none: 0.
         noise: (channel,) standard deviation in raw units by raw element, when tared.
-        changes: share of readings that differed from the one before then; see `taring.Tare`.
+        changes: share of readings that differed from the one before then; see `Tare`.
         matrices: (output channel, channel) output unit per raw unit, by raw element.
         mapping: Raw element by output element, in the order of the output; empty if the elements
             come out as the device sends them.

@@ -18,8 +18,8 @@ from tactile_rt.drivers.codecs.column_guess import (
 )
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 from tactile_rt.recording.importing.table import read_samples, shown_names
+from tactile_rt.recording.importing.table_form import CsvForm, csv_form, read_table
 
 __all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line_columns"]
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from tactile_rt.alignment.metrics import Measure, halves
+from tactile_rt.alignment.metrics import Measure, noise_ceiling
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import UPPER, Floats, pearson, rdm
 
@@ -54,15 +54,15 @@ def rsa_time(animal: Animal) -> Measure:
 
 def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
     """RDMs (bin, 15) of an animal and the ceiling (bin,) of each; None without a time course."""
-    sessions = halves.sessions_of(animal)
-    bins = halves.bins_of(sessions) if sessions else 0
+    sessions = noise_ceiling.sessions_of(animal)
+    bins = noise_ceiling.bins_of(sessions) if sessions else 0
     if not bins:
         return None
-    goal = rdm(halves.means_of(sessions, bins).swapaxes(0, 1))
-    whole = np.concatenate([halves.half_means(s, bins) for s in sessions], axis=-1)
+    goal = rdm(noise_ceiling.means_of(sessions, bins).swapaxes(0, 1))
+    whole = np.concatenate([noise_ceiling.half_means(s, bins) for s in sessions], axis=-1)
     parts = rdm(np.moveaxis(whole, 3, 0))  # (bin, division, 2, 15)
     r = pearson(parts[:, :, 0], parts[:, :, 1])
-    return goal, np.array([halves.ceiling_of(row) for row in r])
+    return goal, np.array([noise_ceiling.ceiling_of(row) for row in r])
 
 
 def cka(animal: Animal) -> Measure:
@@ -74,13 +74,14 @@ def _compare_means(
     animal: Animal, form: Callable[[Floats], Floats], agree: Callable[[Floats, Floats], Floats]
 ) -> Measure:
     """Measure how mean responses agree in a form such as their RDM."""
-    sessions = halves.sessions_of(animal)
+    sessions = noise_ceiling.sessions_of(animal)
     if not sessions:
         return NOTHING
-    goal = form(halves.means_of(sessions, 0)[:, 0])
-    parts = form(np.concatenate([halves.half_means(s, 0)[..., 0, :] for s in sessions], axis=-1))
+    goal = form(noise_ceiling.means_of(sessions, 0)[:, 0])
+    halves = [noise_ceiling.half_means(session, 0)[..., 0, :] for session in sessions]
+    parts = form(np.concatenate(halves, axis=-1))
     return Measure(
-        halves.ceiling_of(agree(parts[:, 0], parts[:, 1])),
+        noise_ceiling.ceiling_of(agree(parts[:, 0], parts[:, 1])),
         lambda layer: float(agree(form(mean_pattern(layer)), goal)),
     )
 

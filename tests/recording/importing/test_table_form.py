@@ -8,8 +8,8 @@ import pytest
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.stream import concatenate
 from tactile_rt.recording import Recording
-from tactile_rt.recording.importing.csv import csv_form, read_table
 from tactile_rt.recording.importing.table import import_table
+from tactile_rt.recording.importing.table_form import csv_form, read_table
 
 N = 50
 
