@@ -5,7 +5,7 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 # Before numpy, torch and onnxruntime start their pools: on a shared machine more threads than one
@@ -34,6 +34,32 @@ settings.load_profile("tactile_rt")
 
 # Until all tests are collected; see `pytest_collection_finish`.
 gc.disable()
+
+# What the extras bring: tests that import one which is not installed are skipped.
+EXTRAS = frozenset(
+    "DracoPy PIL av cantools cyclonedds foxglove gymnasium h5py lightning manifold3d matplotlib "
+    "mujoco numba onnx onnxscript pyarrow ray rosbags scipy sklearn threadpoolctl torch trimesh "
+    "urllib3 zenoh zmq".split()
+)
+
+
+class Module(pytest.Module):
+    """A file of tests, which needs the packages that it imports."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        try:
+            return super().collect()
+        except self.CollectError as error:
+            match error.__cause__:
+                case ModuleNotFoundError(name=str(name)) if name.partition(".")[0] in EXTRAS:
+                    pytest.skip(f"{name} is not installed", allow_module_level=True)
+            raise
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> Module:
+    """Make what `Module` says of a file of tests."""
+    return Module.from_parent(parent, path=module_path)
+
 
 LENGTHY = Path(__file__).with_name("lengthy.txt")
 

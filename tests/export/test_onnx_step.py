@@ -8,14 +8,10 @@ from types import SimpleNamespace
 
 import msgspec
 import numpy as np
-import onnxruntime
-import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("onnxscript")
-
 import onnx
 import onnx.parser
+import onnxruntime
+import pytest
 import torch
 
 import tactile_rt

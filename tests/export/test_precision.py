@@ -4,12 +4,8 @@ from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("onnxscript")
-
 import onnx
+import pytest
 import torch
 from onnx import numpy_helper
 

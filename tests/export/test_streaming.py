@@ -3,10 +3,6 @@
 from collections.abc import Iterator
 
 import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("onnxscript")
-
 import torch
 
 from tactile_rt.classifier.model_file import read_model, shipped_model

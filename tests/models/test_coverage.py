@@ -5,9 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.decision_rules import MASS_ABOVE, POSTERIOR, UNKNOWN, PredictionSetRule
 from tactile_rt.classifier.decision_rules import OpenSetRule as Rule
 from tactile_rt.core.stream import Timing

@@ -4,9 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-
 from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import ContactDetector

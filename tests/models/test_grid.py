@@ -11,10 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("lightning")
-pytest.importorskip("matplotlib")
-
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError
 from tactile_rt.models.grid import pool, results
 from tactile_rt.models.grid.outcomes import (

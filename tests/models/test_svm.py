@@ -5,8 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("sklearn")
-
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation.svm import fit, fit_svm

@@ -9,10 +9,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("lightning")
-
 import torch
 
 from tactile_rt.core.errors import ConfigError, ModelError

@@ -8,12 +8,6 @@ from urllib.parse import urlencode
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-pytest.importorskip("torch")
-pytest.importorskip("matplotlib")
-
 import trimesh
 
 from tactile_rt.classifier.model_file import shipped_model

@@ -5,9 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 from tactile_rt.project.placing import place_objects
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.objects.catalogue import make_object

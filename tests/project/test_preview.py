@@ -3,14 +3,8 @@
 import json
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-pytest.importorskip("torch")
-pytest.importorskip("matplotlib")
-
 import numpy as np
+import pytest
 from PIL import Image
 
 from tactile_rt.project import making

@@ -11,12 +11,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("torch")
-pytest.importorskip("onnx")
-pytest.importorskip("sklearn")
-pytest.importorskip("matplotlib")
-
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.sensor_spec import SensorSpec

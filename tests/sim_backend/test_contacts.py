@@ -3,13 +3,9 @@
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
-import mujoco
 
 from bench.sim.beams import flat
 from bench.sim.pegs import SLIDE_MM_S, _steps, press, presses

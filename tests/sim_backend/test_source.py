@@ -5,10 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-pytest.importorskip("numba")
-
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk, EndOfStream, SourceStats, concatenate
 from tactile_rt.recording.description import describe

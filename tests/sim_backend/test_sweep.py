@@ -2,13 +2,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
-import mujoco
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 

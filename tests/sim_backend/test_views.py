@@ -4,16 +4,10 @@ import re
 from contextlib import closing
 from dataclasses import replace
 
-import numpy as np
-import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-pytest.importorskip("matplotlib")
-pytest.importorskip("av")
-
 import av
 import mujoco
+import numpy as np
+import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image

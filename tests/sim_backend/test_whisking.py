@@ -2,12 +2,9 @@
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-
-import mujoco
 
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers

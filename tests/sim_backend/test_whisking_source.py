@@ -7,10 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 from scipy.integrate import solve_ivp
 
 from tactile_rt.core.errors import ConfigError

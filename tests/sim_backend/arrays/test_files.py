@@ -5,13 +5,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
-import mujoco
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

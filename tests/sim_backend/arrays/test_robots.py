@@ -8,9 +8,6 @@ from urllib.parse import parse_qsl
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 from tactile_rt.calibration import declared
 from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.core.stream.sensor_spec import SensorSpec

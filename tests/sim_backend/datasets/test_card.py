@@ -3,10 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("matplotlib")
-pytest.importorskip("sklearn")
-
 from matplotlib.image import imread
 
 from tactile_rt.core.errors import RecordingError

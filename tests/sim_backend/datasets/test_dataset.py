@@ -12,9 +12,6 @@ import msgspec
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError, RecordingError, SourceError, TactileError
 from tactile_rt.sets.manifest import SPLITS, SweepManifest

@@ -9,9 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sets.manifest import WITHHELD
 from tactile_rt.sets.sensor_faults import SensorFaults

@@ -3,13 +3,9 @@
 import subprocess
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
-
-pytest.importorskip("numba")
-pytest.importorskip("gymnasium")
-
-import gymnasium
 from gymnasium.utils.env_checker import check_env
 
 from tactile_rt.core.errors import ConfigError, SourceError

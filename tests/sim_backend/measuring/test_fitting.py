@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("numba")
-
 from tactile_rt.core.errors import SpecMismatch
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.measuring.fitting import Fitted, fit_array, read_described

@@ -4,9 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-pytest.importorskip("scipy")
-
 from scipy.signal import lfilter
 
 from tactile_rt.sim_backend.measuring.findings import about, pooled, spread_of

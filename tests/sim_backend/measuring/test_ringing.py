@@ -7,8 +7,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-pytest.importorskip("scipy")
-
 from tactile_rt.sim_backend.measuring.ringing import find_swings, fit_ring
 
 

@@ -7,8 +7,6 @@ import zlib
 import numpy as np
 import pytest
 
-pytest.importorskip("manifold3d")
-
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,

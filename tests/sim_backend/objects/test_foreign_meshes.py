@@ -6,9 +6,6 @@ turned one is told from it: only one of its eight octants is filled higher than 
 
 import numpy as np
 import pytest
-
-pytest.importorskip("manifold3d")
-
 import trimesh
 from manifold3d import Manifold
 

@@ -8,9 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("manifold3d")
-
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st

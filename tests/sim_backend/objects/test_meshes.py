@@ -6,9 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("trimesh")
-
 import trimesh
 
 from tactile_rt.core.errors import ConfigError

@@ -13,9 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("manifold3d")
-
 import trimesh
 
 from tactile_rt.core.errors import ConfigError

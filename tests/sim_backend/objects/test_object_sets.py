@@ -7,9 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-pytest.importorskip("manifold3d")
-
 import trimesh
 
 from tactile_rt.sets.manifest import SweepManifest

@@ -2,13 +2,9 @@
 
 from itertools import pairwise
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("numba")
-
-import mujoco
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers

@@ -6,9 +6,6 @@ import logging
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("numba")
-
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from tactile_rt.sim_backend.rods import compiled as module

@@ -5,8 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-pytest.importorskip("numba")
-
 from tactile_rt.sim_backend.rods.friction import CREEP, impulses
 
 

@@ -2,10 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("numba")
-
 import trimesh
 from scipy.optimize import nnls
 

@@ -4,10 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("numba")
-
 import trimesh
 from numpy.typing import NDArray
 from scipy.optimize import brentq

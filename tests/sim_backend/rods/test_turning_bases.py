@@ -3,11 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("numba")
-
 from numpy.typing import NDArray
 
 from bench.sim.beams import flat
