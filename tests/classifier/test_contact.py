@@ -119,6 +119,8 @@ def test_touches_on_a_drift_begin_and_end(slope: float) -> None:
     assert len(onsets) == len(begins) and (abs(np.array(onsets) - begins) <= 2).all()
     assert not detector.contact
     assert (abs(detector.offset - slope * n * RATED) < 0.8 * RATED).all()
+    # The noise about the line, not that of the ramp.
+    assert (detector.sigma / RATED).mean() == pytest.approx(1, abs=0.03)
 
 
 @pytest.mark.parametrize("slope", [0.1, 0.2, 0.5])
@@ -138,7 +140,7 @@ def test_release_needs_twenty_quiet_samples_in_a_row() -> None:
     touch[:, 4, 0] += 50 * RATED[0]
     quiet = noise(200, seed=10)
     assert feed(detector, touch) == [1]
-    assert detector.contact
+    assert detector.contact and new().doubted == 0
     feed(detector, quiet[:15])
     feed(detector, touch[:1])  # a flicker begins the count anew
     assert detector.contact
@@ -152,6 +154,20 @@ def test_release_needs_twenty_quiet_samples_in_a_row() -> None:
     assert not any(states[released:])
     assert feed(detector, quiet[80:]) == []
     assert feed(detector, touch[:3]) == [1], "the next touch is a new one"
+
+
+def test_the_count_to_release_begins_when_the_slowest_chart_is_below_its_threshold() -> None:
+    silent = np.zeros((200, ELEMENTS, CHANNELS), dtype=np.float32)
+    touch = silent[:60].copy()
+    touch[:, 4, 0] = 50 * FLOOR[0]
+    detector = new()
+    feed(detector, silent)
+    assert feed(detector, touch) == [1]
+    # 3 sigma, the most that a sample adds, times 0.9 to the number of silent samples
+    threshold = 40 * (0.1 / 1.9 + 1 / 100) * 99 / 97
+    first = int(np.ceil(np.log(np.sqrt(0.83 * threshold) / 3) / np.log(0.9)))
+    contact = [detector.update(x, ALL) or detector.contact for x in silent[:60]]
+    assert contact.index(False) == first - 1 + 19
 
 
 def test_a_load_between_release_and_onset_keeps_a_contact_but_begins_none() -> None:
@@ -217,6 +233,7 @@ def test_a_faint_touch_is_not_part_of_its_own_baseline() -> None:
     detector = new()
     onset = next(i for i, sample in enumerate(samples) if detector.update(sample, ALL))
     assert QUIET + 8 <= onset <= QUIET + 20
+    assert detector.doubted == onset - 153 + 1  # from the first that was suspicious
     assert (detector.offset[6] < 0.04 * FLOOR).all()
 
 
@@ -342,6 +359,20 @@ def test_an_element_that_was_not_a_number_feels_again() -> None:
     assert feed(detector, back) == [11]
 
 
+@pytest.mark.parametrize(
+    ("ramp", "jitter", "moves"),
+    [(1.0, 1.2, True), (1.0, 1.5, False), (0.0, 1.5, False), (0.01, 0.0, False), (0.6, 0.0, True)],
+)
+def test_a_first_baseline_moves_if_it_wanders_more_than_neighbours_differ(ramp, jitter, moves):
+    """A ramp of twenty has 66 times the variance that its steps tell; with a jitter 10 or 7."""
+    at = np.arange(25)
+    samples = np.zeros((25, ELEMENTS, CHANNELS), dtype=np.float32)
+    samples[:, 4, 1] = (ramp * at + jitter * (-1.0) ** at) * FLOOR[1]
+    detector = new()
+    feed(detector, samples)
+    assert detector.ready and detector.moves == moves
+
+
 def test_a_constant_that_is_exact_in_binary_has_no_noise() -> None:
     detector = new()
     samples = np.full((300, ELEMENTS, CHANNELS), 0.125, dtype=np.float32)
@@ -393,13 +424,19 @@ def test_a_baseline_that_was_taken_in_a_touch_is_found_out_wherever_it_was_taken
             assert not contact[end - touch + REST - 5], (start, end)
 
 
-def test_it_is_found_out_with_the_third_return_and_not_before() -> None:
-    samples = touches(4)
+@pytest.mark.parametrize("late", [False, True])
+def test_it_is_found_out_with_the_third_return_and_not_before(late: bool) -> None:
+    """Whatever an element says that comes when it has begun, and has no baseline."""
+    samples = touches(4)[REST + MOVE :]
     touch = REST + TOUCH + 2 * MOVE
+    valid = np.tile(ALL, (len(samples), 1))
+    if late:
+        valid[: TOUCH + MOVE, 11] = False
+        samples[:, 11] = noise(len(samples), 6, level=1e4)[:, 11]
     detector = new()
     contact = []
-    for sample in samples[REST + MOVE :]:
-        detector.update(sample, ALL)
+    for sample, trusted in zip(samples, valid, strict=True):
+        detector.update(sample, trusted)
         contact.append(detector.contact)
     first = TOUCH + 2 * MOVE + 2  # where the first rest is known to be a contact
     third = TOUCH + MOVE + 2 * touch
