@@ -384,19 +384,46 @@ def test_an_element_that_hangs_is_told_where_rest_is_known_to_change():
         assert found == pytest.approx(expected, abs=0.2)
 
 
-def test_who_hangs_again_and_again_is_told_each_time_until_it_turns_out_to_be_at_rest():
+@pytest.mark.parametrize(("changing", "noisy"), [(1500, False), (1501, True)])
+def test_readings_that_differ_in_three_of_four_of_a_whole_window_are_noise(changing, noisy):
+    judge = StuckAtDetector(1.0)  # a window of 2000 samples
+    values = np.cumsum(np.arange(6000) % 2000 < np.repeat((2000, changing, 2000), 2000))
+    said = []
+    for chunk in cut(values.astype(np.float32)[:, None, None], 1.0, 1):
+        judge.add(chunk)
+        said.append(judge.noisy)
+    assert said == [2000 <= k < 4000 or (noisy and k >= 4000) for k in range(1, 6001)]
+    judge = StuckAtDetector()
+    judge.add(*cut(np.arange(30_000, dtype=np.float32)[:, None, None], 1000.0, 10_000))
+    assert judge.noisy
+
+
+def test_a_device_that_gives_nothing_but_zeros_is_told_after_two_seconds():
+    judge, later = StuckAtDetector(), StuckAtDetector()
+    zeros = cut(np.zeros((2002, 3, 2), np.float32), 1000.0, 1)
+    told = [judge.zeros] + [judge.add(chunk) or judge.zeros for chunk in zeros]
+    assert told == [False] * 2002 + [True]
+    zeros[0].values[:] = 1.0  # it has said something
+    later.add(*zeros)
+    assert not later.zeros
+
+
+@pytest.mark.parametrize(("moved", "rested"), [(1, True), (2, True), (3, False)])
+def test_who_hangs_again_and_again_is_told_until_it_turns_out_to_be_at_rest(moved, rested):
     values = np.random.default_rng(0).normal(size=(70_000, 3, 2))
     for k in range(31_000, 70_000, 1000):
         values[k : k + 500] = values[k]
     values[-500] = values[-501]
-    values[-500:, 1, 1] += 1.0  # the last time one value makes a step
+    values[-500:].reshape(500, 6)[:, :moved] += 1.0  # of six, at the last time
     judge, told = StuckAtDetector(1000.0), []
     for chunk in chunks(values):
         judge.after_s = 0.25 if judge.noisy else float("inf")
         judge.add(chunk)
         assert chunk.seq[-1] > 29_000 or not judge.noisy
         told.append(judge.seconds > 0)
-    assert np.diff(told).sum() == 78 and not judge.noisy and not judge.zeros
+    assert np.diff(told).sum() == 78 and judge.noisy != rested and not judge.zeros
+    judge.expect(small_spec(elements=3), None, changes=0.9)  # in a tare, while motors ran
+    assert np.isinf(judge.after_s) == rested
 
 
 def sensor(noise, resolution):
