@@ -17,7 +17,6 @@ from tests.helpers.archive import Archive
 from tests.helpers.refusals import refusal
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
-pytest.importorskip("urllib3")
 
 VOLTAGES = 4 << 20  # bytes that nothing needs
 

@@ -14,7 +14,6 @@ from tactile_rt.core.stream.stimuli import STIMULI
 from tests.helpers.nwb_sessions import changed_copy
 from tests.helpers.refusals import refusal
 
-pytest.importorskip("h5py", reason="h5py reads the files")
 pynwb = pytest.importorskip("pynwb", reason="pynwb writes the files and is the oracle")
 
 ORIGIN = 10.03  # s, when the electrical recording began

@@ -1,12 +1,9 @@
 """The input of the six stimuli, held against what a model takes."""
 
 import msgspec
+import onnx
 import pytest
 import torch
-
-pytest.importorskip("onnx")
-
-import onnx
 
 from tactile_rt.alignment.activations import checkpoint_layers, untrained_card_layers
 from tactile_rt.alignment.onnx_activations import onnx_layers

@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classification, Classifier, fuse
 from tactile_rt.classifier.decision_rules import (
     MASS_ABOVE,

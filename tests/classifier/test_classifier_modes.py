@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.decision_rules import Lanes
 from tactile_rt.classifier.model_file import load_model, shipped_model

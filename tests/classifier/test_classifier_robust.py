@@ -13,8 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier import runtime, stepper
 from tactile_rt.classifier.classifier import Classification, Classifier, without_bad_samples
 from tactile_rt.classifier.decision_rules import Deadline

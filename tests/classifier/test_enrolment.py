@@ -4,8 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.enrolment import (
     NONE_OF_THESE,

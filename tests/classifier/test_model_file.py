@@ -9,8 +9,6 @@ import msgspec
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
 from tactile_rt.classifier.model_file import (

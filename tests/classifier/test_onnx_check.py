@@ -6,14 +6,11 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-
-pytest.importorskip("onnx")
-
-import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from tactile_rt.classifier.model_file import load_model, shipped_model

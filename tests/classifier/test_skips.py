@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier import classifier as classifier_module
 from tactile_rt.classifier.classifier import BEHIND_S, Classifier
 from tactile_rt.classifier.decision_rules import Deadline

@@ -5,8 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classifier
 from tests.helpers.tiny_model import CARD, PERIOD_NS, STEPS, SUBSTEPS, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, same, signal, stream

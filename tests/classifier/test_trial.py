@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier import trial
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.classifier.trial import TrialLimits, try_model

@@ -6,9 +6,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("numba")
-
 from tactile_rt.project.folder import Project, new_project
 from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_array
 from tests.helpers.plucked import plucked

@@ -7,14 +7,9 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-
-from tactile_rt.cli.app import starting
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 import trimesh
 
+from tactile_rt.cli.app import starting
 from tactile_rt.sets.objects import write_object
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe

@@ -8,8 +8,6 @@ from urllib.parse import parse_qsl
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec

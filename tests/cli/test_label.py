@@ -9,9 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError

@@ -3,15 +3,11 @@
 import hashlib
 
 import pytest
+from msgspec.structs import replace
 
 from tactile_rt.classifier.decision_rules import OpenSetRule, PredictionSetRule
 from tactile_rt.classifier.model_file import load_model, probe_logits, read_model, shipped_model
 from tactile_rt.classifier.onnx_check import graph_sha256
-
-pytest.importorskip("onnx")
-
-from msgspec.structs import replace
-
 from tests.helpers.tiny_model import GRAPH, WINDOW, write_model
 
 

@@ -2,9 +2,6 @@
 
 import pytest
 
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set

@@ -1,14 +1,8 @@
 """`tactile-rt view`: pictures and videos of the size and length asked for; mistakes refused."""
 
-import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("trimesh")
-pytest.importorskip("matplotlib")
-pytest.importorskip("av")
-
 import av
 import numpy as np
+import pytest
 from PIL import Image
 
 QUICK = ("--set", "speed_mm_s=300", "--set", "size_mm=20", "--profile", "realtime")

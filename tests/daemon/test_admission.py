@@ -5,8 +5,6 @@ import time
 
 import pytest
 
-pytest.importorskip("onnx")
-
 from bench.daemon.process import DaemonProcess, free_port, messages_of
 from tactile_rt.classifier.model_file import shipped_model
 from tests.helpers.hostile_models import BURNERS, GREEDY, write_burdened

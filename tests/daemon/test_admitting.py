@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import EVERY
 from tactile_rt.classifier.enrolment import EnrolledObject
 from tactile_rt.classifier.trial import Trial, TrialLimits

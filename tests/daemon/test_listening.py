@@ -8,15 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.daemons import load_checked, running_daemon
-from tests.helpers.waiting import until
-
-pytest.importorskip("zmq", reason="needs pyzmq: pip install '.[publish]'")
-pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
-
 from bench.daemon.process import free_port
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions
 from tactile_rt.daemon.publishers.zmq import ZmqOptions
+from tests.helpers.daemons import load_checked, running_daemon
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 LISTENS = {"tcp": "0A", "tcp6": "0A", "udp": "07", "udp6": "07"}  # state of a waiting socket

@@ -8,6 +8,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
@@ -17,9 +18,6 @@ from tactile_rt.recording.as_lerobot import write_dataset
 from tactile_rt.recording.lerobot_meta import Statistics, film_of
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.recordings import noise, write_as_daemon
-
-pytest.importorskip("pyarrow")
-import pyarrow.parquet as pq
 
 SPEC = small_spec()
 

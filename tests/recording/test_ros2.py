@@ -15,7 +15,6 @@ from tactile_rt.recording.replay import DEMO
 from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import SPEC, all_parts, noise, record_device, write_as_daemon
 
-pytest.importorskip("rosbags")
 pytest.importorskip("mcap_ros2")
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory

@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
 from tactile_rt.core.stream import SourceStats

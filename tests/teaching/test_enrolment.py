@@ -6,8 +6,6 @@ import sys
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.enrolment import NONE_OF_THESE, EnrolledObject, identify
 from tactile_rt.classifier.model_file import load_model, verify_model

@@ -2,8 +2,6 @@
 
 import pytest
 
-pytest.importorskip("zmq")
-pytest.importorskip("onnx")
 faults = pytest.importorskip("bench.daemon.faults")
 
 

@@ -5,9 +5,6 @@ import resource
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx", reason="needs onnx: pip install '.[train]'")
-pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
-
 from bench.daemon.accounts import RecordedSamples, account
 from bench.daemon.latencies import latencies
 from bench.daemon.soak import soak_records

@@ -2,9 +2,6 @@
 
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("mujoco")
-
 from bench.models import area
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.models.evaluation.records import Record

@@ -5,9 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("sklearn")
-
 from bench.perception.area import restrict
 from bench.perception.data import Portion
 from bench.perception.folds import (

@@ -2,11 +2,6 @@
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("sklearn")
-pytest.importorskip("trimesh")
-
 import trimesh
 
 from bench.perception.geometry import ACROSS, DENSE, ROWS, SIZE_MM, nearest_shape, take_picture

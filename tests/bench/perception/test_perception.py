@@ -9,9 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("sklearn")
-
 from bench.perception.area import OBJECTS, BenchmarkResults
 from bench.perception.data import FILE, SHAPES_FILE, SOURCE, Data, Portion, load, pack
 from bench.perception.folds import KINDS, TEST_KINDS

@@ -2,11 +2,6 @@
 
 import json
 
-import pytest
-
-pytest.importorskip("mujoco")
-pytest.importorskip("matplotlib")
-
 from bench.pictures.physics import DATA, PAGE, tables
 from tactile_rt.sim_backend.arrays.files import load_array
 

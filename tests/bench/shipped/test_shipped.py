@@ -2,11 +2,6 @@
 
 from pathlib import Path
 
-import pytest
-
-pytest.importorskip("torch")
-pytest.importorskip("trimesh")
-
 import torch
 
 from bench.perception.make import SHAPES

@@ -7,8 +7,6 @@ from importlib import resources
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
 from bench.sim.area import run
 from bench.sim.beams import flat
 from bench.sim.catalogue import Difference, difference

@@ -2,12 +2,9 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
-
-pytest.importorskip("mujoco")
-
-import mujoco
 from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 

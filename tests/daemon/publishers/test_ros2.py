@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("cyclonedds", reason="needs cyclonedds: pip install '.[ros2]'")
-
 from bench.daemon import ros2_node
 from bench.daemon.ros2 import free_domain, measure
 from tactile_rt.core.errors import ConfigError, SourceError

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from bench.drivers.fuzzing import wire_of
 from tactile_rt.core.errors import RecordingError
@@ -12,10 +14,6 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.bag import bag_topics, import_bag
 from tactile_rt.recording.importing.report import report_lines
 from tactile_rt.recording.importing.wire import import_wire
-
-pytest.importorskip("rosbags")
-from rosbags.rosbag2 import Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 SLOW = {"deadline": None, "suppress_health_check": list(HealthCheck)}
 FRAME = 37  # bytes of one of bota's

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import cdr, messages
 from tactile_rt.recording.ros2.cdr import PACKAGE, SIMPLE, STANDARD, fields_of, schema_text
 from tactile_rt.testing import cut, small_spec
-
-pytest.importorskip("rosbags")
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 OURS = sorted(f"tactile_rt_msgs/msg/{p.stem}" for p in (PACKAGE / "msg").glob("*.msg"))
 RANGES = {
