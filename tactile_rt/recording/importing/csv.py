@@ -35,7 +35,7 @@ _REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a s
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
-    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|lbf|psi|%|m?bar|counts?"
+    r"[\[(].*[\])]||-|s|sec|min|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|lbf|psi|%|m?bar|counts?"
     r"|(?:[munkhcM\u00b5]|da)?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)|[muk]?N[ .*\u00b7-]?[mc]?m"
 )
 THOUSAND: Final = " (a thousand?)"
