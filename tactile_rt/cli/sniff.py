@@ -244,7 +244,10 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     """Propose the columns of a table, or of what a board prints; whether there are any."""
     from tactile_rt.recording.importing.proposing import propose_columns, propose_line_columns
 
-    proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
+    try:
+        proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
+    except ConfigError as error:
+        told.nothing(str(error))
     if proposed is None:
         return False
     if not proposed.columns:

@@ -72,6 +72,11 @@ def test_a_thousand_with_a_point_is_no_one(table):
     assert "line 3: '1.000 (a thousand?)' is no number" in made.notes[0]
 
 
+def test_a_thousand_of_the_swiss_is_one(table):
+    _, chunk, _ = table((f"{k},1'234\u2019{100 + k}.5\n" for k in range(N)), "time:s,S.x:1")
+    assert chunk.values.ravel().tolist() == [1_234_100.5 + k for k in range(N)]
+
+
 def test_columns_that_change_places_are_read_by_their_names(table):
     second = "".join(f"{-k},{N + k},{k}\n" for k in range(N))
     first = "".join(f"{k},{k},{-k}\n" for k in range(N))
@@ -86,6 +91,8 @@ def test_a_last_line_that_is_cut_in_a_number_is_told(table):
     assert table(text[:-1], "t=time:s,x=S.fx")[0].notes == [], "it is whole"
     (note,) = table(text[:-3], "t=time:s,x=S.fx")[0].notes
     assert note == "its last line, '0.49,10', has no end: it may be cut"
+    (note,) = table(f"{text}0.5,1\n0.51,1.25\n0.52,1.2", "t=time:s,x=S.fx")[0].notes
+    assert "'0.52,1.2', has no end" in note, "though it is not the shortest"
 
 
 def test_a_column_that_is_seldom_there_is_a_column(table):
@@ -260,6 +267,9 @@ def test_columns_of_a_file_are_with_their_places(tmp_path, table):
         ("1,2\n2,3\n", "time:s,S.fx,S.fy,S.fz", "no line has the 4 columns"),
         ("hello, world\nhow, are you\n", "time:s,S.fx", "is no table of numbers"),
         ("", "time:s,S.fx", "is no table of numbers"),
+        ("t,sensor,x\n" + "1,1,2\n1,2,3\n" * 9, "t=time:s,x=S.x", "'sensor' says .*1, 2.*pivot"),
+        ("t,name,x\n" + "1,a,2\n1,b,3\n" * 9, "t=time:s,x=S.x", "'name' says .*a, b.*: pivot"),
+        ("".join(f"{c},{'1.5,' * 40}2\n" for c in "tab"), "-,T{0..40}.x", "t, a, b .*transpose"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_told_and_nothing_is_written(tmp_path, table, text, columns, why):
