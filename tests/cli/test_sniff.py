@@ -101,6 +101,10 @@ FILES = {
         lambda: b"Time,Fx\n" + b"".join(b"5/10/2023 23:59:%02d,%d\n" % (k, k) for k in range(40)),
         "--columns Time=time:dmy,Fx=S.fx:N",
     ),
+    "a date and a time of day": (
+        lambda: b"Day;At;Fx\n" + b"".join(b"16.9.2023;0:00:%02d;0,5\n" % k for k in range(40)),
+        "--columns Day=time:iso,At=time:iso,Fx=S.fx:N",
+    ),
     "a reading that goes round": (
         lambda: b"".join(b"%d %d\n" % (k % 5, k * k % 17) for k in range(60)),
         "--columns T{0..1}.value --rate 100",

@@ -48,6 +48,7 @@ IN_TURN: Final = 0.9  # of the rows
 THOUSAND: Final = " (a thousand?)"
 _THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+\s*")
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
+_DAY: Final = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}")
 _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
     r"[\[(](?=[\s\[(]*(?:[-+.]*\d|nan\b))(?=[^\])]*[\s,;])"
     r"(?:[-+.\deEnNaAiIfF\s,;]|[\[(][-+.\deEnNaAiIfF\s,;]*[\])])*[\])]"
@@ -288,7 +289,10 @@ def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvF
     lines = sum(k >= (below_names if names else first) for k, _ in rows)
     if often < ENOUGH * lines:
         return []
-    share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
+    share = (
+        sum(sum(_is_there(x) or bool(_DAY.fullmatch(x.strip())) for x in c) / width for c in whole)
+        / often
+    )
     usual = [n for n, times in widths.items() if times >= OFTEN * len(numeric)]
     if names:  # the first rows may lack what is usual, and all rows what is seldom there
         below = (k for k, c in rows if k >= below_names and any(map(_is_number, c)))

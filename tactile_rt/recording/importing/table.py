@@ -3,8 +3,8 @@
     time=time:s,(x{0..3}=T{0..3}.fx:mN,y{0..3}=T{0..3}.fy:mN)
 
 What a column may be is told in `ascii_mapping`; here a time may have decimals in every unit, does
-not wrap, and may be of two columns, seconds and the rest in us or ns. Columns are found by their
-names or, without names, by their places.
+not wrap, and may be of two columns: seconds and the rest in us or ns, or a date and a time of day,
+both time:iso. Columns are found by their names or, without names, by their places.
 
 Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Rows
 that changed places are sorted, and a stamp that is early or late among others that are right is
@@ -170,7 +170,10 @@ def read_samples(
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
     parts = ("us", "ns") if any(c.kind == "s" for c in parsed) else ()  # of its seconds
-    spec = array_of(mapping, tuple(c for c in parsed if c.kind not in parts), where)
+    dated = [c for c in parsed if c.kind == "iso"]
+    second = dated[1] if len(dated) == 2 else None  # a time of day beside its date
+    rest = tuple(c for c in parsed if c.kind not in parts and c is not second)
+    spec = array_of(mapping, rest, where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
         raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
     read = _read(table, parsed, places, spec)
@@ -202,6 +205,7 @@ def _read(
     offset = np.array([columns[k].offset for k in order])
     measured = [places[k] for k in order]
     clocks = [(places[k], c) for k, c in enumerate(columns) if c.kind in NS]
+    dated = [c.kind for _, c in clocks] == ["iso", "iso"]
     counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
     need = max(places) + 1
     width = max(need, table.width or len(table.names))
@@ -223,7 +227,12 @@ def _read(
             if len(cells) < least or (len(cells) > width and (table.width or table.names)):
                 raise ValueError(f"{len(cells)} columns, not {width}")
             row = [_number(cells[k]) for k in measured]
-            t_ns = sum(_time(cells[place], column) for place, column in clocks)
+            each = [_time(cells[place], column, dated) for place, column in clocks]
+            if dated and sum(ns >= DAY_NS for ns in each) != 1:
+                raise ValueError(
+                    f"{[cells[p] for p, _ in clocks]!r:.60} is no date and time of day"
+                )
+            t_ns = sum(each)
             if not clocks and table.times_ns is not None:
                 t_ns = table.times_ns[-1]
             if counter is not None:
@@ -257,11 +266,16 @@ def _number(cell: Any) -> float:
     return found
 
 
-def _time(cell: Any, column: Column) -> int:
-    """A time in ns, exactly where it is written in decimals."""
+def _time(cell: Any, column: Column, dated: bool) -> int:
+    """A time in ns, exactly where it is written in decimals.
+
+    Args:
+        dated: whether it may be a date alone.
+    """
     text = str(cell).strip()
     if column.kind == "iso":
-        text = in_seconds(text, column.unit)
+        midnight = " 00:00" if dated and ":" not in text else ""
+        text = in_seconds(text + midnight, column.unit).removesuffix(midnight)
     try:
         ns = (Decimal(text) * Decimal(column.scale) + Decimal(column.offset)) * NS[column.kind]
         if abs(ns) < 1 << 62:

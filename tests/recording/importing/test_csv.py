@@ -201,11 +201,12 @@ def test_gzip_and_utf16(tmp_path, packed):
         ("2023-11-14T22:13:20.5Z", "time:iso", 1_700_000_000_500_000_000),
         ("2023-11-14 22:13:20.5", "time:iso", 1_700_000_000_500_000_000),
         ("14.11.2023 22:13:20.5", "time:iso", 1_700_000_000_500_000_000),
+        ("2023-11-14,22:13:20.5", "time:iso,time:iso", 1_700_000_000_500_000_000),
     ],
 )
 def test_times_are_exact_and_those_since_1970_are_utc(table, cell, column, t_ns):
     later = {"time:s": "1700000001", "time:ns": "1700000001000000000", "time:ms": "1700000001000"}
-    second = later.get(column, "2023-11-14 22:13:21")
+    second = later.get(column, f"2023-11-14{cell[10]}22:13:21")
     _, chunk, about = table(f"{cell},1\n{second},2\n" + f"{second[:-1]}9,3\n", f"{column},S.fx")
     assert int(chunk.t_ns[0]) + about.utc_offset_ns == t_ns
 
