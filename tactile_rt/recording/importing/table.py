@@ -12,6 +12,7 @@ replaced by one between its neighbours. A time that goes back for good begins an
 period after the row before; a time of day that falls by more than half a day is of the next day.
 """
 
+import re
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -54,6 +55,7 @@ FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 DAY_NS: Final = 86_400 * NS_PER_S
 EXACT: Final = 2.0**53  # whole numbers up to here are exact
+_ZONE: Final = re.compile(r"(?i)utc|gmt|:\d\d.*(?:z|[+-]\d\d:?\d\d)\s*$")
 SHOWN: Final = 600  # characters of the names that a message tells
 
 
@@ -156,7 +158,11 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     session = {"imported": table.path.name, "columns": columns}
     about = Description(spec, zero, table.path.name, session=session)
-    return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+    write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+    if read.local:
+        account.first = account.first.removesuffix(" UTC")
+        account.last = account.last.replace(" UTC", " (local time, taken as UTC)")
+    return account
 
 
 def read_samples(
@@ -195,6 +201,7 @@ class ReadRows:
     count: NDArray[np.int64] | None
     corrupt: int
     complaint: str
+    local: bool  # whether its times are dates of no time zone
 
 
 def _read(
@@ -214,7 +221,7 @@ def _read(
     rows: list[list[float]] = []
     times: list[int] = []
     counts: list[int] = []
-    corrupt, complaint = 0, ""
+    corrupt, complaint, local = 0, "", False
 
     def close() -> None:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -244,6 +251,11 @@ def _read(
             corrupt += 1
             complaint = complaint or (f"line {table.line}: " if table.line else "") + str(error)
             continue
+        if not times:
+            said = " ".join(
+                f"{c.label} {cells[place]}" for place, c in clocks if c.kind == "iso" or c.offset
+            )
+            local = bool(said) and not _ZONE.search(said)
         rows.append(row)
         times.append(t_ns)
         if len(rows) == BLOCK:
@@ -253,6 +265,7 @@ def _read(
     return ReadRows(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
         np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
+        local,
     )  # fmt: skip
 
 
