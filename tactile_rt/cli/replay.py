@@ -25,7 +25,7 @@ TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # of a decision's message
 def replay(
     files: Annotated[list[Path], argument("A recording, or the rotated files of one source.")],
     model: Annotated[
-        Path | None, option("Model file, .onnx. Default: the one that decided live.")
+        Path | None, option("Model file, .onnx, or shipped. Default: the one that decided live.")
     ] = None,
     name: Annotated[str, option("Name of the model, if several decided live.")] = "",
     speed: Annotated[str, option("Speed relative to the recorded one, or max.")] = "max",
@@ -79,9 +79,10 @@ class _Replay:
         check: bool,
         fields: dict[str, str],
     ) -> None:
-        from tactile_rt.classifier.model_file import hash_of
+        from tactile_rt.classifier.model_file import hash_of, shipped_model
         from tactile_rt.recording.checking import file_of_model, live_model
 
+        model = shipped_model() if model == Path("shipped") else model
         self.files, self._fields = files, fields
         self.samples = 0
         self.decided: list[dict[str, Any]] = []

@@ -237,14 +237,17 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         hint = "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'"
         told.nothing(f"no codec fits {path}", hint)
     elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, told):
-        told.nothing(f"nothing fits {path}", DESCRIBE)
+        told.nothing(f"nothing fits {path}", _name_lack(data) or DESCRIBE)
 
 
 def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     """Propose the columns of a table, or of what a board prints; whether there are any."""
     from tactile_rt.recording.importing.table_guess import propose_columns, propose_line_columns
 
-    proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
+    try:
+        proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
+    except ConfigError as error:
+        told.nothing(str(error))
     if proposed is None:
         return False
     if not proposed.columns:
@@ -259,6 +262,17 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
         options += ["--rate", f"{proposed.rate_hz or GUESSED_HZ:g}"]
     told.go_on("import", path, *options)
     return True
+
+
+def _name_lack(data: bytes) -> str:
+    """Say that text has too few rows; empty: it has enough, or is no text."""
+    from tactile_rt.drivers.codecs.ascii_text import fields, is_text, number
+    from tactile_rt.recording.importing.proposing import LEAST
+
+    lines = [x for x in data.decode("utf-8", "replace").splitlines() if x.strip()]
+    rows = sum(any(number(word) is not None for word in fields(line)) for line in lines)
+    few = f"{rows} rows, too few to tell" if rows else "no rows"
+    return f"it holds {few}" if rows < LEAST and all(map(is_text, lines)) else ""
 
 
 def _sniff_bag(path: Path, told: _Told) -> None:

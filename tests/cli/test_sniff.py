@@ -101,6 +101,10 @@ FILES = {
         lambda: b"Time,Fx\n" + b"".join(b"5/10/2023 23:59:%02d,%d\n" % (k, k) for k in range(40)),
         "--columns Time=time:dmy,Fx=S.fx:N",
     ),
+    "a date and a time of day": (
+        lambda: b"Day;At;Fx\n" + b"".join(b"16.9.2023;0:00:%02d;0,5\n" % k for k in range(40)),
+        "--columns Day=time:iso,At=time:iso,Fx=S.fx:N",
+    ),
     "a reading that goes round": (
         lambda: b"".join(b"%d %d\n" % (k % 5, k * k % 17) for k in range(60)),
         "--columns T{0..1}.value --rate 100",
@@ -156,7 +160,7 @@ def test_what_cannot_be_read_is_told_and_not_proposed(call, cwd):
 @pytest.mark.parametrize(
     "data",
     [
-        b"", bytes(3000), bytes(range(256)) * 3,
+        b"", b"time,fx [\xc2\xb5N]\n", bytes(3000), bytes(range(256)) * 3,
         b"".join(b"12:00:%02d INFO worker %d has started\n" % (k % 60, k) for k in range(60)),
     ],
 )  # fmt: skip
@@ -164,6 +168,7 @@ def test_nothing_fits_and_it_says_so(call, cwd, data):
     (cwd / "file.log").write_bytes(data)
     code, said, _ = call("sniff", "file.log")
     assert code == 1 and said.startswith("nothing fits file.log")
+    assert ("it holds no rows" in said) == (len(data) < 99), said
 
 
 def test_frames_that_no_codec_knows_are_shown(call, cwd):
@@ -251,3 +256,5 @@ def test_a_recording_is_known(call, cwd):
     code, said, _ = call("sniff", "raw.mcap")
     teach = ["teach", "replay:raw.mcap?speed=0", "lesson", "--classes", "A,B"]
     assert code == 0 and next_command(said) == teach, "the model that ships is of another array"
+    assert "--source takes it as replay:raw.mcap" in call("run", "raw.mcap")[2]
+    assert "mouse13.onnx was made for" in call("replay", "raw.mcap", "--model", "shipped")[2]

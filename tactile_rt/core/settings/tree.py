@@ -113,6 +113,8 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:  # a zero byte in the name
         raise ConfigError(f"{str(path)!r}: cannot be read: {error}") from None
+    if data.startswith(b"\x89MCAP"):
+        raise ConfigError(f"{path} is a recording, no text: --source takes it as replay:{path}")
     if len(data) > largest:
         raise ConfigError(f"{path}: larger than {largest >> 20} MB: not such a file")
     try:

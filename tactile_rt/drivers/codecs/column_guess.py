@@ -29,21 +29,27 @@ DAYS: Final = (25_569, 80_000)  # of a spreadsheet: 1970 to 2119
 SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
 Rows = Sequence[Sequence[float | None]]
 
+_UNITS_OF_TIME: Final = {  # as names say them, and what is said of the column
+    unit: word
+    for word, units in (
+        ("time:s", "s sec secs second seconds"), ("time:ms", "ms msec msecs"),
+        ("time:us", "us \u00b5s usec usecs"), ("time:ns", "ns nsec nsecs"),
+        ("time*60:s", "min mins minute minutes"), ("time*3600:s", "h hr hrs hour hours"),
+    )
+    for unit in units.split()
+}  # fmt: skip
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
     r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value"
     r"|(?:uhr)?zeit|datum)"
-    r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
+    rf"(?:s|sec|ms|us|µs|ns|nsec|[\W_]+(?:{'|'.join(_UNITS_OF_TIME)}))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
     r"(?:.*[._ ])?(?:seq|count|counter|samples?|frame|frame_?id|index|idx|n|no|id|packet|#)"
     r"|column\.\d+|unnamed.*",
     re.IGNORECASE,
 )
-_TIME_UNIT: Final = re.compile(
-    r"(?:^|[_ ([/.]|millis|micros)(s|sec|secs|ms|us|µs|ns|nsec|nsecs)\W*$"
-)
-_UNITS_OF_TIME: Final = {"sec": "s", "secs": "s", "µs": "us", "nsec": "ns", "nsecs": "ns"}
+_TIME_UNIT: Final = re.compile(rf"(?:^|[\W_]|millis|micros)({'|'.join(_UNITS_OF_TIME)})\W*$")
 _IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
 _OTHER_UNIT: Final = re.compile(r"\[[^\d\]]")  # which keeps to its own column
@@ -106,7 +112,11 @@ def guess_columns(
 
 def list_unread_units(names: Sequence[str], words: Sequence[str]) -> list[str]:
     """List what stands in brackets behind names of measurements that keep their own unit."""
-    alone = [n for n, w in zip(names, words, strict=False) if w.endswith(":1")]
+    alone = [
+        n
+        for n, w in zip(names, words, strict=False)
+        if w.endswith(":1") or (w.startswith("time") and w != "time:iso" and not _named_unit(n))
+    ]
     told = [unit.strip() for name in alone for unit in _BRACKET.findall(name)]
     return [unit for unit in dict.fromkeys(told) if unit not in ("", "-", "1")]
 
@@ -252,7 +262,7 @@ def _place_time(
         rising = (steps >= 0).all() and v[-1] > v[0]
         if k in known:
             if rising or (steps >= 0).mean() > MOSTLY or (steps < 0).all():  # the newest first
-                return k, f"time:{_time_unit(names[k], v)}"
+                return k, _named_unit(names[k]) or f"time:{_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
             # a ramp of a measurement is as steady hardly ever, and none counts from 1970
             since_1970 = any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in PER_SECOND)
@@ -261,10 +271,14 @@ def _place_time(
     return None
 
 
+def _named_unit(name: str) -> str:
+    """Return the word for a time whose name tells its unit; empty: it does not."""
+    found = _TIME_UNIT.search(name.strip().lower().replace("μ", "µ"))
+    return _UNITS_OF_TIME[found[1]] if found else ""
+
+
 def _time_unit(name: str, v: NDArray[np.float64]) -> str:
     """The unit of a time, by its name, by how long ago it began, or by its steps."""
-    if found := _TIME_UNIT.search(name.strip().lower().replace("μ", "µ")):
-        return _UNITS_OF_TIME.get(found[1], found[1])
     for word, unit in (("millis", "ms"), ("micros", "us")):
         if word in name.lower():
             return unit

@@ -152,7 +152,7 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     if len(fitting) == 1:
         return fitting[0]
     told = ", ".join(f"{t.name} ({t.type})" for t in fitting or topics) or "none"
-    none = "of none is known what is what: give --topic, and --columns tells"
+    none = "of none is known what is what: `tactile-rt sniff` proposes --topic and --columns"
     what = "name one with --topic" if fitting else none
     raise ConfigError(f"{path} has the topics {told}: {what}")
 

@@ -3,8 +3,8 @@
     time=time:s,(x{0..3}=T{0..3}.fx:mN,y{0..3}=T{0..3}.fy:mN)
 
 What a column may be is told in `ascii_mapping`; here a time may have decimals in every unit, does
-not wrap, and may be of two columns, seconds and the rest in us or ns. Columns are found by their
-names or, without names, by their places.
+not wrap, and may be of two columns: seconds and the rest in us or ns, or a date and a time of day,
+both time:iso. Columns are found by their names or, without names, by their places.
 
 Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Rows
 that changed places are sorted, and a stamp that is early or late among others that are right is
@@ -12,6 +12,7 @@ replaced by one between its neighbours. A time that goes back for good begins an
 period after the row before; a time of day that falls by more than half a day is of the next day.
 """
 
+import re
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -54,6 +55,7 @@ FAR: Final = 2  # rows that all move for one that does not fit
 MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
 DAY_NS: Final = 86_400 * NS_PER_S
 EXACT: Final = 2.0**53  # whole numbers up to here are exact
+_ZONE: Final = re.compile(r"(?i)utc|gmt|:\d\d.*(?:z|[+-]\d\d:?\d\d)\s*$")
 SHOWN: Final = 600  # characters of the names that a message tells
 
 
@@ -156,7 +158,11 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     session = {"imported": table.path.name, "columns": columns}
     about = Description(spec, zero, table.path.name, session=session)
-    return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+    write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+    if read.local:
+        account.first = account.first.removesuffix(" UTC")
+        account.last = account.last.replace(" UTC", " (local time, taken as UTC)")
+    return account
 
 
 def read_samples(
@@ -170,7 +176,10 @@ def read_samples(
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
     parts = ("us", "ns") if any(c.kind == "s" for c in parsed) else ()  # of its seconds
-    spec = array_of(mapping, tuple(c for c in parsed if c.kind not in parts), where)
+    dated = [c for c in parsed if c.kind == "iso"]
+    second = dated[1] if len(dated) == 2 else None  # a time of day beside its date
+    rest = tuple(c for c in parsed if c.kind not in parts and c is not second)
+    spec = array_of(mapping, rest, where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
         raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
     read = _read(table, parsed, places, spec)
@@ -192,6 +201,7 @@ class ReadRows:
     count: NDArray[np.int64] | None
     corrupt: int
     complaint: str
+    local: bool  # whether its times are dates of no time zone
 
 
 def _read(
@@ -202,6 +212,7 @@ def _read(
     offset = np.array([columns[k].offset for k in order])
     measured = [places[k] for k in order]
     clocks = [(places[k], c) for k, c in enumerate(columns) if c.kind in NS]
+    dated = [c.kind for _, c in clocks] == ["iso", "iso"]
     counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
     need = max(places) + 1
     width = max(need, table.width or len(table.names))
@@ -210,7 +221,7 @@ def _read(
     rows: list[list[float]] = []
     times: list[int] = []
     counts: list[int] = []
-    corrupt, complaint = 0, ""
+    corrupt, complaint, local = 0, "", False
 
     def close() -> None:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -223,7 +234,12 @@ def _read(
             if len(cells) < least or (len(cells) > width and (table.width or table.names)):
                 raise ValueError(f"{len(cells)} columns, not {width}")
             row = [_number(cells[k]) for k in measured]
-            t_ns = sum(_time(cells[place], column) for place, column in clocks)
+            each = [_time(cells[place], column, dated) for place, column in clocks]
+            if dated and sum(ns >= DAY_NS for ns in each) != 1:
+                raise ValueError(
+                    f"{[cells[p] for p, _ in clocks]!r:.60} is no date and time of day"
+                )
+            t_ns = sum(each)
             if not clocks and table.times_ns is not None:
                 t_ns = table.times_ns[-1]
             if counter is not None:
@@ -235,6 +251,11 @@ def _read(
             corrupt += 1
             complaint = complaint or (f"line {table.line}: " if table.line else "") + str(error)
             continue
+        if not times:
+            said = " ".join(
+                f"{c.label} {cells[place]}" for place, c in clocks if c.kind == "iso" or c.offset
+            )
+            local = bool(said) and not _ZONE.search(said)
         rows.append(row)
         times.append(t_ns)
         if len(rows) == BLOCK:
@@ -244,6 +265,7 @@ def _read(
     return ReadRows(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
         np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
+        local,
     )  # fmt: skip
 
 
@@ -257,11 +279,16 @@ def _number(cell: Any) -> float:
     return found
 
 
-def _time(cell: Any, column: Column) -> int:
-    """A time in ns, exactly where it is written in decimals."""
+def _time(cell: Any, column: Column, dated: bool) -> int:
+    """A time in ns, exactly where it is written in decimals.
+
+    Args:
+        dated: whether it may be a date alone.
+    """
     text = str(cell).strip()
     if column.kind == "iso":
-        text = in_seconds(text, column.unit)
+        midnight = " 00:00" if dated and ":" not in text else ""
+        text = in_seconds(text + midnight, column.unit).removesuffix(midnight)
     try:
         ns = (Decimal(text) * Decimal(column.scale) + Decimal(column.offset)) * NS[column.kind]
         if abs(ns) < 1 << 62:

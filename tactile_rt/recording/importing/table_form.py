@@ -35,12 +35,20 @@ _REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a s
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
-    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|lbf|psi|%|m?bar|counts?"
+    r"[\[(].*[\])]||-|s|sec|min|ms|us|\u00b5s|ns|Hz|\u00b0C?|deg|degC|kgf?|lbf|psi|%|m?bar|counts?"
     r"|(?:[munkhcM\u00b5]|da)?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)|[muk]?N[ .*\u00b7-]?[mc]?m"
 )
+_SENSOR: Final = re.compile(
+    r"(?:sensor|channel|taxel|signal|variable|element|quantity|parameter)s?"
+    r"(?:[ _.-]?(?:id|name|no|nr|num|number|index|idx))?|name|key",
+    re.IGNORECASE,
+)
+LONG_ROW: Final = 16  # cells
+IN_TURN: Final = 0.9  # of the rows
 THOUSAND: Final = " (a thousand?)"
 _THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+\s*")
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
+_DAY: Final = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}")
 _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
     r"[\[(](?=[\s\[(]*(?:[-+.]*\d|nan\b))(?=[^\])]*[\s,;])"
     r"(?:[-+.\deEnNaAiIfF\s,;]|[\[(][-+.\deEnNaAiIfF\s,;]*[\])])*[\])]"
@@ -74,6 +82,7 @@ def csv_form(
 
     Raises:
         RecordingError: its lines are no table of numbers.
+        ConfigError: its rows are not samples.
     """
     with open_log_file(path) as file, _text(file) as text:
         head = list(islice(_joined(text, skip, lines), LOOKED_AT))
@@ -99,7 +108,31 @@ def csv_form(
             "numbers (--delimiter, --skip and --lines tell how it is written)"
         )
     _, form = max(fits, key=lambda fit: round(fit[0], 9))
+    _check_layout(path, head, form)
     return replace(form, first=skip + form.first * lines, lines=lines)
+
+
+def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
+    """Raise ConfigError where each row is a channel, or of one sensor of several."""
+    cells = (_cells(x, form.delimiter, form.comma) for x in head[form.first :])
+    rows = [[c.strip(' "') for c in row] for row in cells if len(row) == form.width]
+    names = list(dict.fromkeys(row[0] for row in rows if row[0][:1].isalpha()))
+    wide = form.width > max(LONG_ROW, 2 * len(rows)) and len(head) < LOOKED_AT
+    if wide and not form.names and len(names) == len(rows) > 1 and not any(map(_is_there, names)):
+        told = ", ".join(names)
+        raise ConfigError(
+            f"{path}: each row is a channel ({told:.40} ...), not a sample: transpose it"
+        )
+    for k, column in enumerate(form.names):
+        of = [row[k] for row in rows]
+        n = len(kinds := dict.fromkeys(of))
+        if not _SENSOR.fullmatch(column) or not 1 < n <= len(of) / 2:
+            continue
+        turns = sum(a == b for a, b in zip(of, of[n:], strict=False)) >= IN_TURN * (len(of) - n)
+        words = not any(map(_is_there, kinds)) and 2 * sum(map(str.__ne__, of, of[1:])) > len(of)
+        if words or (turns and all(map(str.isdecimal, kinds))):
+            told = f"column {column!r:.40} says of which sensor a row is ({', '.join(kinds):.40})"
+            raise ConfigError(f"{path}: {told}: pivot it, one row per time, a column for each")
 
 
 def read_table(path: Path, form: CsvForm) -> Table:
@@ -111,15 +144,15 @@ def read_table(path: Path, form: CsvForm) -> Table:
 
 def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
     order: list[int] = []  # of the columns, where another header stands
-    shortest = length = LONGEST  # of all lines but the last; of the last
+    longest, ending = (0, 0), (0, 0)  # ends of all lines but the last; of the last
     cut: list[str] = []
     with open_log_file(table.path) as file, _text(file) as text:
         for k, line in enumerate(_joined(text, form.first, form.lines, cut), start=1):
             if _REMARK.match(line) or not line.strip(" \t,;") or line.strip() in form.heads:
                 continue
             table.line = form.first + k * form.lines
-            shortest, length = min(shortest, length), len(line)
             cells = _cells(line, form.delimiter, form.comma)
+            longest, ending = max(longest, ending), _measure_end(cells, form.width)
             words = [c.strip(' "') for c in cells]
             if len(words) == len(form.names) and set(words) == set(form.names):
                 order = [words.index(name) for name in form.names]
@@ -131,10 +164,16 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
             if lack and (ended or len(cells) in form.widths):
                 cells = [*cells, *[""] * lack][: form.width]
             yield [cells[k] for k in order] if len(order) == len(cells) else cells
-        if cut and length < shortest:
+        if cut and ending < longest:
             table.notes.append(f"its last line, {cut[0]!r:.40}, has no end: it may be cut")
         if getattr(getattr(file, "raw", None), "broken", False):
             table.notes.append("it is cut short or damaged: what unpacks of it was read")
+
+
+def _measure_end(cells: Sequence[str], width: int) -> tuple[int, int]:
+    """Return how many digits a row's last cell has after its point; before it, if it has none."""
+    whole, point, rest = cells[-1].strip().partition(".") if len(cells) == width else ("", "", "")
+    return len(rest), 0 if point else len(whole)
 
 
 def _text(file: Any) -> TextIOWrapper:
@@ -161,6 +200,7 @@ def _joined(
         if cut is not None and line[-1] not in "\r\n" and len(line) < LONGEST:
             cut.append(line)
         line = re.sub(r"\u2212(?=[.,]?\d)", "-", line)  # a minus of typographers
+        line = re.sub(r"(?<=\d)['\u2019](?=\d{3}(?!\d))", "", line)  # a thousand of the Swiss
         for part in line.rstrip("\r\n").split("\r"):
             begun.append(part)
             if len(begun) == lines:
@@ -249,7 +289,10 @@ def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvF
     lines = sum(k >= (below_names if names else first) for k, _ in rows)
     if often < ENOUGH * lines:
         return []
-    share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
+    share = (
+        sum(sum(_is_there(x) or bool(_DAY.fullmatch(x.strip())) for x in c) / width for c in whole)
+        / often
+    )
     usual = [n for n, times in widths.items() if times >= OFTEN * len(numeric)]
     if names:  # the first rows may lack what is usual, and all rows what is seldom there
         below = (k for k, c in rows if k >= below_names and any(map(_is_number, c)))

@@ -26,6 +26,7 @@ __all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line
 _DELTA = re.compile(r"Delta_X\W+([\d.,]+(?:E[+-]\d+)?)")  # LabVIEW's step, s
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
+DAY_S = 86_400
 DATED = 0.9  # of the cells of a column of dates
 ORDERS = {"": "year", "mdy": "month", "dmy": "day"}
 
@@ -95,6 +96,11 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     if form.units:  # said as names say them
         names = tuple(f"{n} [{u}]" if u else n for n, u in zip(names, form.units, strict=True))
     words, timed = guess_columns(names, cells, clocks)
+    if clocks and max(row[min(clocks)] or 0 for row in cells) < DAY_S:  # its date is beside it
+        for k in sorted(set(range(form.width)) - clocks.keys()):
+            if order := _find_order([f"{r[k].strip() or '-'} {r[min(clocks)]}" for r in rows]):
+                clocks[k], words[k] = order, "time:iso"
+                break
     said = f"{path} is a table of {form.width} columns"
     left = [n for n, word in zip(form.names, words, strict=False) if word == "-"]
     said += f" (left out: {shown_names(left)})" if left else ""

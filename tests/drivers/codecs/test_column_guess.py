@@ -106,6 +106,13 @@ def test_the_unit_of_a_time_is_told_by_its_size(first, step, unit):
     assert guessed(["time", "Fx"], [first, 0.5], [step, 0.1])[0] == f"time:{unit}"
 
 
+@pytest.mark.parametrize("form", ["{} [{}]", "{}({})", "{}_{}", "{}:{}", "{} / {}", "{} {}"])
+def test_the_unit_of_a_time_is_told_by_its_name(form):
+    for unit, word in [("min", "*60:s"), ("h", "*3600:s"), ("sec", ":s"), ("\xb5s", ":us")]:
+        words = guessed([form.format("Elapsed", unit), "Fx"], [0, 5], [9, 1])
+        assert words == [f"time{word}", "S.fx:N"]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

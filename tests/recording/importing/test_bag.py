@@ -210,7 +210,7 @@ def test_a_message_that_nobody_knows_is_told_with_its_fields(tmp_path):
         for k in range(20):
             message = skin(np.arange(4, dtype=np.int32) + k, "")
             writer.write(topic, k, store.serialize_cdr(message, "mine/msg/Skin"))
-    with pytest.raises(ConfigError, match=r"of none is known what is what: give --topic"):
+    with pytest.raises(ConfigError, match=r"of none is known what is what: `tactile-rt sniff` pro"):
         import_bag(tmp_path / "skin", tmp_path / "out.mcap")
     with pytest.raises(ConfigError, match=r"e\.g\. .*; its fields are taxels\.\{0\.\.3\}"):
         import_bag(tmp_path / "skin", tmp_path / "out.mcap", "/skin")
