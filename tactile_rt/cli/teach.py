@@ -5,6 +5,7 @@ import shlex
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Generator
 from contextlib import closing
 from pathlib import Path
@@ -185,7 +186,7 @@ class Orders:
 def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
     """Take touches until there are enough, the stream ends, or who teaches has had enough."""
     from tactile_rt.core.stream import EndOfStream
-    from tactile_rt.recording import StreamWriter
+    from tactile_rt.recording import Recording, StreamWriter
     from tactile_rt.teaching.lesson import BEFORE_NS
 
     lesson = teacher.lesson
@@ -198,6 +199,10 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     if not source.live and teacher.wanted:
         order = f"{teacher.each} touches of each, in this order: {', '.join(teacher.wanted)}"
         _say(f"a recording is taken to hold {order}; --touches tells another number")
+    before = lesson.folder.glob("session-*.mcap") if not source.live else ()
+    if any(Recording(one).description.source == url for one in before):
+        _say(f"{lesson.folder} holds touches of this recording: they are taken once more")
+    begun = len(lesson.touches)
     path = lesson.next_recording()
     orders.listen()
     with StreamWriter(path, source, url=url) as writer, closing(_hear(source, orders)) as coming:
@@ -238,6 +243,9 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
             if listener.hasty > hasty:
                 _say(teacher.note(HASTY))
             teacher.watch(listener.seconds(int(chunk.t_ns[-1])))
+    if not source.live:
+        taken = Counter(touch.label for touch in lesson.touches[begun:])
+        _say("found in it: " + (", ".join(f"{n} {label}" for label, n in taken.items()) or "none"))
 
 
 def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
