@@ -267,7 +267,7 @@ def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
 def _name_lack(data: bytes) -> str:
     """Say that text has too few rows; empty: it has enough, or is no text."""
     from tactile_rt.drivers.codecs.ascii_text import fields, is_text, number
-    from tactile_rt.recording.importing.proposing import LEAST
+    from tactile_rt.recording.importing.table_guess import LEAST
 
     lines = [x for x in data.decode("utf-8", "replace").splitlines() if x.strip()]
     rows = sum(any(number(word) is not None for word in fields(line)) for line in lines)

@@ -57,12 +57,18 @@ def decided(folder, sizes):
 def test_objects_are_told_apart_and_a_stranger_is_none_of_these(lesson, network):
     folder, out = lesson
     assert "names are objects" in out and "9 of 9 touches" in out
+    assert "found in it: " + ", ".join(f"3 {name}" for name in SIZES) in out
     assert "knows cup, jug, red mug beside 5 classes, and what is none of these" in out
     assert decided(folder, [-8, 7.5, 1, 4.5]) == ["jug", "cup", "red mug", NONE_OF_THESE]
     card = load_model(folder / MODEL)[1]
     assert [(one.name, one.touches) for one in card.enrolled] == [(name, 3) for name in SIZES]
     assert card.labels == load_model(network)[1].labels, "its classes are as they were"
     verify_model(folder / MODEL)
+
+
+def test_a_recording_that_was_taught_before_is_told(lesson, call, tmp_path):
+    again = "teach", f"replay:{tmp_path}/stream.mcap?speed=0", lesson[0], "--touches", 6
+    assert "touches of this recording: they are taken once more\n" in call(*again)[1]
 
 
 def test_orders_rename_and_forget_objects(lesson, call, tmp_path, monkeypatch):
