@@ -76,6 +76,11 @@ def test_who_does_what_it_should_is_not_named():
          "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
         ({"measured_hz": 1200.0},
          "fast: source.a: it measures more often than ten ninths of the 1000 Hz that it has"),
+        ({"slow": True, "measured_hz": 6.0, "newest_ns": NOW - S // 2, "read_ns": NOW - S // 2},
+         "slow: source.a: it measures less often than nine tenths of the 1000 Hz that it has"),
+        ({"another": "it has 4 elements, not 3"},
+         "another array: source.a: it has 4 elements, not 3; nothing is decided of it until a "
+         "reload (SIGHUP) accepts it"),
         ({"device": Health(State.STREAMING, 1, faults=("a sensor fails",)), "bad": Losses(1, 1)},
          "device fault: source.a: it says: a sensor fails"),
         ({"device": Health(State.STREAMING, 1, counts=False)},
@@ -94,6 +99,7 @@ def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
     "changes",
     [
         {"measured_hz": 5000.0, "device": None},  # a recording, replayed quickly
+        {"rate_hz": 900.0, "measured_hz": 1000.0},
         {"losses": Losses(0, 50_000)},  # lost within the minute, and no longer
         {"part": part("source.a", "ended"), "newest_ns": 1, "read_ns": 1},
         {"part": part("source.a", "stopped"), "newest_ns": 1, "read_ns": 1},
