@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.rest import Drift, RestLevels
+from tactile_rt.classifier.baseline_drift import Drift, RestLevels
 
 __all__ = ["ContactDetector"]
 

@@ -18,7 +18,7 @@ from tactile_rt.cli.tables import fitting, print_table, told_as_json
 from tactile_rt.core.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
-    from tactile_rt.daemon.health import Latency, PartState, Snapshot
+    from tactile_rt.daemon.states import Latency, PartState, Snapshot
 
 LARGEST = 16 << 20  # bytes of a state
 EVERY_S = 1.0  # between looks

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 
-from tactile_rt.daemon.health import BREAKS, Diagnostic
+from tactile_rt.daemon.states import BREAKS, Diagnostic
 
 __all__ = ["ADVICE", "DiagnosticOnsets"]
 

@@ -8,7 +8,6 @@ from typing import Any, ClassVar, Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.diagnostics import LossWindow
-from tactile_rt.daemon.health import ConsumerState, LatencyMeter, OnDisk, Snapshot
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -21,6 +20,7 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.states import ConsumerState, LatencyMeter, OnDisk, Snapshot
 
 __all__ = ["Consumer", "ConsumerPart", "View"]
 

@@ -21,7 +21,6 @@ from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.diagnostics import diagnose
-from tactile_rt.daemon.health import Diagnostic, Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.log import EventHandler
@@ -30,6 +29,7 @@ from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.source_part import Acquisition, SourcePart
+from tactile_rt.daemon.states import Diagnostic, Snapshot
 from tactile_rt.daemon.trends import Trends, read_resident_bytes
 from tactile_rt.drivers.health import Identity
 

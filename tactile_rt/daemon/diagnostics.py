@@ -22,7 +22,8 @@ from msgspec import structs
 from tactile_rt.classifier.classifier import IMPLAUSIBLE_LOADS
 from tactile_rt.core.errors import name_some
 from tactile_rt.daemon.config import LimitsConfig
-from tactile_rt.daemon.health import (
+from tactile_rt.daemon.rate_meter import SLOW
+from tactile_rt.daemon.states import (
     ConsumerState,
     Diagnostic,
     Losses,
@@ -30,7 +31,6 @@ from tactile_rt.daemon.health import (
     PartState,
     SourceState,
 )
-from tactile_rt.daemon.rate_meter import SLOW
 from tactile_rt.drivers.health import State
 
 __all__ = ["LossWindow", "diagnose", "oldest_s"]

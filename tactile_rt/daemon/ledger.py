@@ -3,7 +3,7 @@ lost, over all files and as often as the source comes and goes."""
 
 import time
 
-from tactile_rt.daemon.health import OnDisk
+from tactile_rt.daemon.states import OnDisk
 from tactile_rt.recording.writer import RecordingWriter
 
 __all__ = ["Ledger"]

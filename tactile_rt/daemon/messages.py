@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import (
     Contact,
     Decision,
@@ -24,6 +23,7 @@ from tactile_rt.daemon.items import (
     Skipped,
     SourceChunk,
 )
+from tactile_rt.daemon.states import Snapshot
 
 __all__ = [
     "MESSAGE_VERSION",
@@ -171,7 +171,7 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
 
 
 class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
-    """Everything; see `health.Snapshot`."""
+    """Everything; see `states.Snapshot`."""
 
     topic: ClassVar[str] = "state"
     snapshot: Snapshot

@@ -16,10 +16,10 @@ import msgspec
 from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message
+from tactile_rt.daemon.states import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.trends import read_resident_bytes
 from tactile_rt.drivers.health import State
 

@@ -19,11 +19,11 @@ from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.diagnostics import LossWindow
-from tactile_rt.daemon.health import LatencyMeter, ModelState
 from tactile_rt.daemon.items import Contact, Decision, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.source_part import keeps_host_time
+from tactile_rt.daemon.states import LatencyMeter, ModelState
 
 __all__ = ["ModelPart"]
 

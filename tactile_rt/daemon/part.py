@@ -13,7 +13,7 @@ from typing import Protocol
 
 from tactile_rt.core.errors import SpecMismatch, TactileError
 from tactile_rt.daemon.config import LimitsConfig
-from tactile_rt.daemon.health import PartState
+from tactile_rt.daemon.states import PartState
 
 __all__ = ["Part", "Report", "reason_of"]
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.health import OnDisk
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -33,6 +32,7 @@ from tactile_rt.daemon.items import (
 from tactile_rt.daemon.ledger import Ledger
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.recordings_folder import RecordingsFolder, words
+from tactile_rt.daemon.states import OnDisk
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     DECISIONS,

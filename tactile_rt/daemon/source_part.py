@@ -23,11 +23,11 @@ from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.diagnostics import LossWindow, oldest_s
-from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.rate_meter import RateMeter
+from tactile_rt.daemon.states import SourceState
 from tactile_rt.daemon.stuck_at import StuckAtDetector
 from tactile_rt.drivers.device_source import (
     ArrayChanged,

@@ -9,8 +9,8 @@ from typing import Any
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Event, Item
+from tactile_rt.daemon.states import Snapshot
 
 __all__ = ["Systemd", "hanging", "status_of"]
 

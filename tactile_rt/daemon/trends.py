@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
-from tactile_rt.daemon.health import Diagnostic
+from tactile_rt.daemon.states import Diagnostic
 
 __all__ = ["Trend", "Trends", "read_resident_bytes"]
 

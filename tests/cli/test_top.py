@@ -13,9 +13,9 @@ from bench.daemon.process import free_port
 from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.config import MetricsConfig
-from tactile_rt.daemon.health import ConsumerState, Diagnostic
 from tactile_rt.daemon.messages import encode, message_of, state_message
 from tactile_rt.daemon.metrics import Metrics
+from tactile_rt.daemon.states import ConsumerState, Diagnostic
 from tests.helpers.published import View, busy_snapshot, decision, event, part, running
 
 SHOWN = """\

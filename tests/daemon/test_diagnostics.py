@@ -18,7 +18,7 @@ from tactile_rt.daemon import diagnostics as module
 from tactile_rt.daemon.advice import ADVICE, DiagnosticOnsets
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.diagnostics import LossWindow, diagnose
-from tactile_rt.daemon.health import (
+from tactile_rt.daemon.states import (
     ConsumerState,
     Diagnostic,
     Losses,

@@ -15,9 +15,9 @@ from bench.daemon.process import free_port
 from tactile_rt.core.errors import SourceError
 from tactile_rt.daemon import metrics as module
 from tactile_rt.daemon.config import MetricsConfig
-from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.messages import StateMessage
 from tactile_rt.daemon.metrics import Metrics, exposition
+from tactile_rt.daemon.states import SourceState
 from tests.helpers.published import View, busy_snapshot, part, running
 from tests.helpers.waiting import PATIENCE_S, until
 

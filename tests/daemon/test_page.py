@@ -16,13 +16,13 @@ from bench.daemon.process import free_port
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.http import Refused
 from tactile_rt.daemon.items import Control, Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.page import feed as feed_module
 from tactile_rt.daemon.page.feed import Feed, map_axes
 from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, Guard, PageClient
+from tactile_rt.daemon.states import Snapshot
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 

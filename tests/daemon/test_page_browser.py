@@ -17,9 +17,9 @@ from playwright.sync_api import sync_playwright
 from bench.daemon.process import free_port
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.health import Diagnostic, ModelState, PartState, Snapshot, SourceState
 from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
+from tactile_rt.daemon.states import Diagnostic, ModelState, PartState, Snapshot, SourceState
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.daemons import load_checked, running_daemon
 

@@ -21,7 +21,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.core.stream import Chunk
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
-from tactile_rt.daemon.health import EDGES_S, LatencyMeter
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -36,6 +35,7 @@ from tactile_rt.daemon.log import Log
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
+from tactile_rt.daemon.states import EDGES_S, LatencyMeter
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S, until

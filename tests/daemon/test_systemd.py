@@ -13,8 +13,8 @@ import pytest
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Source
 from tactile_rt.daemon.daemon import Daemon
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.process import _serve
+from tactile_rt.daemon.states import Snapshot
 from tactile_rt.daemon.systemd import Systemd, hanging, status_of
 from tactile_rt.testing import small_spec
 from tests.helpers.daemons import load_checked, running_daemon

@@ -6,7 +6,7 @@ import numpy as np
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.core.stream import ArraySpec, Chunk, SourceStats
-from tactile_rt.daemon import health
+from tactile_rt.daemon import states
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.testing import small_spec
@@ -25,7 +25,7 @@ class View:
     """A daemon that is what the test says."""
 
     def __init__(self, spec=None, snapshot=None):
-        self.shown = snapshot or health.Snapshot("0", 1, "robot.toml", 5, UTC + 5, 1, 0, "running")
+        self.shown = snapshot or states.Snapshot("0", 1, "robot.toml", 5, UTC + 5, 1, 0, "running")
         self.open = {"whiskers": opened(spec)} if spec else {}
         self.reports = []
 
@@ -74,55 +74,55 @@ def samples(spec, values, t_ns=50, valid=None):
 
 
 def part(name, state="running", reason="", failures=0):
-    return health.PartState(name, state, reason, 1, 1 + failures, failures)
+    return states.PartState(name, state, reason, 1, 1 + failures, failures)
 
 
 def busy_snapshot(seconds=0, state="degraded"):
     """A daemon with something of everything."""
     at = 10_000_000_000 + seconds * 1_000_000_000
-    queue = health.QueueState(
+    queue = states.QueueState(
         {"samples": 1}, {"samples": 10, "events": 2}, {"samples": 7, "events": 2}, {"samples": 2},
         99,
     )  # fmt: skip
-    latency = health.Latency(6, 0.035, 5.0, 9.5, 9.5, (0.001, 0.005, 0.01), (1, 2, 3, 0))
-    return health.Snapshot(
+    latency = states.Latency(6, 0.035, 5.0, 9.5, 9.5, (0.001, 0.005, 0.01), (1, 2, 3, 0))
+    return states.Snapshot(
         "1.2.3", 77, "/etc/robot.toml", at, UTC + at, 2_000_000_000, 1, state,
         ("no samples: source.finger: the device is lost",), 2,
         sources=(
-            health.SourceState(
+            states.SourceState(
                 part("source.whiskers"), "serial:///dev/ttyACM0", "mouse", "head", 1000.0,
                 ("B1", "C2"), ("fx", "fy", "fz"), ("N", "N", "N"),
                 Health(State.STREAMING, 1, connections=3, drift_ppm=12.5),
                 SourceStats(5000, 4, 3, 2, 1), 5000 + 1000 * seconds, at - 4_000_000,
                 measured_hz=998.0,
             ),
-            health.SourceState(
+            states.SourceState(
                 part("source.finger", failures=2), "can:slcan:/dev/ttyUSB0", 'fi"ng\\er', "tip",
                 110.0, ("t",), ("fz",), ("N",), Health(State.LOST, 1, "unplugged"),
             ),
         ),
         models=(
-            health.ModelState(
+            states.ModelState(
                 part("model.whiskers"), "whiskers", "m.onnx", "ab" * 32, ("duck", "mug"), queue,
                 40, 4, True, "mug", 0.93, latency, latency,
             ),
         ),
         consumers=(
-            health.ConsumerState(
+            states.ConsumerState(
                 part("publisher.zmq"), "zmq", queue, latency,
                 {"endpoint": "tcp://127.0.0.1:5556", "messages": 40},
             ),
-            health.ConsumerState(
+            states.ConsumerState(
                 part("recorder", "waiting", "No space left on device", 9), "recorder",
                 on_disk={
-                    "whiskers": health.OnDisk(
+                    "whiskers": states.OnDisk(
                         at - 400_000_000, at - 900_000_000, 4000, meant_ns=at
                     )
                 },
             ),
         ),
-        diagnostics=(health.Diagnostic("source.finger", "no samples", "the device is lost"),),
-        soon=(health.Diagnostic("recorder", "disk full soon", "it is full within 3 h"),),
+        diagnostics=(states.Diagnostic("source.finger", "no samples", "the device is lost"),),
+        soon=(states.Diagnostic("recorder", "disk full soon", "it is full within 3 h"),),
     )  # fmt: skip
 
 

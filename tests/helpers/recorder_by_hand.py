@@ -3,9 +3,9 @@
 import time
 
 from tactile_rt.daemon.config import RecorderConfig
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.recorder import Recorder
+from tactile_rt.daemon.states import Snapshot
 from tactile_rt.testing import ArraySource, small_spec
 
 SPEC = small_spec()

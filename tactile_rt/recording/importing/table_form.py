@@ -171,7 +171,7 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
 
 
 def _measure_end(cells: Sequence[str], width: int) -> tuple[int, int]:
-    """Return how many digits a row's last cell has after its point; before it, if it has none."""
+    """Count the digits of a row's last cell: those after its point, else all."""
     whole, point, rest = cells[-1].strip().partition(".") if len(cells) == width else ("", "", "")
     return len(rest), 0 if point else len(whole)
 

@@ -11,9 +11,9 @@ from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import soak
 from bench.emulated import KINDS, Played
 from tactile_rt.daemon.config import RecorderConfig
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.recorder import Recorder
+from tactile_rt.daemon.states import Snapshot
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished

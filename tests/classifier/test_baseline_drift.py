@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tactile_rt.classifier.rest import Drift, RestLevels
+from tactile_rt.classifier.baseline_drift import Drift, RestLevels
 
 BOTH = np.ones(2, dtype=bool)  # elements, of one channel
 SIGMA = np.full((2, 1), 0.5, dtype=np.float32)
