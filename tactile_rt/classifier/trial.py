@@ -10,7 +10,6 @@ on its processor time and on the clock. It dies with whoever started it.
 """
 
 import ctypes
-import math
 import os
 import resource
 import signal
@@ -185,15 +184,14 @@ def _run(task: _Task) -> Trial:
     step_s, random = 0.0, np.random.default_rng(0)
     shape = stepper.samples.shape[1:]
     floor = np.broadcast_to(card.floor, shape[1:])
-    for name, decides, count, load in _list_loads(card):
+    for name, decides, loads in _list_loads(card):
         stepper.begin(3 * floor, 2 * floor)  # some offset, and noise above the least
         began = time.monotonic()
         took: list[float] = []
-        for k in range(count):
+        for load in loads:
             if len(took) >= STEPS and time.monotonic() - began > TOUCH_S:
                 break
-            grows = math.sin(math.pi * (k + 0.5) / count)
-            stepper.samples[:] = 3 * floor + grows * load * random.uniform(0.9, 1.0, shape)
+            stepper.samples[:] = 3 * floor + load * random.uniform(0.9, 1.0, shape)
             start = time.monotonic()
             logits = stepper.run()
             took.append(time.monotonic() - start)
@@ -203,11 +201,12 @@ def _run(task: _Task) -> Trial:
     return Trial(sha256, load_s, step_s, (_data_bytes() - before) / MB)
 
 
-def _list_loads(card: "ModelCard") -> list[tuple[str, bool, int, "NDArray[np.float64]"]]:
+def _list_loads(card: "ModelCard") -> list[tuple[str, bool, "NDArray[np.float64]"]]:
     """List what a model is tried on.
 
-    Each is a name, whether it must decide on it, steps, and the load (element, channel), SI. The
-    touch is made up from the card's loads."""
+    Each is a name, whether it must decide on it, and loads (step, element, channel), SI, which grow
+    and go as those of a touch, made up from the card's.
+    """
     import numpy as np
 
     from tactile_rt.classifier.classifier import ABSURD, IMPLAUSIBLE
@@ -215,14 +214,20 @@ def _list_loads(card: "ModelCard") -> list[tuple[str, bool, int, "NDArray[np.flo
     random = np.random.default_rng(0)
     touch = np.array(card.clip) * random.uniform(0.2, 1.0, card.array.shape)
     signs = random.choice((-1.0, 1.0), card.array.shape)
-    return [
-        ("rest", True, STEPS, 0.0 * signs),
+    largest = IMPLAUSIBLE * np.array(card.clip)
+    limit = float(np.finfo(np.float32).max)
+    tried: list[tuple[str, bool, int, NDArray[np.float64]]] = [
+        ("rest", True, STEPS, 0 * signs),
         ("a touch", True, max(STEPS, card.steps), touch),
-        ("the largest loads", True, EXTREME_STEPS, IMPLAUSIBLE * np.array(card.clip) * signs),
+        ("the largest loads", True, EXTREME_STEPS, largest * signs),
         ("absurd loads", False, EXTREME_STEPS, ABSURD * signs),
-        ("float32's limits", False, EXTREME_STEPS, float(np.finfo(np.float32).max) * signs),
+        ("float32's limits", False, EXTREME_STEPS, limit * signs),
         ("no numbers", False, EXTREME_STEPS, np.nan * signs),
         ("infinite loads", False, EXTREME_STEPS, np.inf * signs),
+    ]
+    return [
+        (name, decides, np.sin(np.pi * (np.arange(n) + 0.5) / n)[:, None, None] * load)
+        for name, decides, n, load in tried
     ]
 
 

@@ -3,16 +3,19 @@
 import ast
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tactile_rt.classifier import trial
-from tactile_rt.classifier.model_file import hash_of, shipped_model
+from tactile_rt.classifier.classifier import ABSURD, IMPLAUSIBLE
+from tactile_rt.classifier.model_file import hash_of, load_model, shipped_model
 from tactile_rt.classifier.trial import TrialLimits, try_model
 from tactile_rt.core.errors import ModelError
 from tests.helpers.hostile_models import BURNERS, GREEDY, SHAPED, UNSOUND, write_burdened
@@ -101,6 +104,44 @@ def test_a_large_file_may_take_more(tmp_path: Path) -> None:
     assert try_model(write_model(tmp_path / "tiny.onnx"), limits).memory_mb < 16
 
 
+def test_it_is_tried_at_rest_on_a_touch_of_its_card_and_beyond_what_any_sensor_gives() -> None:
+    card = load_model(shipped_model())[1]
+    loads = {name: loads for name, _, loads in trial._list_loads(card)}
+    decided = [name for name, decides, _ in trial._list_loads(card) if decides]
+    assert decided == ["rest", "a touch", "the largest loads"]
+    assert not loads["rest"].any() and np.isnan(loads["no numbers"]).all()
+    touch = loads["a touch"] / card.clip
+    assert len(touch) == card.steps and touch[0] == pytest.approx(touch[-1])  # it grows and goes
+    assert touch[0].max() < 0.1 and 0.2 <= touch[card.steps // 2].min() < 0.25
+    assert 0.95 < touch.max() <= 1
+    for name, size in (
+        ("the largest loads", IMPLAUSIBLE * np.array(card.clip)),
+        ("absurd loads", ABSURD),
+    ):
+        middle = loads[name][1]
+        assert abs(middle) == pytest.approx(np.broadcast_to(size, middle.shape))
+        assert (middle > 0).any() and (middle < 0).any()
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        (-signal.SIGXCPU, "more than limits.model_s = 7 s of the processor"),
+        (-signal.SIGKILL, "it needs more memory than limits.model_mb = 256 MB"),
+        (trial.MEMORY, "it needs more memory than limits.model_mb = 256 MB"),
+        (3, "its trial ended with exit code 3"),
+    ],
+)
+def test_how_a_trial_ended_is_told(code: int, why: str) -> None:
+    with pytest.raises(ModelError, match=f"^m.onnx is refused: {why}"):
+        trial._result(Path("m.onnx"), TrialLimits(seconds=7.0), code, b"")
+
+
+def test_memory_is_what_the_limit_counts() -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[5])
+    assert trial._data_bytes() == pytest.approx(pages * resource.getpagesize(), rel=0.1)
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")
 def test_a_trial_dies_with_whoever_started_it(tmp_path: Path) -> None:
     file = write_burdened(tmp_path / "m.onnx", BURNERS["chained_products"])
@@ -135,7 +176,7 @@ def test_a_child_whose_parent_had_died_before_it_could_say_so_tries_nothing() ->
 
 
 LIMITED = """
-import os, resource, sys
+import os, resource, signal, sys
 import tactile_rt.classifier.model_file as model_file
 import tactile_rt.classifier.trial as trial
 from tactile_rt.core.errors import ModelError
@@ -143,7 +184,8 @@ from tactile_rt.core.errors import ModelError
 def load_model(path, *others):
     kinds = resource.RLIMIT_CPU, resource.RLIMIT_CORE, resource.RLIMIT_DATA
     score = open("/proc/self/oom_score_adj").read().strip()
-    raise ModelError(f"{[resource.getrlimit(k) for k in kinds]}, {os.nice(0)}, {score}")
+    deaf = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    raise ModelError(f"{[resource.getrlimit(k) for k in kinds]}, {os.nice(0)}, {score}, {deaf}")
 
 model_file.load_model = load_model
 sys.exit(trial._main())
@@ -165,9 +207,9 @@ def test_the_child_limits_itself_before_it_loads(tmp_path: Path) -> None:
     small, large = tmp_path / "small.onnx", tmp_path / "large.onnx"
     small.write_bytes(b"x")
     large.write_bytes(bytes(50_000_000))
-    (cpu, core, data), nice, score = limits_of(small)
+    (cpu, core, data), nice, score, deaf = limits_of(small)
     (_, _, more), *_ = limits_of(large)
-    assert score == 1000
+    assert score == 1000 and deaf  # to Ctrl-C, which is for the parent
     assert cpu == (9, 10) and core == (0, 0) and nice >= 5
     assert data[0] == data[1] > 300e6
     assert more[0] - data[0] == pytest.approx(200e6, abs=20e6)  # four times the file
