@@ -125,6 +125,19 @@ def test_a_constant_signal_is_no_copy_of_itself_a_turn_of_the_counter_later():
     assert keep.all() and stats == SourceStats()
 
 
+def test_what_came_a_turn_of_the_counter_ago_or_before_it_began_anew_is_no_copy():
+    stats = SourceStats()
+    sequencer = Sequencer(4, stats)
+    sequencer.number(samples([k % 16 for k in range(24)], content=[k // 16 for k in range(24)]))
+    for count, duplicates, resets in ((7, 1, 0), (3, 1, 1)):  # of this turn; of the one before
+        sequencer.number(samples([count], content=[count == 7]))
+        assert (stats.duplicates, sequencer.resets) == (duplicates, resets)
+    stats = SourceStats()
+    sequencer = Sequencer(16, stats)
+    sequencer.number(samples([20_005, 60_010, 10_000, 25_000, 20_005]))
+    assert (stats.duplicates, sequencer.resets) == (0, 2)
+
+
 PACKET, TICKS = 8, 1000  # samples that share a reading of the clock; its ticks to a sample
 
 
@@ -159,6 +172,12 @@ def test_the_clock_bears_a_gap_out_within_a_packet_and_two_percent(off, missing,
         (16, 32, 1000.0, 900, 300_000, 899, 0),
         (16, 32, 1000.0, 900, 1, 0, 1),
         (16, 32, 1000.0, 900, 0, 899, 0),
+        # half of its turn, and a tick more
+        (16, 16, 4.0, 8000, 32_768, 7999, 0),
+        (16, 16, 4.0, 8000, 32_769, 0, 1),
+        # whole turns of an 8-bit counter: 101 samples that the clock may be off, and half a turn
+        (8, 16, 4.0, 86, 19_800, 4949, 0),
+        (8, 16, 4.0, 206, 25_400, 0, 1),
     ],
 )
 def test_what_the_clock_says_of_a_step(bits, tick_bits, period, ahead, passed, missing, resets):
