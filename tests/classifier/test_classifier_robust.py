@@ -14,9 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_rt.classifier import runtime, stepper
-from tactile_rt.classifier.classifier import Classification, Classifier, without_bad_samples
+from tactile_rt.classifier.classifier import (
+    Classification,
+    Classifier,
+    ClassifierStats,
+    without_bad_samples,
+)
 from tactile_rt.classifier.decision_rules import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.classifier.skips import Skip
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
@@ -167,14 +173,43 @@ def test_loads_in_another_unit_are_told_once_and_counted(model: Path, caplog) ->
     assert caplog.text.count("another unit, gain or sensor?") == 1
 
 
-def test_bad_samples_that_were_marked_are_no_news(model: Path) -> None:
-    chunks = stream(signal([], 50))
-    for chunk in chunks:
-        chunk.values[:, 1] = np.nan
-        chunk.valid[:, 1] = False
+@pytest.mark.parametrize(("load", "implausible"), [(9.5, 0), (10.5, 1)])
+def test_ten_times_the_largest_load_of_its_card_is_implausible(model, caplog, load, implausible):
     classifier = Classifier(model, SAME_RATE)
+    push_all(classifier, stream(signal([(QUIET, 300, load)], 400)))
+    assert classifier.stats.implausible == implausible
+    assert caplog.text.count("another unit, gain or sensor?") == implausible
+
+
+@pytest.mark.parametrize(("seconds", "told"), [(9.5, 0), (25.0, 1)])
+def test_a_contact_without_an_end_is_told_once(model, caplog, seconds, told):
+    held = round(seconds * SAME_RATE.rate_hz)
+    values = signal([(QUIET, QUIET + held, 0.1)], QUIET + held + 200)
+    assert push_all(Classifier(model, SAME_RATE), stream(values))
+    assert caplog.text.count("contact for 10 s without an end") == told
+
+
+@pytest.mark.parametrize(("seconds", "joined"), [(0, True), (4.5, True), (6, False)])
+def test_a_baseline_that_moves_is_put_off_for_five_seconds(model, seconds, joined):
+    """A stream that is joined within a touch, which is on its way out, and touched again."""
+    dead, way = round(seconds * SAME_RATE.rate_hz), 70
+    values = signal([(dead + 300, dead + 350, 0.1)], dead + 500)
+    values[dead : dead + way, 0] += np.linspace(1, 0, way, dtype=np.float32)[:, None]
+    classifier, chunks = Classifier(model, SAME_RATE), stream(values)
+    for chunk in chunks:
+        chunk.valid[chunk.seq < dead] = False
     push_all(classifier, chunks)
-    assert classifier.stats.bad_samples == 0
+    found = [t_ns // PERIOD_NS - dead for t_ns, began in classifier.touches if began]
+    assert (found == [301]) == joined, found
+
+
+def test_a_stream_that_begins_with_a_skip_has_one(model):
+    classifier = Classifier(model, SAME_RATE, skips=[Skip(0, 20 * PERIOD_NS)])
+    assert classifier.stats == ClassifierStats(0, 0, 0, 0, 0, 0, 0)
+    decision = push_all(classifier, stream(signal([(QUIET, 300, 0.1)], 400)))[-1]
+    assert classifier.stats.skips == 1
+    seven = replace(decision, labels=tuple("abcdefg"), probabilities=np.arange(7.0) / 21)
+    assert [label for label, _ in seven.top()] == list("gfedc")
 
 
 @pytest.mark.parametrize("rate_hz", [1000.0, 111.0])
