@@ -246,6 +246,9 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     if not source.live:
         taken = Counter(touch.label for touch in lesson.touches[begun:])
         _say("found in it: " + (", ".join(f"{n} {label}" for label, n in taken.items()) or "none"))
+        each, more = divmod(taken.total(), len(teacher.wanted) or 1)
+        if teacher.wanted and not begun and each not in (0, teacher.each) and not more:
+            _say(f"{taken.total()} touches: if each was touched {each} times, --touches {each}")
 
 
 def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":

@@ -81,7 +81,9 @@ _LABELLED: Final = re.compile(
     r"([A-Za-z_][\w ()\[\]/°%]*?(?:\s*[\[(][^\d\])=:][^\])=:]*[\])])?)\s*[:=\[]\s*([^\s,;|\]]+)"
     rf"(?: (?:{'|'.join(map(re.escape, [*UNITS, *_ALIASES, 'C']))})(?= ))?"
 )
-_WEIGHED: Final = re.compile(r"force|load|weight|mass|cell|grip|press", re.IGNORECASE)
+_WEIGHED: Final = re.compile(
+    r"force|load|weight|mass|cell|grip|press|gewicht|kraft|last|poids|peso", re.IGNORECASE
+)
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
 _NAMED: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
 

@@ -40,13 +40,20 @@ _UNIT: Final = re.compile(
 )
 _SENSOR: Final = re.compile(
     r"(?:sensor|channel|taxel|signal|variable|element|quantity|parameter)s?"
-    r"(?:[ _.-]?(?:id|name|no|nr|num|number|index|idx))?|name|key",
+    r"(?:[ _.-]?(?:id|name|no|nr|num|number|index|idx))?|name|key|id|device|node|board|finger",
     re.IGNORECASE,
 )
+MOST_SENSORS: Final = 64  # with numbers for names: a counter turns later
+_NAMES_LINE: Final = re.compile(
+    r"[ \t\"]*[^\W\d][^:=\"]{0,40}(?:([,;\t|])[ \t\"]*[^\W\d][^:=\"]{0,40})+"
+)
+_GLUED: Final = re.compile(r"[+-]?\d+(?:[.,]\d+)?([a-zA-Z\u00b5]{1,3})")
 LONG_ROW: Final = 16  # cells
 IN_TURN: Final = 0.9  # of the rows
 THOUSAND: Final = " (a thousand?)"
 _THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+\s*")
+_US_THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+\.\d+\s*")
+_GERMAN_THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+,\d+\s*")
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
 _DAY: Final = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}")
 _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
@@ -69,6 +76,7 @@ class CsvForm:
     # how many cells a row may have; those that it lacks of `width` are empty
     widths: frozenset[int] = frozenset()
     heads: frozenset[str] = frozenset()  # lines above the first row
+    note: str = ""  # what is odd of its header
 
 
 def csv_form(
@@ -86,6 +94,7 @@ def csv_form(
     """
     with open_log_file(path) as file, _text(file) as text:
         head = list(islice(_joined(text, skip, lines), LOOKED_AT))
+    _check_cells(path, head)
     told = NAMES.get(delimiter, delimiter)
     if len(told) > 1:
         raise ConfigError(f"--delimiter is one character, tab or space, not {delimiter!r}")
@@ -109,7 +118,36 @@ def csv_form(
         )
     _, form = max(fits, key=lambda fit: round(fit[0], 9))
     _check_layout(path, head, form)
+    form = _compare_header(path, head[: form.first], form)
     return replace(form, first=skip + form.first * lines, lines=lines)
+
+
+def _check_cells(path: Path, head: list[str]) -> None:
+    """Raise ConfigError where most cells are numbers with units: 0.10N,10.00mN."""
+    cells = [c.strip(' "') for x in head for c in re.split("[,;\t ]+", x.strip())]
+    glued = [c for c in cells if (found := _GLUED.fullmatch(c)) and _UNIT.fullmatch(found[1])]
+    if 2 * len(glued) > len(cells):
+        raise ConfigError(
+            f"{path}: its cells hold units ({glued[-1]}): write these behind the columns' names"
+        )
+
+
+def _compare_header(path: Path, above: list[str], form: CsvForm) -> CsvForm:
+    """Take names that stand apart by another mark than cells; note where they are not as many.
+
+    Raises:
+        ConfigError: the decimal mark may be what stands between cells.
+    """
+    line = above[-1].strip() if above else ""
+    if form.names or form.delimiter == " " or not (found := _NAMES_LINE.fullmatch(line)):
+        return form
+    names = [name.strip(' "') for name in line.split(found[1])]
+    if len(names) == form.width:
+        return replace(form, names=tuple(_distinct(names)))
+    odd = f"its header, {line!r:.40}, names {len(names)} columns, its rows have {form.width} cells"
+    if form.delimiter == "," and len(names) < form.width <= 2 * len(names):
+        raise ConfigError(f"{path}: {odd}: if , is a decimal mark, too, put ; between the cells")
+    return replace(form, note=f"{odd}: the columns have no names")
 
 
 def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
@@ -118,7 +156,8 @@ def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
     rows = [[c.strip(' "') for c in row] for row in cells if len(row) == form.width]
     names = list(dict.fromkeys(row[0] for row in rows if row[0][:1].isalpha()))
     wide = form.width > max(LONG_ROW, 2 * len(rows)) and len(head) < LOOKED_AT
-    if wide and not form.names and len(names) == len(rows) > 1 and not any(map(_is_there, names)):
+    across = bool(_SENSOR.fullmatch(form.names[0])) if form.names else wide
+    if across and len(names) == len(rows) > 1 and not any(map(_is_there, names)):
         told = ", ".join(names)
         raise ConfigError(
             f"{path}: each row is a channel ({told:.40} ...), not a sample: transpose it"
@@ -126,7 +165,7 @@ def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
     for k, column in enumerate(form.names):
         of = [row[k] for row in rows]
         n = len(kinds := dict.fromkeys(of))
-        if not _SENSOR.fullmatch(column) or not 1 < n <= len(of) / 2:
+        if not _SENSOR.fullmatch(column) or not 1 < n <= min(len(of) / 2, MOST_SENSORS):
             continue
         turns = sum(a == b for a, b in zip(of, of[n:], strict=False)) >= IN_TURN * (len(of) - n)
         words = not any(map(_is_there, kinds)) and 2 * sum(map(str.__ne__, of, of[1:])) > len(of)
@@ -138,6 +177,7 @@ def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
 def read_table(path: Path, form: CsvForm) -> Table:
     """The rows of a table."""
     table = Table(path, form.names, (), width=form.width)
+    table.notes += [form.note] if form.note else []
     table.rows = _rows(table, form)
     return table
 
@@ -222,6 +262,9 @@ def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
         cells = [x for c in cells for x in (_split_list(c) if _LIST.search(c) else (c,))]
     if len(cells) > 1 and line.rstrip(" ").endswith(delimiter):
         del cells[-1]  # a delimiter at the end of each line
+    mark, grouped = (".", _GERMAN_THOUSANDS) if comma else (",", _US_THOUSANDS)
+    if mark in line and (mark != delimiter or '"' in line):
+        cells = [c.replace(mark, "") if grouped.fullmatch(c) else c for c in cells]
     if comma:  # where 1.000 is a thousand, or the decimal mark is another after all
         cells = [c + THOUSAND if _THOUSANDS.fullmatch(c) else c for c in cells]
     return [c.replace(",", ".") if comma and _COMMA.fullmatch(c) else c for c in cells]

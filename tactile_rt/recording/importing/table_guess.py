@@ -104,6 +104,7 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     said = f"{path} is a table of {form.width} columns"
     left = [n for n, word in zip(form.names, words, strict=False) if word == "-"]
     said += f" (left out: {shown_names(left)})" if left else ""
+    said += f"; {form.note}" if form.note else ""
     unread = list_unread_units(names, words)
     said += f"; units that are not read: {shown_names(unread)}" if unread else ""
     if not any("." in word for word in words if not word.startswith("time")):

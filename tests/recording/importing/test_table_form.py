@@ -49,6 +49,7 @@ WRITTEN = {
         "%time,field.wrench.force.x,field.wrench.force.y\n", "{s:.2f},{a},{b}\n",
         "%time=time:s,field.wrench.force.x=S.fx:mN,field.wrench.force.y=S.fy:mN",
     ),
+    "another mark": ("t,x,y\n", "{s:.2f};{a};{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
     "words between": ("", "{s:.2f} N: ({a}, {b})\n", "time:s,S.fx:mN,S.fy:mN"),
     "case": ("Time , FX,fY\n", "{s:.2f}, {a}, {b}\n", "time=time:s,fx=S.fx:mN,fy=S.fy:mN"),
 }  # fmt: skip
@@ -72,8 +73,9 @@ def test_a_thousand_with_a_point_is_no_one(table):
     assert "line 3: '1.000 (a thousand?)' is no number" in made.notes[0]
 
 
-def test_a_thousand_of_the_swiss_is_one(table):
-    _, chunk, _ = table((f"{k},1'234\u2019{100 + k}.5\n" for k in range(N)), "time:s,S.x:1")
+@pytest.mark.parametrize("form", ["{},1'234\u2019{}.5\n", '{},"1,234,{}.5"\n', "{};1.234.{},5\n"])
+def test_a_thousand_that_can_be_nothing_else_is_one(table, form):
+    _, chunk, _ = table((form.format(k, 100 + k) for k in range(N)), "time:s,S.x:1")
     assert chunk.values.ravel().tolist() == [1_234_100.5 + k for k in range(N)]
 
 
@@ -272,6 +274,9 @@ def test_columns_of_a_file_are_with_their_places(tmp_path, table):
         ("", "time:s,S.fx", "is no table of numbers"),
         ("t,sensor,x\n" + "1,1,2\n1,2,3\n" * 9, "t=time:s,x=S.x", "'sensor' says .*1, 2.*pivot"),
         ("t,name,x\n" + "1,a,2\n1,b,3\n" * 9, "t=time:s,x=S.x", "'name' says .*a, b.*: pivot"),
+        ("sensor,t0,t1\nfx,1,2\nfy,1,2\nfz,1,3\n", "t0=S.x", "fx, fy, fz .*transpose"),
+        ("t,F\n" + "0,01,1,5\n0,02,1,6\n" * 9, "t=time:s", "names 2 columns, its rows have 4"),
+        ("t,F\n" + "0.01s,1.5N\n0.02s,5mN\n" * 9, "t=time:s", "cells hold units .5mN."),
         ("".join(f"{c},{'1.5,' * 40}2\n" for c in "tab"), "-,T{0..40}.x", "t, a, b .*transpose"),
     ],
 )  # fmt: skip
