@@ -39,7 +39,7 @@ gc.disable()
 EXTRAS = frozenset(
     "DracoPy PIL av cantools cyclonedds foxglove gymnasium h5py lightning manifold3d matplotlib "
     "mujoco numba onnx onnxscript pyarrow ray rosbags scipy sklearn threadpoolctl torch trimesh "
-    "urllib3 zenoh zmq".split()
+    "mcap_ros2 pynwb urllib3 yaml zenoh zmq".split()
 )
 
 

@@ -5,13 +5,11 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
+import yaml
 
 import tactile_rt
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tests.helpers.source_tree import ROOT
-
-yaml = pytest.importorskip("yaml")
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 SOURCE = PROJECT["urls"].get("Source")  # none until it is published

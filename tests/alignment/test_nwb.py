@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 from functools import partial
 
 import numpy as np
+import pynwb
 import pytest
 
 from tactile_rt.alignment import build, nwb
@@ -13,8 +14,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 from tests.helpers.nwb_sessions import changed_copy
 from tests.helpers.refusals import refusal
-
-pynwb = pytest.importorskip("pynwb", reason="pynwb writes the files and is the oracle")
 
 ORIGIN = 10.03  # s, when the electrical recording began
 STRINGS = ("outcome", "stimulus", "servo_position")

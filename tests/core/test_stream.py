@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.core import stream
 from tactile_rt.core.errors import ConfigError, TactileError
-from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, concatenate
+from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, Timing, concatenate
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 SPEC = small_spec()
@@ -230,5 +231,19 @@ def test_what_does_not_come_in_time_is_no_chunk_of_a_stream() -> None:
 
 def test_a_source_is_closed_where_its_context_is_left() -> None:
     with Given() as source:
-        assert not source.closed
+        assert source.live and source.fileno() == -1 and not source.closed
     assert source.closed
+
+
+def test_quaternions_turn_as_those_of_scipy_do() -> None:
+    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    p, q = (rotation.random(9, random_state=seed) for seed in (1, 2))
+    as_ours = [turn.as_quat()[:, [3, 0, 1, 2]] for turn in (p, q)]
+    assert stream.rotation_matrices(7 * as_ours[0]) == pytest.approx(p.as_matrix(), abs=1e-12)
+    products = np.array([stream.quaternion_product(*pair) for pair in zip(*as_ours, strict=True)])
+    assert stream.rotation_matrices(products) == pytest.approx((p * q).as_matrix(), abs=1e-12)
+
+
+def test_a_step_is_as_near_to_45_ms_as_samples_are() -> None:
+    assert [Timing.of(ns).substeps for ns in (9_000_000, 20_000_000, 90_000_000)] == [5, 2, 1]
+    assert Timing() == stream.MOUSE and (stream.MOUSE.substeps, stream.MOUSE.samples) == (5, 110)

@@ -6,6 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
 
 from tactile_rt.calibration import Calibration
 from tactile_rt.drivers.codec import CanFrame
@@ -14,11 +17,6 @@ from tactile_rt.recording.conversion import write_bag
 from tactile_rt.recording.replay import DEMO
 from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import SPEC, all_parts, noise, record_device, write_as_daemon
-
-pytest.importorskip("mcap_ros2")
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
 
 
 def by_rosbags(path):

