@@ -133,7 +133,7 @@ def _check_cells(path: Path, head: list[str]) -> None:
 
 
 def _compare_header(path: Path, above: list[str], form: CsvForm) -> CsvForm:
-    """Take names that stand apart by another mark; note where they are too few or many.
+    """Take names apart by another mark; note where they are too few or many.
 
     Raises:
         ConfigError: the decimal mark may be what stands between cells.
