@@ -102,6 +102,7 @@ class DeviceSource(Source):
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
         self._looked_ns = 0  # when nothing had come
+        self._noise_ns = 0  # since when what comes is no sample; 0: it is
         self._asked_ns, self._resets = 0, 0  # when it was last asked again; its counter's then
         self.describes = codec.describes and codec.spec is None
         self._early: list[Samples] = []  # that came while the device was being started
@@ -246,16 +247,18 @@ class DeviceSource(Source):
                 self._lose(str(error))
             return None
         if found is None:
-            self._looked_ns = time.monotonic_ns()
-            if self.describes:
-                self._ask_again(self._looked_ns)
+            now_ns = self._looked_ns = time.monotonic_ns()
+            if self.describes and self._stamper is not None:
+                self._ask_again(now_ns, now_ns - self._stamper.newest_ns)
             return None
         packet, t_ns = found
         if self._tap is not None:
             self._tap(packet, t_ns)
         samples = self.codec.feed(packet, t_ns)
         if self.describes:
-            self._ask_again(t_ns)
+            # What waited while nobody read is old, but no silence: its end may be half a frame.
+            self._noise_ns = 0 if samples is not None else self._noise_ns or t_ns
+            self._ask_again(t_ns, t_ns - self._noise_ns if self._noise_ns else 0)
             if self.codec.spec is not self._described:
                 self._compare()
         return None if samples is None else self._chunk(samples)
@@ -303,11 +306,10 @@ class DeviceSource(Source):
         if found.serial_number:
             self._known = found
 
-    def _ask_again(self, now_ns: int) -> None:
+    def _ask_again(self, now_ns: int, silent_ns: int) -> None:
         """Ask a device that is silent, or counts anew, what it is."""
         assert self._stamper is not None
         resets = self._stamper.sequencer.resets
-        silent_ns = now_ns - self._stamper.newest_ns
         well = silent_ns < max(ASK_NS, self._stale_ns) and resets == self._resets
         if well or now_ns - self._asked_ns < ASK_NS or self._link is None:
             return

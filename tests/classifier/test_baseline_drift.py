@@ -69,8 +69,7 @@ def test_a_slope_is_one_beyond_six_errors_and_close_to_a_line():
 
 def test_a_slope_that_begins_late_is_found_from_there_on_and_needs_trusted_samples():
     assert not follow(drifting(0.05, 0.1)[:-BLOCK]).found
-    flat_first = np.concatenate([np.zeros((400, 2, 1)), drifting(0.2, 0.0, n=420)])
-    drift = follow(flat_first)
+    drift = follow(np.concatenate([np.zeros((400, 2, 1)), drifting(0.2, 0.0, n=420)]))
     assert drift.straight and drift.slope[:, 0] == pytest.approx(0.2)
     assert drift.span == 20 * BLOCK  # a block less of what was flat with each that slopes
     long = follow(drifting(0.2, 0.0, n=40 * BLOCK))
@@ -113,11 +112,9 @@ def test_so_many_samples_of_a_still_stretch_may_be_wild(wild, rests):
 
 
 def test_an_element_that_is_not_trusted_throughout_a_stretch_says_nothing_of_it():
-    levels, said = RestLevels(), []
+    levels, nothing, said = RestLevels(), RestLevels(), []
     for k in range(100):
         values = np.array([[1e3 * k * ((k // 20) % 2)], [1e3 * k]], dtype=np.float32)
         said.append(levels.found(values, np.array([True, k % 20 == 0]), SIGMA, 0))
     assert said == [k == 99 for k in range(100)]
-    assert len(levels.block) == 20
-    nothing = RestLevels()
     assert not any(nothing.found(SIGMA, ~BOTH, SIGMA, 0) for _ in range(100))

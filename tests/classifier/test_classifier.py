@@ -230,19 +230,6 @@ def test_the_same_touch_at_the_model_s_rate_and_at_1_khz_gives_the_same_decision
         assert x.probabilities == pytest.approx(y.probabilities, abs=1e-6)
 
 
-def test_a_silence_of_seconds_within_an_episode_ends_it(model: Path) -> None:
-    """The rest of it is lost; what comes after is not the object that was touched before."""
-    silence_ns = 600 * PERIOD_NS
-    values = signal([(QUIET, QUIET + 6, 0.1), (300, 400, 0.1)], 400)
-    chunks = stream(values, samples=1)
-    late = [replace(c, t_ns=c.t_ns + silence_ns) if c.seq[0] >= QUIET + 6 else c for c in chunks]
-    decisions = push_all(Classifier(model, SAME_RATE), late)
-    assert [d.step for d in decisions] == [1, 1, 2, 3, 4]
-    for d in decisions[1:]:
-        assert d.onset_ns == 301 * PERIOD_NS + silence_ns
-        assert logits_of(d.probabilities) == fed_logits(values, 301, d.step)
-
-
 # Elements that cannot be trusted
 
 

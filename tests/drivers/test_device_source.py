@@ -11,6 +11,7 @@ from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.core.stream import EndOfStream
 from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.health import State
+from tactile_rt.drivers.links import SerialLink
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import FakeCan, FakeSerial
 from tests.helpers.waiting import PATIENCE_S, until
@@ -138,6 +139,21 @@ def test_a_silent_device_is_stale_not_fresh():
         assert source.health.state == State.STREAMING  # nobody has looked
         until(lambda: not source.read(0.0) and source.health.state == State.STALE)
         assert "no sample for" in source.health.reason
+
+
+def test_a_frame_at_the_end_of_what_waited_while_nobody_read_is_not_lost(monkeypatch):
+    receive, held = SerialLink.receive, []
+
+    def cut(link, timeout_s):
+        if not held and (found := receive(link, timeout_s)) is not None:
+            held.extend((part, found[1] + 2 * 10**9) for part in (found[0][:-9], found[0][-9:]))
+        return held.pop(0) if held else None
+
+    with FakeSerial(signal(3000), "native") as fake, open_source(fake.url) as source:
+        take(source, 100)
+        monkeypatch.setattr(SerialLink, "receive", cut)
+        take(source, 300)
+        assert (source.stats.missing, source.stats.corrupt) == (0, 0)
 
 
 def test_a_device_that_restarts_goes_on(tmp_path):
