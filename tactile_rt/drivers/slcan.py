@@ -6,7 +6,6 @@ line makes of itself can't always be told, and lost lines not at all. USB has a 
 own.
 """
 
-from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
@@ -38,24 +37,18 @@ _KINDS: Final = {
     )
 }  # fmt: skip
 _LONGEST: Final = 1 + 8 + 1 + 2 * 64 + 8
-_REPLIES: Final = b"VNFv"  # version, serial number, status flags, detailed version
 
 
 class SlcanDecoder:
     """The host's side: bytes to frames. Never raises, holds one line at most.
 
-    Time stamps, 4 or 8 hexadecimal digits after a frame's data, are allowed but not used: they
-    are the adapter's, not the device's. Whether frames have them is learnt from the first line; it
-    changes when two lines in succession agree that it has, so that a damaged length is noticed.
-
-    Attributes:
-        corrupt: Number of lines that were neither a frame nor an answer.
-        replies: The last 16 answers to V, N and F, without their end of line.
+    Answers to commands are passed over, and so is what is no frame. Time stamps, 4 or 8 hexadecimal
+    digits after a frame's data, are allowed but not used: they are the adapter's, not the device's.
+    Whether frames have them is learnt from the first line; it changes when two lines in succession
+    agree that it has, so that a damaged length is noticed.
     """
 
     def __init__(self) -> None:
-        self.corrupt = self.acks = self.bells = 0
-        self.replies: deque[bytes] = deque(maxlen=16)
         self._rest = b""
         self._stamp: int | None = None  # digits of a time stamp
         self._other: int | None = None  # of the line before, if it differed
@@ -73,23 +66,16 @@ class SlcanDecoder:
         for line in lines:
             kind = _KINDS.get(line[0]) if line else None
             if kind is None:
-                self._answer(line)
                 continue
             end, highest, lengths, extended, fd, remote = kind
             # int() and fromhex() would allow spaces, signs and underscores
-            if len(line) <= end or not line.isalnum():
-                self.corrupt += 1
-                continue
-            size = lengths.get(line[end])
-            if size is None:
-                self.corrupt += 1
+            if len(line) <= end or not line.isalnum() or (size := lengths.get(line[end])) is None:
                 continue
             stop = end + 1 if remote else end + 1 + 2 * size
             stamp = len(line) - stop
             if stamp == self._stamp:
                 self._other = None
             elif not self._stamped(stamp):
-                self.corrupt += 1
                 continue
             try:
                 ident = int(line[1:end], 16)
@@ -97,18 +83,10 @@ class SlcanDecoder:
                 if stamp:
                     int(line[stop:], 16)
             except ValueError:
-                self.corrupt += 1
                 continue
-            if ident > highest:
-                self.corrupt += 1
-                continue
-            frames.append(CanFrame(ident, body, extended, fd, remote))
+            if ident <= highest:
+                frames.append(CanFrame(ident, body, extended, fd, remote))
         return frames
-
-    def forget(self) -> None:
-        """Drop the line that is not yet complete (after a reconnection)."""
-        self._rest = b""
-        self._stamp = self._other = None
 
     def _stamped(self, digits: int) -> bool:
         """Whether a line with so many more digits than expected is to be believed."""
@@ -119,19 +97,6 @@ class SlcanDecoder:
             return False
         self._stamp, self._other = digits, None
         return True
-
-    def _answer(self, line: bytes) -> None:
-        if line.endswith(BELL):
-            self.bells += 1
-            line = line[:-1]
-            if line:
-                self.corrupt += 1
-        elif line in (b"", b"z", b"Z"):
-            self.acks += 1
-        elif line[0] in _REPLIES and len(line) <= 40 and line.isalnum():
-            self.replies.append(line)
-        else:
-            self.corrupt += 1
 
 
 def encode(frames: Iterable[CanFrame], stamp_ms: int | None = None) -> bytes:

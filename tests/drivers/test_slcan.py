@@ -49,7 +49,6 @@ def test_the_manual_s_lines(line: bytes, frame: CanFrame) -> None:
     assert decoder.feed(line[:3]) == []
     assert decoder.feed(line[3:]) == [frame]
     assert decoder.feed(line.lower().replace(line[:1].lower(), line[:1], 1)) == [frame]
-    assert decoder.corrupt == decoder.acks == decoder.bells == 0
 
 
 def test_frames_are_written_as_the_manual_does() -> None:
@@ -71,16 +70,12 @@ def test_what_is_encoded_is_decoded_however_it_is_cut(frames, stamped, cuts):
     for a, b in zip(edges, edges[1:], strict=False):  # noqa: RUF007
         found += decoder.feed(wire[a:b])
     assert found == frames
-    assert decoder.corrupt == 0
 
 
 def test_answers_are_told_from_frames() -> None:
-    decoder = SlcanDecoder()
     frame = CanFrame(0x100, b"\x11\x33")
     wire = b"\r\r\aV1013\r" + encode([frame]) + b"NA123\rz\rZ\r\aF08\r" + encode([frame])
-    assert decoder.feed(wire) == [frame, frame]
-    assert (decoder.acks, decoder.bells, decoder.corrupt) == (4, 2, 0)
-    assert list(decoder.replies) == [b"V1013", b"NA123", b"F08"]
+    assert SlcanDecoder().feed(wire) == [frame, frame]
     assert SlcanDecoder().feed(b"t10021133\r\nt0200\r\n") == [frame, CanFrame(0x20)]
 
 
@@ -92,11 +87,9 @@ def test_answers_are_told_from_frames() -> None:
         b"d100G", b"\xff\xfe", b"t10021133XYZW", b"V" * 60,
     ],
 )  # fmt: skip
-def test_a_line_that_is_no_frame_is_counted(line: bytes) -> None:
-    decoder = SlcanDecoder()
+def test_a_line_that_is_no_frame_is_passed_over(line: bytes) -> None:
     good = encode([CanFrame(0x20)] * 2)
-    assert decoder.feed(good + line + b"\r" + good) == [CanFrame(0x20)] * 4
-    assert decoder.corrupt == 1
+    assert SlcanDecoder().feed(good + line + b"\r" + good) == [CanFrame(0x20)] * 4
 
 
 def test_a_shorter_length_is_not_taken_for_a_time_stamp() -> None:
@@ -104,7 +97,6 @@ def test_a_shorter_length_is_not_taken_for_a_time_stamp() -> None:
     line = encode([CanFrame(0x100, bytes(6))])
     decoder = SlcanDecoder()
     assert len(decoder.feed(line + line.replace(b"t1006", b"t1004") + line)) == 2
-    assert decoder.corrupt == 1
     # time stamps switched on meanwhile: believed from the second line on
     assert len(decoder.feed(encode([CanFrame(0x100)] * 3, 7))) == 2
 
@@ -124,14 +116,10 @@ def test_no_input_raises_or_piles_up() -> None:
         a = whole.feed(bytes(hurt))
         b = [f for i in range(0, len(hurt), 7) for f in pieces.feed(bytes(hurt[i : i + 7]))]
         assert a == b
-    assert (whole.corrupt, whole.acks, whole.bells) == (pieces.corrupt, pieces.acks, pieces.bells)
     for _ in range(100):
         decoder.feed(b"t" * 10_000)  # no end of line
     assert len(decoder._rest) < 200
     assert decoder.feed(b"\rt0200\r") == [CanFrame(0x20)]
-    decoder.feed(b"t10")
-    decoder.forget()
-    assert decoder.feed(b"t0200\r") == [CanFrame(0x20)]
 
 
 def test_a_host_opens_and_closes_an_adapter() -> None:
