@@ -13,7 +13,7 @@ from tactile_rt.core.errors import ConfigError, SourceError, describe_error
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 
-__all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
+__all__ = ["CanLink", "Link", "SerialLink", "SlcanLink", "convert_message"]
 
 READ_BYTES = 65_536
 TERMINAL_BYTES = 4095  # that Linux's terminals give at most at a time
@@ -170,6 +170,14 @@ class SerialLink(Link[bytes]):
         return -1 if self._fd is None else self._fd
 
 
+def convert_message(message: Any) -> CanFrame:
+    """Convert a message of python-can."""
+    return CanFrame(
+        message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_fd,
+        message.is_remote_frame,
+    )  # fmt: skip
+
+
 class CanLink(Link[Sequence[CanFrame]]):
     """Any interface of python-can: socketcan, pcan, kvaser, virtual, ...
 
@@ -178,19 +186,21 @@ class CanLink(Link[Sequence[CanFrame]]):
         channel: Which bus of that interface, such as ``can0``.
         bitrate: Speed of the bus, bit/s.
         data_bitrate: Speed of the data phase of CAN FD, bit/s.
+        patience_s: Longest time that the bus may take to take a frame, s.
     """
 
     def __init__(
-        self, interface: str, channel: str, bitrate: int, fd: bool, data_bitrate: int | None
-    ) -> None:
+        self, interface: str, channel: str, bitrate: int, fd: bool, data_bitrate: int | None = None,
+        patience_s: float = 1.0,
+    ) -> None:  # fmt: skip
         import can
 
-        self.name = f"{interface}:{channel}"
+        self.name, self._patience_s = f"{interface}:{channel}", patience_s
         wanted: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if fd else {}
         if interface == "virtual":
             wanted = {"protocol": can.CanProtocol.CAN_FD} if fd else {}
         try:
-            self._bus: Any = can.Bus(channel, interface, bitrate=bitrate, **wanted)
+            self.bus: Any = can.Bus(channel, interface, bitrate=bitrate, **wanted)
         except can.CanInterfaceNotImplementedError as error:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             raise ConfigError(
@@ -204,18 +214,13 @@ class CanLink(Link[Sequence[CanFrame]]):
 
         frames: list[CanFrame] = []
         try:
-            message = self._bus.recv(timeout_s)
+            message = self.bus.recv(timeout_s)
             while message is not None:
                 if message.is_error_frame:
                     self.can_errors += 1
                 else:
-                    frames.append(
-                        CanFrame(
-                            message.arbitration_id, bytes(message.data), message.is_extended_id,
-                            message.is_fd, message.is_remote_frame,
-                        )
-                    )  # fmt: skip
-                message = self._bus.recv(0) if len(frames) < MOST_FRAMES else None
+                    frames.append(convert_message(message))
+                message = self.bus.recv(0) if len(frames) < MOST_FRAMES else None
         except (can.CanError, OSError, ValueError) as error:
             if self._off():
                 raise SourceError(
@@ -230,12 +235,12 @@ class CanLink(Link[Sequence[CanFrame]]):
 
         try:
             for f in packet:
-                self._bus.send(
+                self.bus.send(
                     can.Message(
                         arbitration_id=f.id, data=f.data, is_extended_id=f.extended, is_fd=f.fd,
                         bitrate_switch=f.fd, is_remote_frame=f.remote,
                     ),
-                    timeout=1.0,
+                    timeout=self._patience_s,
                 )  # fmt: skip
         except (can.CanError, OSError, ValueError) as error:
             raise SourceError(f"can:{self.name}: cannot send ({_reason(error)})") from None
@@ -244,7 +249,7 @@ class CanLink(Link[Sequence[CanFrame]]):
         import can
 
         try:
-            self._bus.shutdown()
+            self.bus.shutdown()
         except (can.CanError, OSError):
             pass  # it is gone, which is what we want
 
@@ -252,7 +257,7 @@ class CanLink(Link[Sequence[CanFrame]]):
         import can
 
         try:
-            return bool(self._bus.state == can.BusState.ERROR)
+            return bool(self.bus.state == can.BusState.ERROR)
         except (NotImplementedError, can.CanError, OSError):
             return False
 

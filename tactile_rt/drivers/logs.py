@@ -22,7 +22,7 @@ from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers import log_lines
-from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.drivers.links import convert_message
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "Occurrences", "open_log_file", "read_log"]
 
@@ -205,11 +205,7 @@ class LineLog:
             made.stop = lambda: None  # `file` is looked at once more
             for message in made:
                 bus = "" if message.channel is None else str(message.channel)
-                frame = CanFrame(
-                    message.arbitration_id, bytes(message.data), message.is_extended_id,
-                    message.is_fd, message.is_remote_frame,
-                )  # fmt: skip
-                packet = [] if message.is_error_frame else [frame]
+                packet = [] if message.is_error_frame else [convert_message(message)]
                 yield bus, packet, round(NS_PER_S * message.timestamp)
             if self.form == "blf":
                 self.total = made.object_count

@@ -6,13 +6,15 @@ None of them ever waits for a reader: what does not fit is refused whole.
 import abc
 import random
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, ClassVar, Generic
+from typing import ClassVar, Generic
 
-from tactile_rt.core.errors import ConfigError, describe_error
+from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.emulation.pseudo_terminal import Pty, Wire, bytes_s, frames_s
+from tactile_rt.drivers.links import CanLink
 from tactile_rt.drivers.slcan import SlcanAdapter
 
 __all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
@@ -22,7 +24,6 @@ FIFO_BYTES = 1 << 20  # a second of 1 kHz x 850 B: a busy host machine is no fau
 LOOK_S = 0.005  # how often a bus that is not there is looked at
 WAIT_S = 0.05  # how soon a wait on a bus notices that the device is closed
 SEND_S = 0.05  # what a bus may take to take a frame
-MOST_FRAMES = 512  # taken from a bus at a time
 BUS_ERROR = 0x80  # slcan's status flag
 
 
@@ -215,72 +216,48 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
             raise ConfigError(f"bus {name!r} is not INTERFACE:CHANNEL, e.g. virtual:test")
         self.address = f"can:{name}"
         self._fd, self._bitrate = fd, bitrate
-        self._bus: Any = None
-        self._others: list[Any] | None = None
+        self._link: CanLink | None = None
 
     @property
     def heard(self) -> bool:
         # a virtual bus knows who is on it; of another nobody can tell
-        bus = self._bus
-        if bus is None:
-            return False
-        return len(bus.channel) > 1 if self._interface == "virtual" else True
+        link = self._link
+        return link is not None and (self._interface != "virtual" or len(link.bus.channel) > 1)
 
     def plug(self) -> None:
-        import can
-
-        if self._bus is not None:
-            return
-        options: dict[str, Any] = {"fd": True} if self._fd else {}
-        if self._interface == "virtual":
-            options = {"protocol": can.CanProtocol.CAN_FD} if self._fd else {}
-        try:
-            self._bus = can.Bus(self._channel, self._interface, bitrate=self._bitrate, **options)
-        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
-            why = describe_error(error)
-            raise ConfigError(f"bus {self.address[4:]} cannot be opened ({why})") from None
+        if self._link is None:
+            try:
+                self._link = CanLink(
+                    self._interface, self._channel, self._bitrate, self._fd, patience_s=SEND_S
+                )
+            except SourceError as error:
+                raise ConfigError(str(error)) from None
 
     def pull(self) -> None:
-        bus, self._bus = self._bus, None
-        if bus is not None:
-            bus.shutdown()
-
-    def close(self) -> None:
-        self.pull()
+        link, self._link = self._link, None
+        if link is not None:
+            link.close()
 
     def receive(self, timeout_s: float) -> Sequence[CanFrame]:
-        import can
-
-        bus = self._bus
-        if bus is None:
+        link = self._link
+        if link is None:
             time.sleep(min(timeout_s, LOOK_S))
             return []
-        frames: list[CanFrame] = []
         try:
-            message = bus.recv(min(timeout_s, WAIT_S))
-            while message is not None:
-                if not message.is_error_frame:
-                    frames.append(
-                        CanFrame(
-                            message.arbitration_id, bytes(message.data), message.is_extended_id,
-                            message.is_fd, message.is_remote_frame,
-                        )
-                    )  # fmt: skip
-                message = bus.recv(0) if len(frames) < MOST_FRAMES else None
-        except (can.CanError, OSError, ValueError):
+            found = link.receive(min(timeout_s, WAIT_S))
+        except SourceError:
             time.sleep(LOOK_S)  # pulled out meanwhile, or the bus is off
-        return frames
+            return []
+        return found[0] if found else []
 
     def send(self, packet: Sequence[CanFrame], answer: bool = False) -> bool:
-        import can
-
-        return self._put(
-            can.Message(
-                arbitration_id=f.id, data=f.data, is_extended_id=f.extended, is_fd=f.fd,
-                bitrate_switch=f.fd, is_remote_frame=f.remote,
-            )
-            for f in packet
-        )  # fmt: skip
+        link = self._link
+        if link is None or not self.heard:
+            return False
+        with suppress(SourceError):
+            link.send(packet)
+            return True
+        return False
 
     def disturb(self, amount: int, draw: random.Random) -> None:
         for _ in range(-(-amount // 8)):  # 29 bits: no device of ours has such an identifier
@@ -289,17 +266,7 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
     def error(self, frames: int) -> None:
         import can
 
-        self._put(can.Message(is_error_frame=True) for _ in range(frames))
-
-    def _put(self, messages: Iterable[Any]) -> bool:
-        import can
-
-        bus = self._bus
-        if bus is None or not self.heard:
-            return False
-        try:
-            for message in messages:
-                bus.send(message, timeout=SEND_S)
-        except (can.CanError, OSError, ValueError):
-            return False
-        return True
+        if self._link is not None and self.heard:
+            with suppress(can.CanError, OSError, ValueError):
+                for _ in range(frames):
+                    self._link.bus.send(can.Message(is_error_frame=True), timeout=SEND_S)
