@@ -268,14 +268,14 @@ class EmulatedArray(EmulatedDevice):
     def where(self) -> str:
         """How far the array has come, in words."""
         return (
-            f"{self.emulator.log.sent} of {self._script.samples} measured, "
+            f"{self.log.sent} of {self._script.samples} measured, "
             f"{self._endpoint.backlog} bytes not sent, "
             f"{'heard' if self._endpoint.heard else 'unheard'}"
         )
 
     def played(self) -> Played:
         """What the array has done so far."""
-        log = self.emulator.log
+        log = self.log
         fate = log.fate
         at_ns = np.array(self._endpoint.at_ns, np.int64)[: len(fate)]
         due = [f for f in self._script.faults if f.at_s is not None]
@@ -313,7 +313,7 @@ def play(pipe: Connection, script: ArrayScript) -> None:
             elif word == "end":
                 device.end()
             elif word == "done":
-                answer = device.emulator.done
+                answer = device.done
             elif word == "where":
                 answer = device.where()
             else:

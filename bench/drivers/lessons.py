@@ -76,9 +76,9 @@ def play(pipe: Any, name: str, drawn: Drawing) -> None:
     made = EmulatedCan if SENSORS[name].wire == "can" else EmulatedSerial
     with made(LoopedSource(drawn.spec, drawn.signal), name) as device:
         pipe.send(f"{device.url}&start_s={START_S:g}")
-        while not device.emulator._began_ns:
+        while not device._began_ns:
             sleep(0.01)
-        pipe.send(device.emulator._began_ns)
+        pipe.send(device._began_ns)
         pipe.poll(None)
 
 

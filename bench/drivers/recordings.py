@@ -49,7 +49,7 @@ def _replays(folder: Path, times: int) -> list[Record]:
     live: Replayed = []
     device = EmulatedSerial(LoopedSource(spec, values), faults=FaultSchedule(FAULTS, 0))
     with device, open_source(device.url) as source, StreamWriter(path, source) as writer:
-        while not device.emulator.done:
+        while not device.done:
             if (chunk := source.read(0.3)) is not None:
                 writer.push(chunk)
                 live.append(_bytes_of(chunk))

@@ -145,7 +145,7 @@ def _watch(device: "EmulatedDevice") -> None:
     if console.is_terminal:
         with console.status("") as status:
             while not device.wait(LOOK_S):
-                there = "" if device.emulator.endpoint.heard else ", nobody listens"
+                there = "" if device.endpoint.heard else ", nobody listens"
                 status.update(_count(device) + there)
     else:
         device.wait()
@@ -153,7 +153,7 @@ def _watch(device: "EmulatedDevice") -> None:
 
 
 def _count(device: "EmulatedDevice") -> str:
-    log = device.emulator.log
+    log = device.log
     counts = {fate.name.lower(): n for fate, n in sorted(log.counts.items()) if n}
     counts |= {"copies": log.duplicated} if log.duplicated else {}
     rest = ", ".join(f"{n} {name}" for name, n in counts.items())

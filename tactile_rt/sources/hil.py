@@ -205,7 +205,7 @@ class Loop:
         direct, wire = self._decided
         pairs = pair(direct, wire)
         finals = [(a, b) for a, b in pairs if a.final]
-        log = self._device.emulator.log
+        log = self._device.log
         return LoopReport(
             samples=self._samples,
             identical_samples=self._identical,

@@ -228,10 +228,10 @@ def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):
         daemon, spy = robot(text)
         assert fake.wait(PATIENCE_S) and calm.wait(PATIENCE_S)
         until(lambda: len(seqs(spy, "calm")) == 1000)
-        told = fake.emulator.log
+        told = fake.log
         until(lambda: received(daemon) == told.sent + told.duplicated)
         until(lambda: not any(daemon.snapshot().models[0].queue.waiting.values()))
-        log, snapshot = fake.emulator.log, daemon.snapshot()
+        log, snapshot = fake.log, daemon.snapshot()
     stats = snapshot.sources[0].stats
     assert log.sent == 6000 and stats.corrupt > 10 and stats.missing > 5 and stats.duplicates > 5
     assert log.sent + log.duplicated == received(daemon)

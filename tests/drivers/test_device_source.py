@@ -69,7 +69,7 @@ def test_what_a_device_measures_arrives_bit_for_bit(device, no_thread_left):
         assert source.stats.delivered == len(values)
         assert source.stats.missing == source.stats.corrupt == source.stats.duplicates == 0
         assert source.health.state == State.STREAMING
-        assert source.spec == fake.emulator.source.spec
+        assert source.spec == fake.source.spec
 
 
 @pytest.mark.parametrize("kind", ["bit_flip", "truncate", "duplicate", "drop", "burst"])
@@ -80,9 +80,9 @@ def test_every_sample_is_accounted_for(kind):
         FakeSerial(values, faults=faults, pace="fast") as fake,
         open_source(fake.url + PATIENT) as source,
     ):
-        chunks = take(source, len(values), lambda: fake.emulator.done)
+        chunks = take(source, len(values), lambda: fake.done)
         assert fake.wait(PATIENCE_S)  # what has come may not be in its log yet
-        log, stats = fake.emulator.log, source.stats
+        log, stats = fake.log, source.stats
         assert log.sent == len(values)
         received = stats.delivered + stats.corrupt + stats.missing + stats.dropped
         assert log.sent + log.duplicated == received + stats.duplicates
@@ -114,7 +114,7 @@ def test_a_device_that_is_unplugged_comes_again(tmp_path, no_thread_left):
             take(source, 20)
             assert source.health.state == State.STREAMING
             assert source.health.connections == connections
-        log, stats = fake.emulator.log, source.stats
+        log, stats = fake.log, source.stats
         unheard = int(np.isin(np.asarray(log.fate), (Fate.UNHEARD, Fate.OVERFLOWED)).sum())
         assert unheard > 0
         assert stats.missing >= unheard  # and what was on its way

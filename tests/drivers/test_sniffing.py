@@ -44,7 +44,7 @@ def a_second(wire: str, name: str, options: dict[str, str]):
             source.tap(lambda packet, _: heard.append(packet))
             end = time.monotonic() + PATIENCE_S
             with suppress(EndOfStream):
-                while source.read(0.05) is not None or not device.emulator.done:
+                while source.read(0.05) is not None or not device.done:
                     assert time.monotonic() < end
     packets = [packet for packet in heard if packet is not None]
     return b"".join(packets) if wire == "serial" else [f for packet in packets for f in packet]

@@ -25,7 +25,7 @@ def test_health_is_told_when_it_changes(path, tmp_path):
         if n > 100 and not away:
             away.append(time.monotonic())
             fake.unplug()
-        if away and not fake.emulator.endpoint.heard and time.monotonic() > away[0] + 0.3:
+        if away and not fake.endpoint.heard and time.monotonic() > away[0] + 0.3:
             fake.replug()
             away[0] = float("inf")
 

@@ -6,7 +6,7 @@ with EmulatedSerial(source, "native") as device, open_source(device.url) as driv
 """
 
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 from urllib.parse import quote, urlencode
 
 from tactile_rt.core.errors import ConfigError
@@ -27,12 +27,8 @@ SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
 __all__ = ["EmulatedCan", "EmulatedDevice", "EmulatedSerial"]
 
 
-class EmulatedDevice:
-    """An emulated device on a line that exists; a context manager, plugged in while entered.
-
-    Attributes:
-        emulator: The emulator behind the line; its `log` tells what it did with each sample.
-    """
+class EmulatedDevice(Emulator):
+    """An emulated device on a line that exists; a context manager, plugged in while entered."""
 
     wire: ClassVar[str]
     paced: ClassVar[bool] = True  # whether, in real time, its line has a speed
@@ -46,19 +42,18 @@ class EmulatedDevice:
         *,
         options: dict[str, str],
         faults: FaultSchedule | None = None,
-        pace: str = "realtime",
         **emulator: Any,
     ) -> None:
-        self._name, self._options, self.codec = name, options, codec
+        self._name, self._options = name, options
         like = getattr(source, "like", None)  # a made-up array has the device's array, and loads
         if like is not None and codec.spec is not None:
             source = like(codec.spec)
-        self.emulator = Emulator(codec, source, endpoint, faults, pace=pace, **emulator)
+        super().__init__(codec, source, endpoint, faults, **emulator)
 
     @property
     def port(self) -> str:
         """What a program opens: a serial port's path, or INTERFACE:CHANNEL."""
-        return self.emulator.address.partition(":")[2].removeprefix("//")
+        return self.address.partition(":")[2].removeprefix("//")
 
     @property
     def url(self) -> str:
@@ -66,30 +61,7 @@ class EmulatedDevice:
         # a + is a + in our URLs, not the space that web forms make of it
         told = {k: v for k, v in self._options.items() if k not in SPEEDS or v != "0"}
         query = urlencode({"codec": self._name, **told}, quote_via=quote)
-        return f"{quote(self.emulator.address, safe=':/')}?{query}"
-
-    def unplug(self) -> None:
-        """Pull it out."""
-        self.emulator.unplug()
-
-    def replug(self, restart: bool = False) -> None:
-        """Plug it in again; see `Emulator.replug`."""
-        self.emulator.replug(restart)
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait until all is sent; whether it is."""
-        return self.emulator.wait(timeout)
-
-    def close(self) -> None:
-        """Leave nothing behind; safe to call twice."""
-        self.emulator.close()
-
-    def __enter__(self) -> Self:
-        self.emulator.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        return f"{quote(self.address, safe=':/')}?{query}"
 
 
 def _made(

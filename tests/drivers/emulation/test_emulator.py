@@ -242,7 +242,7 @@ def test_unplugged_it_is_gone_and_replugged_it_is_there_under_its_name(tmp_path:
             assert device.codec.streaming == (not k % 2), "without power it forgets"
             host.close()
             assert os.readlink(link).startswith("/dev/pts/") and old
-        counts = device.emulator.log.counts
+        counts = device.log.counts
         assert counts[Fate.OVERFLOWED] == 0
     assert not link.is_symlink()
 

@@ -133,7 +133,7 @@ def test_a_wire_carries_what_it_can_and_no_more():
             came = len(host.read(57_600 // 10 * 2))
             seconds = time.monotonic() - began
         assert seconds >= 0.98 * came * 10 / 57_600  # never faster
-        counts = emulated.emulator.log.counts
+        counts = emulated.log.counts
         assert counts[5] > counts[0]  # most did not fit
 
     def unlimited_hz():
