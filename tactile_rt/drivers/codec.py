@@ -28,6 +28,7 @@ __all__ = [
     "CanFrame",
     "Codec",
     "Command",
+    "SIX_AXES",
     "Samples",
     "SerialCodec",
     "Step",
@@ -35,6 +36,8 @@ __all__ = [
     "codec_class",
     "six_axis",
 ]
+
+SIX_AXES = {**dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my", "mz"), "N m")}
 
 
 class Command(StrEnum):
@@ -289,17 +292,7 @@ class SampleBatch:
 
 def six_axis(name: str, rate_hz: float) -> ArraySpec:
     """One element at the origin of the frame ``sensor``: fx, fy, fz in N, mx, my, mz in N m."""
-    return ArraySpec(
-        name=name,
-        elements=("sensor",),
-        grid=((0, 0),),
-        positions=((0.0, 0.0, 0.0),),  # loads are told at the frame's origin
-        orientations=((1.0, 0.0, 0.0, 0.0),),
-        channels=("fx", "fy", "fz", "mx", "my", "mz"),
-        units=("N",) * 3 + ("N m",) * 3,
-        rate_hz=rate_hz,
-        frame="sensor",
-    )
+    return ArraySpec.at_origin(name, rate_hz, SIX_AXES)
 
 
 def codec_class(wire: str, name: str) -> type[Codec[Any]]:

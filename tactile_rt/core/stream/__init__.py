@@ -7,8 +7,9 @@ Everything downstream sees `Chunk`s described by one `ArraySpec`.
 """
 
 import abc
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Self
 
 import msgspec
@@ -96,6 +97,23 @@ class ArraySpec:
                 raise ConfigError(f"array {self.name!r}: {what} must be finite")
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
             raise ConfigError(f"array {self.name!r}: rate_hz must be positive, not {self.rate_hz}")
+
+    @classmethod
+    def at_origin(
+        cls, name: str, rate_hz: float, channels: Mapping[str, str], frame: str = "sensor",
+        elements: Mapping[str, tuple[int, int]] = MappingProxyType({"sensor": (0, 0)}),
+    ) -> "ArraySpec":  # fmt: skip
+        """Describe an array whose elements are all at the frame's origin, as far as is known.
+
+        Args:
+            channels: the SI unit of each.
+            elements: the place of each on the grid, (row, column).
+        """
+        n = len(elements)
+        return cls(
+            name, tuple(elements), tuple(elements.values()), ((0.0, 0.0, 0.0),) * n,
+            ((1.0, 0.0, 0.0, 0.0),) * n, tuple(channels), tuple(channels.values()), rate_hz, frame,
+        )  # fmt: skip
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import SIX_AXES, Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_modbus
 
 __all__ = ["Ati485", "Ati485Options"]
@@ -82,21 +82,9 @@ class Ati485(SerialCodec):
 
     def __init__(self, options: Ati485Options) -> None:
         self._matrix = _matrix(options.matrix)
-        told = self._matrix is not None
-        super().__init__(
-            ArraySpec(
-                name="ati_485",
-                elements=("sensor",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),  # loads are told at the frame's origin
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=("fx", "fy", "fz", "mx", "my", "mz") if told
-                else ("g0", "g1", "g2", "g3", "g4", "g5"),
-                units=("N",) * 3 + ("N m",) * 3 if told else ("1",) * 6,
-                rate_hz=options.rate_hz,
-                frame="sensor",
-            )
-        )  # fmt: skip
+        gauges = dict.fromkeys((f"g{k}" for k in range(6)), "1")
+        channels = gauges if self._matrix is None else SIX_AXES
+        super().__init__(ArraySpec.at_origin("ati_485", options.rate_hz, channels))
         self._request = _checked(bytes((options.slave,)) + STREAM)
         self._answer = _checked(bytes((options.slave,)) + STREAMS)
         self.streaming = False

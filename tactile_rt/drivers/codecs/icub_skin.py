@@ -100,21 +100,10 @@ class IcubSkin(CanCodec):
         self._first = CLASS[options.firmware] | options.board << 4
         self._numbers = options.numbers()
         self._part = {n: 2 * i for i, n in enumerate(self._numbers)}
-        cells = [(n, k) for n in self._numbers for k in range(TAXELS)]
+        cells = {f"t{n}.{k}": (n, k) for n in self._numbers for k in range(TAXELS)}
         # where the taxels are depends on the robot's part that the board sits in: left at zero
-        super().__init__(
-            ArraySpec(
-                name=f"icub-skin-{options.board}",
-                elements=tuple(f"t{n}.{k}" for n, k in cells),
-                grid=tuple(cells),
-                positions=((0.0, 0.0, 0.0),) * len(cells),
-                orientations=((1.0, 0.0, 0.0, 0.0),) * len(cells),
-                channels=("c",),
-                units=("1",),
-                rate_hz=1e3 / options.period_ms,
-                frame="board",
-            )
-        )
+        name, rate_hz = f"icub-skin-{options.board}", 1e3 / options.period_ms
+        super().__init__(ArraySpec.at_origin(name, rate_hz, {"c": "1"}, "board", cells))
         self._rounds: Rounds[bytes] = Rounds(2 * len(self._numbers))
         self.streaming = options.firmware == "old"
 

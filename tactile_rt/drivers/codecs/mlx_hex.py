@@ -85,18 +85,9 @@ class MlxHex(SerialCodec):
     cannot_detect = "lost and repeated lines (no counter); changed digits (no checksum)"
 
     def __init__(self, options: MlxHexOptions) -> None:
+        field = dict.fromkeys(("bx", "by", "bz"), "T")
         super().__init__(
-            ArraySpec(
-                name="mlx_hex",
-                elements=("W0",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=("bx", "by", "bz"),
-                units=("T",) * 3,
-                rate_hz=options.rate_hz,
-                frame="chip",
-            )
+            ArraySpec.at_origin("mlx_hex", options.rate_hz, field, "chip", {"W0": (0, 0)})
         )
         xy, z = SENSITIVITY[options.hallconf][options.gain]
         self._scale = np.array([xy, xy, z]) * 2**options.resolution * TESLA

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import (
+    SIX_AXES,
     CanCodec,
     CanFrame,
     Command,
@@ -43,7 +44,6 @@ SHAPES: Final = {"3d": (1, 3), "4x3d": (4, 3), "6d": (1, 6)}
 SPEEDS: Final = {1000: 1, 333: 3, 100: 10, 30: 33, 10: 100}  # Hz: code, ms between samples
 FILTERS: Final = {0.0: 0, 500.0: 1, 150.0: 2, 50.0: 3, 15.0: 4, 5.0: 5, 1.5: 6}  # Hz: code
 ZERO: Final = 255
-CHANNELS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 
 FAILURE, SEVERAL = 11, 3  # bits of the status
 FAULTS: Final = 0xFFF0  # errors and overloads; below them the number of the sensor that has them
@@ -97,18 +97,11 @@ class _Messages:
 
     def __init__(self, options: OptoForceOptions, stats: WireStats, parts: bool) -> None:
         elements, channels = SHAPES[options.model]
-        units = ("N",) * 3 + ("N m",) * 3 if options.counts else ("1",) * 6
-        self.spec = ArraySpec(
-            name="optoforce",
-            elements=tuple(f"S{i + 1}" for i in range(elements)),
-            grid=tuple((0, i) for i in range(elements)),
-            positions=((0.0, 0.0, 0.0),) * elements,  # unknown: sensors are mounted by their user
-            orientations=((1.0, 0.0, 0.0, 0.0),) * elements,
-            channels=CHANNELS[:channels],
-            units=units[:channels],
-            rate_hz=float(options.rate_hz),
-            frame="sensor",
-        )
+        axes = list(SIX_AXES)[:channels]
+        units = {axis: SIX_AXES[axis] if options.counts else "1" for axis in axes}
+        sensors = {f"S{i + 1}": (0, i) for i in range(elements)}  # mounted by their user
+        rate_hz = float(options.rate_hz)
+        self.spec = ArraySpec.at_origin("optoforce", rate_hz, units, elements=sensors)
         self._scale = options.scale()
         self._head = SAMPLE + bytes((4 + 2 * elements * channels,))
         self._layout = np.dtype(

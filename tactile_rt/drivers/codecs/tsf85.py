@@ -12,6 +12,7 @@ Sources: facts of the public drivers that go back to Robotiq's tactile sensor in
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -261,28 +262,16 @@ def _spec(options: Tsf85Options) -> ArraySpec:
     fingers = range(options.fingers)
     if options.signals == "taxels":
         # side by side on the grid, an empty column between; where they are depends on the gripper
-        cells = [
-            (r, f * (COLUMNS + 1) + c) for f in fingers for r in range(ROWS) for c in range(COLUMNS)
-        ]
-        names = [f"f{f}t{k}" for f in fingers for k in range(ROWS * COLUMNS)]
-        channels: tuple[str, ...] = ("pressure",)
-        units: tuple[str, ...] = ("1",)
+        cells = {
+            f"f{f}t{COLUMNS * r + c}": (r, f * (COLUMNS + 1) + c)
+            for f, r, c in product(fingers, range(ROWS), range(COLUMNS))
+        }
+        channels = {"pressure": "1"}
     else:
-        cells = [(0, f) for f in fingers]
-        names = [f"f{f}" for f in fingers]
-        channels = ("dynamic", "ax", "ay", "az", "wx", "wy", "wz")
-        units = ("1", *("m/s2",) * 3, *("rad/s",) * 3)
-    return ArraySpec(
-        name="tsf85",
-        elements=tuple(names),
-        grid=tuple(cells),
-        positions=((0.0, 0.0, 0.0),) * len(names),
-        orientations=((1.0, 0.0, 0.0, 0.0),) * len(names),
-        channels=channels,
-        units=units,
-        rate_hz=1000.0 / options.period_ms,
-        frame="fingers",
-    )
+        cells = {f"f{f}": (0, f) for f in fingers}
+        channels = {"dynamic": "1", **dict.fromkeys(("ax", "ay", "az"), "m/s2")}
+        channels |= dict.fromkeys(("wx", "wy", "wz"), "rad/s")
+    return ArraySpec.at_origin("tsf85", 1000.0 / options.period_ms, channels, "fingers", cells)
 
 
 def _packet(command: int, data: bytes) -> bytes:

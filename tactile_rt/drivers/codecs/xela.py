@@ -76,18 +76,11 @@ class Xela(CanCodec):
         self._first, self._board = options.first_id, options.board
         # the distance of the taxels is not in the public driver: positions are left at zero
         super().__init__(
-            ArraySpec(
-                name="uSPa44",
-                elements=tuple(f"T{i}" for i in range(TAXELS)),
-                grid=tuple((i // SIDE, i % SIDE) for i in range(TAXELS)),
-                positions=((0.0, 0.0, 0.0),) * TAXELS,
-                orientations=((1.0, 0.0, 0.0, 0.0),) * TAXELS,
-                channels=("x", "y", "z"),
-                units=("1", "1", "1"),
-                rate_hz=options.rate_hz,
-                frame="patch",
+            ArraySpec.at_origin(
+                "uSPa44", options.rate_hz, dict.fromkeys("xyz", "1"), "patch",
+                {f"T{i}": divmod(i, SIDE) for i in range(TAXELS)},
             )
-        )
+        )  # fmt: skip
         self._rounds: Rounds[bytes] = Rounds(TAXELS)
         self.streaming = False
 
