@@ -13,7 +13,6 @@ import struct
 import zlib
 from binascii import crc_hqx
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +23,7 @@ from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs import native_common as common
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType
+from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType, NativeOptions
 
 __all__ = ["NativeOptions", "NativeSerial", "frame"]
 
@@ -38,29 +37,6 @@ LONGEST: Final = 65_535  # of a payload: the length field's range
 WHISKING: Final = struct.Struct("<3f")  # frequency in Hz, amplitude and offset in rad
 
 _TYPES: Final[dict[int, np.dtype[Any]]] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
-
-
-@dataclass(frozen=True)
-class NativeOptions:
-    """Options of the native protocol.
-
-    Attributes:
-        format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
-            both.
-        range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
-            can tell.
-        range_si: The largest reading of channels of other units that it can tell.
-        serial_number: The serial number that an emulated device tells; empty for none.
-    """
-
-    format: str = "float32"
-    range_n: float = common.RANGE_N
-    range_nm: float = common.RANGE_NM
-    range_si: float = common.RANGE_SI
-    serial_number: str = ""
-
-    def __post_init__(self) -> None:
-        common.check_numbers(self.format, self.range_n, self.range_nm, self.range_si)
 
 
 def frame(
@@ -97,8 +73,7 @@ class NativeSerial(SerialCodec):
 
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(None)
-        self._format = common.FORMATS[options.format]
-        self._ranges = options.range_n, options.range_nm, options.range_si
+        self._options, self._format = options, common.FORMATS[options.format]
         self.serial_number = options.serial_number
         self._described: DeviceDescription | None = None
         self._rest = b""  # of a frame that is not complete
@@ -214,27 +189,15 @@ class NativeSerial(SerialCodec):
                 f"{shape[0]} elements of {shape[1]} channels: the native protocol carries 255 of "
                 f"255 at most, in {LONGEST} bytes"
             )
-        packets = []
-        for seq, t_ns, values, valid in zip(
-            chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
-        ):
-            if self._format == common.FORMATS["int16"]:
-                body = common.quantise(values, described.scale).astype("<i2").tobytes()
-                valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
-            else:
-                body = values.astype("<f4").tobytes()
-            packets.append(
-                frame(
-                    MessageType.SAMPLE,
-                    common.pack_valid(valid) + body,
-                    format=self._format,
-                    status=self.status,
-                    seq=seq,
-                    time_us=t_ns // 1000,
-                    shape=shape,
-                )
+        return [
+            frame(
+                MessageType.SAMPLE, payload, format=self._format, status=self.status, seq=seq,
+                time_us=time_us, shape=shape,
             )
-        return packets
+            for seq, time_us, payload in common.encode_samples(
+                chunk, described, self._options.format
+            )
+        ]  # fmt: skip
 
     def respond(self, packet: bytes) -> bytes:
         answer = b""
@@ -264,7 +227,7 @@ class NativeSerial(SerialCodec):
     def _description(self) -> DeviceDescription:
         if self._described is None:
             assert self.spec is not None
-            self._described = DeviceDescription.of(self.spec, *self._ranges, self.serial_number)
+            self._described = DeviceDescription.of(self.spec, self._options, self.serial_number)
         return self._described
 
     def _valid_of(self, flags: bytes, n: int) -> NDArray[np.bool_]:

@@ -36,7 +36,7 @@ from tactile_rt.drivers.codec import (
 )
 from tactile_rt.drivers.codecs import native_common as common
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType
+from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType, NativeOptions
 
 __all__ = ["NativeCan", "NativeCanOptions"]
 
@@ -52,31 +52,21 @@ PIECE: Final = struct.Struct("<BH")  # type and index, before each part of the d
 
 
 @dataclass(frozen=True)
-class NativeCanOptions:
-    """Options of the native protocol over CAN.
+class NativeCanOptions(NativeOptions):
+    """Options of the native protocol over CAN, besides those of the serial one.
 
     Attributes:
         base: The first of the device's five identifiers, of 11 bits.
         fd: Whether commands, and what an emulated device sends, are CAN FD frames. A host takes
             samples in both.
-        format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
-            both.
-        range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
-            can tell.
-        range_si: The largest reading of channels of other units that it can tell.
-        serial_number: The serial number that an emulated device tells; empty for none.
     """
 
+    format: str = "int16"
     base: int = 0x100
     fd: bool = False
-    format: str = "int16"
-    range_n: float = common.RANGE_N
-    range_nm: float = common.RANGE_NM
-    range_si: float = common.RANGE_SI
-    serial_number: str = ""
 
     def __post_init__(self) -> None:
-        common.check_numbers(self.format, self.range_n, self.range_nm, self.range_si)
+        super().__post_init__()
         if not 0 <= self.base <= 0x7FF - DESCRIPTION:
             raise ConfigError(
                 f"base must be from 0 to {0x7FF - DESCRIPTION:#x}, so that base to base + 4 have "
@@ -115,9 +105,7 @@ class NativeCan(CanCodec):
 
     def __init__(self, options: NativeCanOptions) -> None:
         super().__init__(None)
-        self._base, self._fd = options.base, options.fd
-        self._float32 = options.format == "float32"
-        self._ranges = options.range_n, options.range_nm, options.range_si
+        self._options, self._base, self._fd = options, options.base, options.fd
         self.serial_number = options.serial_number
         self._described: DeviceDescription | None = None
         self._sample = SampleParts(self.stats)
@@ -197,19 +185,13 @@ class NativeCan(CanCodec):
     def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         described = self._description()
         assert described is not None
-        flags = (LONG if self._fd else 0) | (FLOAT32 if self._float32 else 0)
+        flags = (LONG if self._fd else 0) | FLOAT32 * (self._options.format == "float32")
         flags |= (~flags & 15) << 4
         packets: list[Sequence[CanFrame]] = []
-        for seq, t_ns, values, valid in zip(
-            chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
-        ):
-            if self._float32:
-                body = values.astype("<f4").tobytes()
-            else:
-                body = common.quantise(values, described.scale).astype("<i2").tobytes()
-                valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
-            head = HEAD.pack(seq & 0xFFFF, t_ns // 1000 & 0xFFFFFFFF, self.status, flags)
-            parts = sample_parts(head, common.pack_valid(valid) + body)
+        samples = common.encode_samples(chunk, described, self._options.format)
+        for seq, time_us, payload in samples:
+            head = HEAD.pack(seq & 0xFFFF, time_us & 0xFFFFFFFF, self.status, flags)
+            parts = sample_parts(head, payload)
             if parts is None:
                 elements, channels = described.spec.shape
                 raise ConfigError(
@@ -262,7 +244,7 @@ class NativeCan(CanCodec):
 
     def _description(self) -> DeviceDescription | None:
         if self._described is None and self.spec is not None:
-            return DeviceDescription.of(self.spec, *self._ranges, self.serial_number)
+            return DeviceDescription.of(self.spec, self._options, self.serial_number)
         return self._described
 
 
@@ -372,7 +354,8 @@ class SampleParts:
             self.refuse()
             return
         seq, time_us, status, flags = HEAD.unpack(head)
-        valid = common.unpack_valid(body[:bits], shape[0])
+        known_bits = np.frombuffer(body[:bits], np.uint8)
+        valid = np.unpackbits(known_bits, count=shape[0], bitorder="little").view(np.bool_)
         kind = np.dtype("<f4" if flags & FLOAT32 else "<i2")
         values = np.frombuffer(body[:end], kind, offset=bits).reshape(shape)
         if not flags & FLOAT32:

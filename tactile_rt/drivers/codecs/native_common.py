@@ -1,30 +1,25 @@
 """What the native protocol says on every line: see docs/reference/native-protocol.md."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, Chunk
 
 __all__ = [
     "FORMATS",
     "HARMLESS",
     "IMPOSSIBLE",
-    "RANGE_N",
-    "RANGE_NM",
-    "RANGE_SI",
     "STATUS",
     "UNKNOWN",
     "DeviceDescription",
     "MessageType",
-    "check_numbers",
-    "pack_valid",
-    "quantise",
-    "unpack_valid",
+    "NativeOptions",
+    "encode_samples",
 ]
 
 # What an ACK says went wrong: a type or length that the device does not know; a thing it cannot do.
@@ -32,11 +27,6 @@ UNKNOWN: Final = 1
 IMPOSSIBLE: Final = 2
 
 FORMATS: Final = {"float32": 0, "int16": 1}
-# What int16's largest value stands for, by SI unit, unless the device describes another scale.
-RANGE_N: Final = 0.1
-RANGE_NM: Final = 1e-3
-RANGE_RAD: Final = float(np.pi)
-RANGE_SI: Final = 1.0
 LARGEST: Final = 1e30  # scale: any count times it is a float32
 # Bits of the status; 4 to 7 are ours to give a meaning later, 8 to 15 the device's own (serial).
 STATUS: Final = {
@@ -63,6 +53,32 @@ class MessageType:
 
 
 @dataclass(frozen=True)
+class NativeOptions:
+    """Options of the native protocol.
+
+    Attributes:
+        format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
+            both.
+        range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
+            can tell.
+        range_si: The largest reading of channels of other units that it can tell; of rad it is pi.
+        serial_number: The serial number that an emulated device tells; empty for none.
+    """
+
+    format: str = "float32"
+    range_n: float = 0.1
+    range_nm: float = 1e-3
+    range_si: float = 1.0
+    serial_number: str = ""
+
+    def __post_init__(self) -> None:
+        if not all(0 < r <= LARGEST for r in (self.range_n, self.range_nm, self.range_si)):
+            raise ConfigError("range_n, range_nm and range_si must be above 0")
+        if self.format not in FORMATS:
+            raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
+
+
+@dataclass(frozen=True)
 class DeviceDescription:
     """What a native device says of itself.
 
@@ -77,22 +93,12 @@ class DeviceDescription:
 
     @classmethod
     def of(
-        cls,
-        spec: ArraySpec,
-        range_n: float = RANGE_N,
-        range_nm: float = RANGE_NM,
-        range_si: float = RANGE_SI,
-        serial_number: str = "",
+        cls, spec: ArraySpec, options: NativeOptions | None = None, serial_number: str = ""
     ) -> "DeviceDescription":
-        """A description with scales for these largest readings, and +-pi rad.
-
-        Args:
-            range_n: Largest force that an int16 can tell, N.
-            range_nm: Largest moment that an int16 can tell, N m.
-            range_si: Largest reading in any other unit that an int16 can tell.
-        """
-        full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
-        scale = tuple(full.get(unit, range_si) / 32767 for unit in spec.units)
+        """A description with scales for the largest readings of a device's options."""
+        options = options or NativeOptions()
+        full = {"N": options.range_n, "N m": options.range_nm, "rad": float(np.pi)}
+        scale = tuple(full.get(unit, options.range_si) / 32767 for unit in spec.units)
         return cls(spec, scale, serial_number)
 
     def to_json(self) -> bytes:
@@ -115,27 +121,16 @@ class DeviceDescription:
         return cls(spec, scale, serial_number) if good else None
 
 
-def pack_valid(valid: NDArray[np.bool_]) -> bytes:
-    """(element,) bool as bits, the first element lowest."""
-    return np.packbits(valid, bitorder="little").tobytes()
-
-
-def unpack_valid(bits: bytes, elements: int) -> NDArray[np.bool_]:
-    """What `pack_valid` packed."""
-    return np.unpackbits(np.frombuffer(bits, np.uint8), count=elements, bitorder="little").view(
-        np.bool_
-    )
-
-
-def quantise(values: NDArray[np.float32], scale: tuple[float, ...]) -> NDArray[np.int16]:
-    """Values as counts, rounded to the nearest and saturated."""
-    counts = np.rint(np.nan_to_num(values.astype(np.float64) / scale))
-    return np.clip(counts, -32767, 32767).astype(np.int16)
-
-
-def check_numbers(form: str, *ranges: float) -> None:
-    """Raise a `ConfigError` if there is no such format, or one cannot be a range."""
-    if not all(0 < r <= LARGEST for r in ranges):
-        raise ConfigError("range_n, range_nm and range_si must be above 0")
-    if form not in FORMATS:
-        raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {form!r}")
+def encode_samples(
+    chunk: Chunk, described: DeviceDescription, form: str
+) -> Iterator[tuple[int, int, bytes]]:
+    """Yield of each sample its number, time in us, and payload: bits of validity, then values."""
+    rows = zip(chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True)
+    for seq, t_ns, values, valid in rows:
+        if form == "float32":
+            body = values.astype("<f4").tobytes()
+        else:
+            counts = np.rint(np.nan_to_num(values.astype(np.float64) / described.scale))
+            body = np.clip(counts, -32767, 32767).astype("<i2").tobytes()
+            valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
+        yield seq, t_ns // 1000, np.packbits(valid, bitorder="little").tobytes() + body
