@@ -236,7 +236,7 @@ def readers():
     """(name, function of a path, text that is wrong, where and how that is told)."""
     from tactile_rt.calibration import load_calibration, read_loads
     from tactile_rt.daemon.loading import load_config
-    from tactile_rt.drivers.codecs.ascii_mapping import read_mapping
+    from tactile_rt.drivers.codecs.ascii_mapping import LineMapping, read_mapping
     from tactile_rt.drivers.emulation.faults import read_faults
     from tactile_rt.sources.opening import check_source
 
@@ -244,7 +244,7 @@ def readers():
     yield "daemon", load_config, page, ":3: page.port: expected a whole"
     yield "calibration", load_calibration, "version = 1\ndevice = 7", ":2: device: expected text"
     yield "loads", read_loads, "fy,raw_a\n1,x", ":2: raw_a: expected a number, got 'x'"
-    yield "mapping", lambda p: read_mapping(str(p)), "columns = 3", ":1: columns: expected a list"
+    yield "mapping", lambda p: read_mapping(str(p), LineMapping), "columns = 3", ":1: columns: expected a list"
     yield "faults", read_faults, "seed = 'x'", ":1: seed: expected a whole number, got 'x'"
     yield (
         "combined", lambda p: check_source(f"combined:{p}"), "name = 3", ":1: name: expected text",

@@ -100,7 +100,7 @@ class AsciiLine(SerialCodec):
         where = options.mapping or "columns"
         mapping = LineMapping(columns=(options.columns,))
         if options.mapping:
-            mapping = read_mapping(options.mapping)
+            mapping = read_mapping(options.mapping, LineMapping)
         if options.rate_hz:
             mapping = msgspec.structs.replace(mapping, rate_hz=options.rate_hz)
         self.claims_rate = bool(options.mapping or options.rate_hz)

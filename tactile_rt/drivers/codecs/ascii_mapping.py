@@ -25,13 +25,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.settings import convert, nearest, read_toml
+from tactile_rt.core.settings import convert, nearest, read_toml, refusal
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.column_words import expand_columns
 
@@ -118,6 +118,9 @@ class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     elements: dict[str, Element] = {}
 
 
+Table = TypeVar("Table", bound=ArrayTable)
+
+
 class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
 
@@ -163,11 +166,12 @@ class Column:
         return cls("value", scale * factor, offset, 0, element, channel, si)
 
 
-def read_mapping(path: str) -> LineMapping:
-    """Read a mapping file."""
-    mapping: LineMapping = convert(read_toml(Path(path)), LineMapping)
+def read_mapping(path: str, kind: type[Table]) -> Table:
+    """Read a mapping file of this kind."""
+    nodes = read_toml(Path(path))
+    mapping: Table = convert(nodes, kind)
     if mapping.version != VERSION:
-        raise ConfigError(f"{path}: version {mapping.version}; this release reads {VERSION}")
+        raise refusal(nodes, ["version"], f"this release reads {VERSION}, not {mapping.version}")
     return mapping
 
 

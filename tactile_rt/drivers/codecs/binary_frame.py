@@ -13,9 +13,10 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.catalogue import FRAMES
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
+from tactile_rt.drivers.codecs.ascii_mapping import read_mapping
 from tactile_rt.drivers.codecs.endings import EndFinder, Found, StrideFinder
 from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
-from tactile_rt.drivers.codecs.frame_mapping import FrameMapping, read_frame_mapping
+from tactile_rt.drivers.codecs.frame_mapping import FrameMapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
 
 __all__ = [
@@ -242,12 +243,13 @@ class BinaryFrame(DescribedFrame):
     Options = BinaryFrameOptions
 
     def __init__(self, options: BinaryFrameOptions) -> None:
-        super().__init__(read_frame_mapping(options.mapping), options.mapping, options.rate_hz)
+        mapping = read_mapping(options.mapping, FrameMapping)
+        super().__init__(mapping, options.mapping, options.rate_hz)
 
 
 def shipped_frame(name: str) -> FrameMapping:
     """The description in `FRAMES` of a device's frame."""
-    return read_frame_mapping(str(FRAMES / f"{name}.toml"))
+    return read_mapping(str(FRAMES / f"{name}.toml"), FrameMapping)
 
 
 @cache

@@ -5,10 +5,9 @@
 ``docs/codecs/can_dbc.toml``; cantools reads the DBC file that it names.
 """
 
-import difflib
 import math
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -17,10 +16,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.errors import ConfigError, name_some
+from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import open_regular
 from tactile_rt.core.packages import require_extra
-from tactile_rt.core.settings import convert, read_toml
+from tactile_rt.core.settings import convert, nearest, no_such, read_toml
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
@@ -182,11 +181,6 @@ def read_mapping(path: Path) -> DbcMapping:
     return _Reader(path, file).mapping()
 
 
-def _near(name: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {near[0][:40]}?)" if near else ""
-
-
 class _Reader:
     def __init__(self, path: Path, file: _File) -> None:
         with require_extra("codec can-dbc needs", "dbc"):
@@ -224,7 +218,7 @@ class _Reader:
             where = f"{path}, element {element.name}"
             for name in element.signals:
                 if name not in names:
-                    raise ConfigError(f"{where}: no channel {name!r}{_near(name, names)}")
+                    raise ConfigError(f"{where}: {no_such('channel', name, names)}")
             for channel in file.channel:
                 if channel.name not in element.signals:
                     raise ConfigError(f"{where}: no signal for channel {channel.name}; add one")
@@ -281,8 +275,8 @@ class _Reader:
 
     def _message(self, where: str, name: str) -> Any:
         if name not in self.messages:
-            hint = _near(name, self.messages)
-            raise ConfigError(f"{where}: no message {name[:40]!r} in {self.dbc}{hint}")
+            hint = nearest(name, [known[:40] for known in self.messages])
+            raise ConfigError(f"{where}: no message {name[:40]!r} in {self.dbc}; {hint}")
         return self.messages[name]
 
     def _find(self, where: str, name: str) -> tuple[Any, Signal]:
@@ -295,12 +289,9 @@ class _Reader:
         message = self._message(where, of)
         known = {s.name: s for s in message.signals}
         if signal_name not in known:
-            hint = (
-                _near(signal_name, known)
-                or f"; it has {name_some([n[:40] for n in known]) or 'none'}"
-            )
+            hint = nearest(signal_name, [n[:40] for n in known])
             raise ConfigError(
-                f"{where}: no signal {signal_name!r} in message {of[:40]} of {self.dbc}{hint}"
+                f"{where}: no signal {signal_name!r} in message {of[:40]} of {self.dbc}; {hint}"
             )
         signal = known[signal_name]
         chain: list[tuple[str, frozenset[int]]] = []

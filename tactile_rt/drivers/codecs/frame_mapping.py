@@ -3,18 +3,15 @@
 Offsets count from the frame's first byte, 0. Bytes are written in hexadecimal, ``AA 07``.
 """
 
-from pathlib import Path
 from typing import Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
-from tactile_rt.core.settings import convert, read_toml, refusal
 from tactile_rt.drivers.codecs.ascii_mapping import ArrayTable
 
-__all__ = ["UNHEARD", "FrameCounter", "FrameMapping", "Message", "Values", "read_frame_mapping"]
+__all__ = ["UNHEARD", "FrameCounter", "FrameMapping", "Message", "Values"]
 
 LONGEST: Final = 65_536  # bytes of a frame
-VERSION: Final = 1
 UNHEARD: Final = "-"  # channel of numbers that are not delivered
 
 Order: TypeAlias = Literal["little", "big"]
@@ -172,12 +169,3 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
     start: tuple[Message, ...] = ()
     stop: tuple[Message, ...] = ()
     poll: str = ""
-
-
-def read_frame_mapping(path: str) -> FrameMapping:
-    """Read a mapping file."""
-    nodes = read_toml(Path(path))
-    mapping: FrameMapping = convert(nodes, FrameMapping)
-    if mapping.version != VERSION:
-        raise refusal(nodes, ["version"], f"this release reads {VERSION}, not {mapping.version}")
-    return mapping

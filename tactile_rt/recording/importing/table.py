@@ -85,7 +85,7 @@ def shown_names(names: Sequence[str]) -> str:
 def mapping_of(columns: str, name: str) -> LineMapping:
     """What a user says of the columns: words, or a TOML file as docs/codecs/ascii_line.toml."""
     if columns.endswith(".toml"):
-        return read_mapping(columns)
+        return read_mapping(columns, LineMapping)
     return LineMapping(columns=(columns,), name=name)
 
 

@@ -233,7 +233,7 @@ BAD_FILES = [
     ('columns = ["A0.fx"]\nrate = 5.0', "2: the file has no key 'rate'; did you mean rate_hz?"),
     ('columns = ["A0.fx"]\nrate_hz = -1.0', " array 'ascii_line': rate_hz must be positive"),
     ('columns = ["A0.fx", "A0:fy"]', " columns[1]: 'A0:fy' is no column"),
-    ('columns = ["A0.fx"]\nversion = 2', " version 2; this release reads 1"),
+    ('columns = ["A0.fx"]\nversion = 2', "2: version: this release reads 1, not 2"),
     ('columns = ["A0.fx"]\n[elements.B1]', " no column is of elements.B1"),
     (
         'columns = ["A0.fx"]\n[elements.A0]\ngrid = [0]',

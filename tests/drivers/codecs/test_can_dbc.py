@@ -236,11 +236,11 @@ def test_polling(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('"Taxel3.X"', '"Taxl3.X"', r"channel x: no message 'Taxl3' in .*\(did you mean Taxel3\?"),
-        ('"Taxel3.X"', '"Taxel3.q"', r"no signal 'q' in message Taxel3 of .*; it has X, Y, Z"),
+        ('"Taxel3.X"', '"Taxl3.X"', r"channel x: no message 'Taxl3' in .*; did you mean Taxel3\?"),
+        ('"Taxel3.X"', '"Taxel3.q"', r"no signal 'q' in message Taxel3 of .*; there are X, Y, Z"),
         ('"Taxel3.X"', '"X"', r"'X' must be written Message.Signal \(did you mean Taxel0.X\?\)"),
         ('x = "Taxel3.X", ', "", r"element T3: no signal for channel x; add one"),
-        ('x = "Taxel3.X"', 'xx = "Taxel3.X"', r"element T3: no channel 'xx' \(did you mean x\?\)"),
+        ('x = "Taxel3.X"', 'xx = "Taxel3.X"', r"element T3: no channel 'xx'; did you mean x\?"),
         ("patch.dbc", "patsch.dbc", r"dbc: .*patsch.dbc: No such file"),
         ("patch.dbc", "bad.dbc", r"bad.dbc: is not a DBC file that cantools reads: .*line 3"),
         ("rate_hz", "rate_hs", r":3: the file has no key 'rate_hs'; did you mean rate_hz\?"),
