@@ -69,8 +69,6 @@ class AsciiLineOptions:
                 "ascii_line has to know its columns: give either mapping=FILE.toml or "
                 "columns=A0.fx,A0.fy"
             )
-        if not 0 <= self.rate_hz < np.inf:
-            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 def _has_digit(word: str) -> bool:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import SIX_AXES, Command, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.framing import crc16_modbus
+from tactile_rt.drivers.codecs.framing import seal_modbus
 
 __all__ = ["Ati485", "Ati485Options"]
 
@@ -58,8 +58,6 @@ class Ati485Options:
     def __post_init__(self) -> None:
         if not 1 <= self.slave <= 247:
             raise ConfigError(f"slave must be a Modbus address, 1 to 247, not {self.slave}")
-        if not 0 < self.rate_hz < 1e6:
-            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 class Ati485(SerialCodec):
@@ -85,8 +83,8 @@ class Ati485(SerialCodec):
         gauges = dict.fromkeys((f"g{k}" for k in range(6)), "1")
         channels = gauges if self._matrix is None else SIX_AXES
         super().__init__(ArraySpec.at_origin("ati_485", options.rate_hz, channels))
-        self._request = _checked(bytes((options.slave,)) + STREAM)
-        self._answer = _checked(bytes((options.slave,)) + STREAMS)
+        self._request = seal_modbus(bytes((options.slave,)) + STREAM)
+        self._answer = seal_modbus(bytes((options.slave,)) + STREAMS)
         self.streaming = False
         self._heard = b""
         self._damaged = 0
@@ -240,10 +238,6 @@ class Ati485(SerialCodec):
                 self.streaming, self._heard = True, b""
                 answer += self._answer
         return answer
-
-
-def _checked(message: bytes) -> bytes:
-    return message + crc16_modbus(message).to_bytes(2, "little")
 
 
 def _matrix(path: str) -> NDArray[np.float64] | None:

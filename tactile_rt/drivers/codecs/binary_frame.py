@@ -41,10 +41,6 @@ class FrameOptions:
 
     rate_hz: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.rate_hz < np.inf:
-            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
-
 
 @dataclass(frozen=True)
 class BinaryFrameOptions(FrameOptions):
@@ -57,7 +53,6 @@ class BinaryFrameOptions(FrameOptions):
     mapping: str = ""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if not self.mapping:
             raise ConfigError(
                 "binary_frame has to know the frame: give mapping=FILE.toml, as "

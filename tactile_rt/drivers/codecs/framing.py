@@ -28,7 +28,10 @@ from typing import Final, Generic, TypeVar
 
 from tactile_rt.drivers.codec import WireStats
 
-__all__ = ["ByteBuffer", "FrameFinder", "Rounds", "crc16_modbus", "crc16_x25", "crc16_xmodem"]
+__all__ = [
+    "ByteBuffer", "FrameFinder", "Rounds", "crc16_modbus", "crc16_x25", "crc16_xmodem",
+    "seal_modbus",
+]  # fmt: skip
 
 GAP: Final = 64  # frames: what is remembered of bytes that are none
 FILL: Final = 7  # bytes at most that fill a part, of a CAN frame's 8
@@ -69,6 +72,11 @@ def crc16_modbus(data: bytes | bytearray | memoryview) -> int:
     for b in data:
         crc = crc >> 8 ^ _MODBUS[(crc ^ b) & 0xFF]
     return crc
+
+
+def seal_modbus(message: bytes) -> bytes:
+    """Add the CRC of a Modbus message, low byte first."""
+    return message + crc16_modbus(message).to_bytes(2, "little")
 
 
 class ByteBuffer:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
-from tactile_rt.drivers.codecs.framing import crc16_modbus
+from tactile_rt.drivers.codecs.framing import seal_modbus
 
 __all__ = ["Ft300", "Ft300Options"]
 
@@ -61,8 +61,8 @@ class Ft300(DescribedFrame):
     def __init__(self, options: Ft300Options) -> None:
         self._slave = options.slave
         select = bytes((options.slave, WRITE)) + OUTPUT.to_bytes(2, "big") + b"\0\1"
-        self._request = _checked(select + b"\2" + STREAM.to_bytes(2, "big"))
-        self._echo = _checked(select)
+        self._request = seal_modbus(select + b"\2" + STREAM.to_bytes(2, "big"))
+        self._echo = seal_modbus(select)
         frame = shipped_frame("ft300")
         jam, request = frame.start  # it may be streaming, and then takes no request
         request = replace(request, send=self._request.hex(), expect=self._echo.hex())
@@ -80,8 +80,8 @@ class Ft300(DescribedFrame):
         while not self.streaming and at < len(self._heard):
             length = _length(self._heard[at:], self._slave)
             request = self._heard[at : at + length]
-            if 0 < length <= len(request) and _checked(request[:-2]) == request:
-                answer += _checked(request[:1] + self._obey(request[1:-2]))
+            if 0 < length <= len(request) and seal_modbus(request[:-2]) == request:
+                answer += seal_modbus(request[:1] + self._obey(request[1:-2]))
                 self._heard, at = self._heard[at + length :], 0
             elif length > len(request):
                 break  # the rest is still to come
@@ -123,7 +123,3 @@ def _length(heard: bytes, slave: int) -> int:
     if len(heard) < 2 or (heard[1] == WRITE and len(heard) < 7):
         return len(heard) + 1
     return 9 + heard[6] if heard[1] == WRITE else 8
-
-
-def _checked(message: bytes) -> bytes:
-    return message + crc16_modbus(message).to_bytes(2, "little")

@@ -9,7 +9,6 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
 from msgspec.structs import replace
 
 from tactile_rt.core.errors import ConfigError
@@ -45,8 +44,6 @@ class Hx711WhiskerOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.whiskers <= MOST:
             raise ConfigError(f"whiskers must be 1 to {MOST}, not {self.whiskers}")
-        if not 0 < self.rate_hz < np.inf:
-            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 class Hx711Whisker(DescribedFrame):

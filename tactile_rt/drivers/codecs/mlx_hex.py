@@ -62,8 +62,6 @@ class MlxHexOptions:
             raise ConfigError(f"resolution must be 0 to 3, not {self.resolution}")
         if self.hallconf not in SENSITIVITY:
             raise ConfigError(f"hallconf must be 12 or 0, not {self.hallconf}")
-        if not 0 < self.rate_hz < np.inf:
-            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 class MlxHex(SerialCodec):

@@ -42,8 +42,6 @@ class XelaOptions:
             raise ConfigError(
                 f"first_id must be from 0 to {0x800 - TAXELS:#x}, not {self.first_id:#x}"
             )
-        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 class Xela(CanCodec):

@@ -261,4 +261,4 @@ def test_other_mistakes_are_named() -> None:
     with pytest.raises(ConfigError, match="give either mapping=FILE"):
         AsciiLineOptions(mapping="a.toml", columns="A0.fx")
     with pytest.raises(ConfigError, match="rate_hz must be positive, not -1"):
-        AsciiLineOptions(columns="A0.fx", rate_hz=-1.0)
+        AsciiLine(AsciiLineOptions(columns="A0.fx", rate_hz=-1.0))
