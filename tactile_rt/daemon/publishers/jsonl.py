@@ -2,13 +2,13 @@
 
 import os
 import sys
-import time
 
 import msgspec
 
-from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
+from tactile_rt.daemon.consumer import View
+from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import Message, encode, message_of, state_message
+from tactile_rt.daemon.publishers.sending import Publisher, StateSeconds
 
 __all__ = ["JsonlOptions", "JsonlPublisher"]
 
@@ -25,28 +25,18 @@ class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     file: str = ""
     samples: bool = False
-    state_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.state_s <= 86400:
-            raise ValueError(f"state_s must be from 0 to 86400, not {self.state_s}")
+    state_s: StateSeconds = 0.0
 
 
-class JsonlPublisher(Consumer):
+class JsonlPublisher(Publisher):
     """Appends a line per message; a line that could not be written whole is not followed by
     another in the same line."""
 
     Options = JsonlOptions
 
     def __init__(self, name: str, options: JsonlOptions) -> None:
-        self._options = options
-        wants = {Opened, Decision, Contact, Skipped, Event}
-        self.wants = frozenset(wants | {SourceChunk} if options.samples else wants)
-        self.tick_s = options.state_s
-        self._handle = -1
-        self._view: View | None = None
-        self._state_at = 0.0
-        self._lines = self._bytes = 0
+        super().__init__(name, options.samples, options.state_s)
+        self._options, self._handle = options, -1
 
     def open(self, view: View) -> None:
         self._view = view
@@ -68,9 +58,7 @@ class JsonlPublisher(Consumer):
         for start in range(0, len(items), TOGETHER):
             found = map(message_of, items[start : start + TOGETHER])
             self._write([message for message in found if message is not None])
-        now = time.monotonic()
-        if self._options.state_s and now >= self._state_at and self._view is not None:
-            self._state_at = now + self._options.state_s
+        if self._view is not None and self._state_due.now():
             self._write([state_message(self._view.snapshot())])
 
     def _write(self, messages: list[Message]) -> None:
@@ -78,7 +66,7 @@ class JsonlPublisher(Consumer):
         self._bytes += len(data)
         while data:
             data = data[os.write(self._handle, data) :]
-        self._lines += len(messages)
+        self._messages += len(messages)
 
     def close(self) -> None:
         handle, self._handle = self._handle, -1
@@ -88,6 +76,6 @@ class JsonlPublisher(Consumer):
     def details(self) -> dict[str, str | int | float]:
         return {
             "file": self._options.file or "standard output",
-            "messages": self._lines,
+            "messages": self._messages,
             "bytes": self._bytes,
         }

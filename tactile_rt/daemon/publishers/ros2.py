@@ -23,16 +23,8 @@ from cyclonedds.topic import Topic
 
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.daemon.config import is_loopback
-from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.items import (
-    Contact,
-    Decision,
-    Event,
-    Item,
-    Opened,
-    Skipped,
-    SourceChunk,
-)
+from tactile_rt.daemon.consumer import View
+from tactile_rt.daemon.items import Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import (
     DecisionMessage,
     Message,
@@ -41,7 +33,7 @@ from tactile_rt.daemon.messages import (
     state_message,
     topic_of,
 )
-from tactile_rt.daemon.publishers.sending import Due, SenderOptions, tell_exposed
+from tactile_rt.daemon.publishers.sending import Publisher, SenderOptions, tell_exposed
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import SIMPLE, dds_type, fields_of, token
@@ -95,24 +87,20 @@ class Ros2Options(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_onl
             ) from None
 
 
-class Ros2Publisher(Consumer):
+class Ros2Publisher(Publisher):
     """Writes each message to the topic of its name, as soon as it is there."""
 
     Options = Ros2Options
 
     def __init__(self, name: str, options: Ros2Options) -> None:
-        self.name, self._options = name, options
-        wants = {Opened, Decision, Contact, Skipped, Event}
-        self.wants = frozenset(wants | {SourceChunk} if options.samples else wants)
+        super().__init__(name, options.samples, options.state_s)
+        self._options = options
         self.gather_s = 0.0  # a control loop is on the other side
-        self.tick_s = options.state_s
-        self._state_due = Due(options.state_s)
         self._config()  # refuse what cannot be read before anything starts
-        self._view: View | None = None
         self._domain: Domain | None = None
         self._participant: DomainParticipant | None = None
         self._writers: dict[str, DataWriter[Any]] = {}
-        self._messages = self._bytes = self._dropped = 0
+        self._dropped = 0
 
     def open(self, view: View) -> None:
         self._view = view

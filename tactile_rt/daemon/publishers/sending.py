@@ -35,9 +35,11 @@ __all__ = [
     "Due",
     "ListenerOptions",
     "Prefix",
+    "Publisher",
     "Repeated",
     "Sender",
     "SenderOptions",
+    "StateSeconds",
     "is_port",
     "tell_exposed",
 ]
@@ -236,17 +238,24 @@ class Repeated:
         return [*arrays, state_message(view.snapshot())]
 
 
-class Sender(Consumer):
+class Publisher(Consumer):
+    """What all have that publish messages: samples only if asked for, and the state now and then."""
+
+    def __init__(self, name: str, samples: bool, state_s: float) -> None:
+        self.name = name
+        wants = {Opened, Decision, Contact, Skipped, Event}
+        self.wants = frozenset(wants | {SourceChunk} if samples else wants)
+        self.tick_s, self._state_due = state_s, Due(state_s)
+        self._view: View | None = None
+        self._messages = self._bytes = 0
+
+
+class Sender(Publisher):
     """Sends each message as it is; `_send` does it."""
 
     def __init__(self, name: str, options: SenderOptions) -> None:
-        self.name = name
-        wants = {Opened, Decision, Contact, Skipped, Event}
-        self.wants = frozenset(wants | {SourceChunk} if options.samples else wants)
-        self.tick_s = options.state_s
+        super().__init__(name, options.samples, options.state_s)
         self._repeated = Repeated(options.state_s)
-        self._view: View | None = None
-        self._messages = self._bytes = 0
         self._limit: ConnectionLimit | None = None
 
     def open(self, view: View) -> None:
