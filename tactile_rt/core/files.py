@@ -8,7 +8,7 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, cast
 
 from tactile_rt.core.errors import ConfigError
 
@@ -105,10 +105,16 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
             _name(error, path, path)
             raise
         return
-    hidden = _hidden(path)
+    with _complete(path, _hidden(path), "x+b") as file:
+        write(file)
+
+
+@contextmanager
+def _complete(path: Path, hidden: Path, mode: str) -> Iterator[BinaryIO]:
+    """A file that takes its name when the block ends; if that fails, nothing has changed."""
     try:
-        with hidden.open("x+b") as file:
-            write(file)
+        with cast(BinaryIO, hidden.open(mode)) as file:
+            yield file
         os.replace(hidden, path)
     except BaseException as error:
         with suppress(OSError):  # where nothing may be written it may not be removed either
@@ -140,19 +146,10 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
     Raises:
         OSError: naming `path`: the medium is full, or failed.
     """
-    partial = path.with_suffix(".partial")
-    try:
-        with partial.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except BaseException as error:
-        with suppress(OSError):  # as above
-            partial.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno:
-            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
-        raise
+    with _complete(path, path.with_suffix(".partial"), "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
 
 
 @contextmanager
