@@ -252,9 +252,7 @@ class DeviceSource(Source):
                 self._ask_again(now_ns, now_ns - self._stamper.newest_ns)
             return None
         packet, t_ns = found
-        if self._tap is not None:
-            self._tap(packet, t_ns)
-        samples = self.codec.feed(packet, t_ns)
+        samples = self._feed(packet, t_ns)
         if self.describes:
             # What waited while nobody read is old, but no silence: its end may be half a frame.
             self._noise_ns = 0 if samples is not None else self._noise_ns or t_ns

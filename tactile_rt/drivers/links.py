@@ -268,7 +268,7 @@ class SlcanLink(Link[Sequence[CanFrame]]):
     python-can speaks it too, byte by byte: 5,500 frames/s where a saturated bus carries 9,000.
     """
 
-    def __init__(self, port: str, bitrate: int, fd: bool = False) -> None:
+    def __init__(self, port: str, bitrate: int) -> None:
         self._decoder = SlcanDecoder()
         self._serial = SerialLink(port, 115200)
         self.name = f"slcan:{port}"

@@ -7,6 +7,7 @@ serial:COM3?codec=ascii_line&baud=9600      can:virtual:test?codec=can-dbc&mappi
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from tactile_rt.calibration import (
@@ -136,10 +137,7 @@ def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None 
     options, own = take_options(f"serial:{target}", fields, SerialOptions, kind.Options)
     codec = kind(own)
     baud, parity = options.baud or codec.baud, options.parity or codec.parity
-
-    def connect() -> Link[Any]:
-        return SerialLink(target, baud, parity, options.dtr)
-
+    connect = partial(SerialLink, target, baud, parity, options.dtr)
     return _prepared(connect, codec, options, target, fields, array)
 
 
@@ -169,15 +167,18 @@ def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = N
     # `fd` is the bus's affair and the codec's
     options, own = take_options(f"can:{target}", fields, CanOptions, kind.Options)
     fd = options.fd or bool(getattr(own, "fd", False))
-    bitrate = options.bitrate or kind.bitrate
-    data_bitrate = options.data_bitrate or kind.data_bitrate
-
-    def connect() -> Link[Any]:
-        if interface == "slcan":
-            return SlcanLink(channel, bitrate, fd)
-        return CanLink(interface, channel, bitrate, fd, data_bitrate)
-
+    speeds = kind.bitrate, kind.data_bitrate
+    connect = partial(_open_bus, interface, channel, options, fd, speeds)
     return _prepared(connect, kind(own), options, target, fields, array)
+
+
+def _open_bus(
+    interface: str, channel: str, options: CanOptions, fd: bool, speeds: tuple[int, int | None]
+) -> Link[Any]:
+    bitrate = options.bitrate or speeds[0]
+    if interface == "slcan":
+        return SlcanLink(channel, bitrate)
+    return CanLink(interface, channel, bitrate, fd, options.data_bitrate or speeds[1])
 
 
 def open_line(url: str) -> Link[Any]:
@@ -198,10 +199,8 @@ def open_line(url: str) -> Link[Any]:
     if scheme != "can" or not channel:
         raise ConfigError(f"{url!r} is no line: serial:PORT?baud=... or can:INTERFACE:CHANNEL")
     (can,) = take_options(f"can:{target}", fields, CanOptions)
-    bitrate = can.bitrate or CanCodec.bitrate
-    if interface == "slcan":
-        return SlcanLink(channel, bitrate, can.fd)
-    return CanLink(interface, channel, bitrate, can.fd, can.data_bitrate or None)
+    speeds = CanCodec.bitrate, CanCodec.data_bitrate
+    return _open_bus(interface, channel, can, can.fd, speeds)
 
 
 def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
@@ -230,10 +229,7 @@ def _prepared(
     if told is not None:
         codec.spec = told
         written["array"] = told.to_json()  # without it a recording's packets say nothing
-
-    def opened() -> Source:
-        return DeviceSource(connect, codec, options, name, written)
-
+    opened = partial(DeviceSource, connect, codec, options, name, written)
     prepared = Prepared(codec.spec, opened, told is not None)
     if not options.calibration:
         return prepared
