@@ -195,21 +195,18 @@ class CombinedSource(Source):
         self._closed = False
 
     def read(self, timeout: float | None = None) -> Chunk | None:
-        end = None if timeout is None else time.monotonic() + timeout
+        end, over = None if timeout is None else time.monotonic() + timeout, False
         while not self._closed:
-            chunk = self._ready()
-            if chunk is not None:
+            if (chunk := self._ready()) is not None:
                 self.stats.delivered += len(chunk)
                 return chunk
+            if over:
+                return None
             if all(feed.ended for feed in self._feeds):
                 break
             left = SLICE_S if end is None else min(SLICE_S, max(0.0, end - time.monotonic()))
             self._read_on(left)
-            if end is not None and time.monotonic() >= end:
-                chunk = self._ready()
-                if chunk is not None:
-                    self.stats.delivered += len(chunk)
-                return chunk
+            over = end is not None and time.monotonic() >= end
         raise EndOfStream
 
     def close(self) -> None:
