@@ -11,7 +11,7 @@ apply the rule.
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -24,12 +24,15 @@ __all__ = [
     "MASS_ABOVE",
     "POSTERIOR",
     "UNKNOWN",
+    "Count",
     "Deadline",
     "EarlyExit",
     "Lanes",
     "OpenSetRule",
     "Policy",
+    "Positive",
     "PredictionSetRule",
+    "Share",
     "fitting",
     "mass_above",
     "named",
@@ -40,6 +43,10 @@ UNKNOWN = "unknown"  # what is decided of an object of no class that the model k
 POSTERIOR = "posterior of unknown"  # the score of an `OpenSetRule`: of the label `unknown`
 # The score of a `PredictionSetRule`: how much of the posterior the more probable classes have.
 MASS_ABOVE = "mass above"
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Share = Annotated[float, msgspec.Meta(gt=0, lt=1)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class OpenSetRule(msgspec.Struct, frozen=True):
@@ -87,25 +94,19 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
     """
 
     score: str
-    coverage: float
+    coverage: Share
     quantiles: tuple[float, ...]
-    objects: int
-    noise: float | None = None
+    objects: Count
+    noise: Annotated[float, msgspec.Meta(ge=0)] | None = None
 
     def fault(self, steps: int) -> str:
         """What makes the rule unusable for episodes of so many steps; "" if nothing does."""
         if not named(self.score):
             return f"score must be 1 to {MAX_NAME} printable characters"
-        if not 0 < self.coverage < 1:
-            return f"coverage is {self.coverage:g}, not between 0 and 1"
         if len(self.quantiles) != steps:
             return f"quantiles: {len(self.quantiles)} values for {steps} steps"
         if not np.isfinite(self.quantiles).all():
             return "quantiles must be finite"
-        if self.objects < 1:
-            return f"objects is {self.objects}, must be at least 1"
-        if self.noise is not None and not 0 <= self.noise < np.inf:
-            return f"noise is {self.noise:g}, must be 0 or more"
         return ""
 
     def prediction_set(self, probabilities: NDArray[np.float32], step: int) -> list[int]:

@@ -9,13 +9,13 @@ thresholds are fitted to last steps: of embeddings of earlier ones the rule prom
 """
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Self
+from typing import Any, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.classifier.decision_rules import MAX_NAME, named
+from tactile_rt.classifier.decision_rules import MAX_NAME, Count, Positive, Share, named
 
 __all__ = [
     "ENROLLED",
@@ -39,10 +39,6 @@ Floats = NDArray[np.float64]
 
 ENROLLED, JUDGED = 5, 2  # touches, at most, that thresholds tell apart
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-Count = Annotated[int, msgspec.Meta(ge=1)]
-
-
 class IdentityRule(msgspec.Struct, frozen=True):
     """When touches are of an enrolled object. Bytes are float16, little-endian.
 
@@ -62,7 +58,7 @@ class IdentityRule(msgspec.Struct, frozen=True):
     """
 
     score: str
-    refused: Annotated[float, msgspec.Meta(gt=0, lt=1)]
+    refused: Share
     among: tuple[Count, ...]
     thresholds: tuple[float, ...]
     objects: Count

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -20,7 +20,9 @@ from tactile_rt.classifier.decision_rules import (
     MAX_NAME,
     POSTERIOR,
     UNKNOWN,
+    Count,
     OpenSetRule,
+    Positive,
     PredictionSetRule,
     named,
 )
@@ -106,17 +108,17 @@ class ModelCard(msgspec.Struct, frozen=True):
             not told.
     """
 
-    name: str
+    name: Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
     spec: str
-    period_ns: int
-    substeps: int
-    steps: int
+    period_ns: Annotated[int, msgspec.Meta(ge=PERIODS_NS[0], le=PERIODS_NS[-1])]
+    substeps: Count
+    steps: Annotated[int, msgspec.Meta(ge=1, le=MAX_STEPS)]
     labels: tuple[str, ...]
     state: tuple[StateTensor, ...]
-    clip: tuple[float, ...]
-    scale: tuple[float, ...]
-    floor: tuple[float, ...]
-    temperature: float = 1.0
+    clip: tuple[Positive, ...]
+    scale: tuple[Positive, ...]
+    floor: tuple[Positive, ...]
+    temperature: Positive = 1.0
     provenance: dict[str, Any] = {}
     figures: dict[str, Any] = {}
     version: int = CARD_VERSION
@@ -241,19 +243,11 @@ def parse_card(path: Path, text: str) -> ModelCard:
     for what in ("clip", "scale", "floor"):
         if len(getattr(card, what)) != channels:
             raise damaged(f"{len(getattr(card, what))} values of {what} for {channels} channels")
-    for what in ("period_ns", "substeps", "steps", "temperature", "clip", "scale", "floor"):
-        values = np.asarray(getattr(card, what), dtype=np.float64)
-        if not (np.all(values > 0) and np.all(np.isfinite(values))):
-            raise damaged(f"{what} must be positive")
-    if card.steps > MAX_STEPS or card.period_ns not in PERIODS_NS:
-        raise damaged(f"{card.steps} steps of {card.substeps} sub-steps of {card.period_ns} ns")
     if not card.labels or len(set(card.labels)) != len(card.labels):
         raise damaged("labels are missing or repeat")
     # Decisions carry them to terminals, pages and logs.
     if not all(map(named, card.labels)):
         raise damaged(f"labels must be 1 to {MAX_NAME} printable characters")
-    if len(card.name) > MAX_NAME:
-        raise damaged(f"a name of {len(card.name)} characters")
     if card.license and not named(card.license):
         raise damaged(f"a licence must be at most {MAX_NAME} printable characters")
     if not isinstance(card.provenance.get("unseen_objects", []), list):
