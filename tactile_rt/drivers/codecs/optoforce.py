@@ -228,25 +228,14 @@ class OptoForceCanOptions(OptoForceOptions):
         host_id: CAN identifier of the frames that the device takes.
     """
 
-    device_id: str = "0x100"
-    host_id: str = "0x101"
+    device_id: int = 0x100
+    host_id: int = 0x101
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.ids()
-
-    def ids(self) -> tuple[int, int]:
-        """(device's, host's) identifier."""
-        found = []
         for name in ("device_id", "host_id"):
-            text = getattr(self, name)
-            try:
-                found.append(int(text, 0))
-            except ValueError:
-                found.append(-1)
-            if not 0 <= found[-1] < 1 << 11:
-                raise ConfigError(f"{name} must be 0 to 0x7ff, not {text!r}")
-        return found[0], found[1]
+            if not 0 <= (value := getattr(self, name)) <= 0x7FF:
+                raise ConfigError(f"{name} must be from 0 to 0x7ff, not {value:#x}")
 
 
 class OptoForceCan(CanCodec):
@@ -265,7 +254,7 @@ class OptoForceCan(CanCodec):
             {"model": model, "device_id": f"{device:#x}"}
             for model in SHAPES
             for device in sorted(identifiers)
-            if (model, f"{device:#x}") != usual
+            if (model, device) != usual
         ]
 
     def __init__(self, options: OptoForceCanOptions) -> None:
@@ -273,7 +262,7 @@ class OptoForceCan(CanCodec):
         self._options = options
         self._messages = _Messages(options, self.stats, parts=True)
         self.spec = self._messages.spec
-        self._id, self._host_id = options.ids()
+        self._id, self._host_id = options.device_id, options.host_id
 
     def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
         mine = [f.data for f in packet if f.id == self._id and not (f.extended or f.remote)]

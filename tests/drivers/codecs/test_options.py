@@ -25,7 +25,7 @@ WRONG = [
     ("can optoforce", "filter_hz", "1", "filter_hz must be one of 0, 500, 150, 50, 15, 5, 1.5, no"),
     ("can optoforce", "counts", "1,2", "counts must be 3 numbers"),
     ("can optoforce", "counts", "1,2,0", "counts must be positive"),
-    ("can optoforce", "host_id", "0x800", "host_id must be 0 to 0x7ff, not '2048'"),
+    ("can optoforce", "host_id", "0x800", "host_id must be from 0 to 0x7ff, not 0x800"),
     ("can ati_can", "base", "128", "base must be from 0 to 0x7f, not 0x80"),
     ("can ati_can", "calibration", "16", "calibration must be from 0 to 15, or -1, not 16"),
     ("can icub_skin", "board", "16", "board must be from 0 to 15, not 16"),

@@ -174,7 +174,7 @@ def test_a_device_is_configured() -> None:
 
 
 def test_a_device_on_can_is_configured() -> None:
-    device, host = can(host_id="0x201", device_id="0x200"), can(host_id="0x201", device_id="0x200")
+    device, host = can(host_id=0x201, device_id=0x200), can(host_id=0x201, device_id=0x200)
     (start,) = host.commands(Command.START)
     # 16 bytes in two frames, as RCPRG-ros-pkg/optoforce_can sends them
     assert [f.id for f in start.send] == [0x201] * 2 and [len(f.data) for f in start.send] == [8, 8]
