@@ -9,16 +9,8 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import Chunk
-from tactile_rt.drivers.codec import (
-    CanCodec,
-    CanFrame,
-    Command,
-    SampleBatch,
-    Samples,
-    Step,
-    six_axis,
-)
-from tactile_rt.drivers.codecs.framing import Rounds
+from tactile_rt.drivers.codec import CanFrame, Command, SampleBatch, Step, six_axis
+from tactile_rt.drivers.codecs.framing import CodecOfParts
 
 __all__ = ["Aft200", "Aft200Options"]
 
@@ -56,7 +48,7 @@ class Aft200Options:
             raise ConfigError(f"rate_hz must be from 15.3 to 1000, not {self.rate_hz:g}")
 
 
-class Aft200(CanCodec):
+class Aft200(CodecOfParts):
     """A frame of forces, then one of torques, three u16 big-endian each.
 
     Of a sample without its torques, or without its forces, nothing is valid.
@@ -79,33 +71,18 @@ class Aft200(CanCodec):
 
     def __init__(self, options: Aft200Options) -> None:
         self._options, self._first = options, options.force_id
-        self._period_us = round(1e6 / options.rate_hz)
-        super().__init__(
-            six_axis("AFT200-D80", 1e6 / self._period_us)
-        )  # it takes whole microseconds
-        self._rounds: Rounds[bytes] = Rounds(2)
+        self._period_us = round(1e6 / options.rate_hz)  # it takes whole microseconds
+        super().__init__(six_axis("AFT200-D80", 1e6 / self._period_us), parts=2)
         self.streaming = False
 
-    def forget(self) -> None:
-        self._rounds.forget()
+    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+        part = identifier - self._first
+        return (part, XYZ.size) if 0 <= part <= 1 else None
 
-    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
-        batch, stats = SampleBatch(), self.stats
-        for identifier, data, extended, _, remote in packet:
-            part = identifier - self._first
-            if extended or remote or not 0 <= part <= 1:
-                stats.skipped += 1
-            elif len(data) < XYZ.size:
-                stats.corrupt += 1
-            else:
-                stats.intact += 1
-                for parts in self._rounds.add(part, data[: XYZ.size]):
-                    whole = None not in parts
-                    stats.incomplete += not whole
-                    raw = b"".join([p or bytes(XYZ.size) for p in parts])
-                    batch.values.append(np.frombuffer(raw, ">u2") * SCALE + ZERO)
-                    batch.valid.append((whole,))
-        return batch.take((1, 6), t_ns)
+    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+        raw = b"".join([p[: XYZ.size] if p else bytes(XYZ.size) for p in parts])
+        batch.values.append(np.frombuffer(raw, ">u2") * SCALE + ZERO)
+        batch.valid.append((None not in parts,))
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         if command != Command.START:  # how to stop it is not public

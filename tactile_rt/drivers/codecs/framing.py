@@ -23,14 +23,16 @@ and on is settled every 64 lengths, so that noise cannot pile up.
 
 import binascii
 import re
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Final, Generic, TypeVar
 
-from tactile_rt.drivers.codec import WireStats
+from tactile_rt.core.stream import ArraySpec
+from tactile_rt.drivers.codec import CanCodec, CanFrame, SampleBatch, Samples, WireStats
 
 __all__ = [
-    "ByteBuffer", "FrameFinder", "Rounds", "crc16_modbus", "crc16_x25", "crc16_xmodem",
-    "seal_modbus",
+    "ByteBuffer", "CodecOfParts", "FrameFinder", "Rounds", "crc16_modbus", "crc16_x25",
+    "crc16_xmodem", "seal_modbus",
 ]  # fmt: skip
 
 GAP: Final = 64  # frames: what is remembered of bytes that are none
@@ -286,3 +288,38 @@ class Rounds(Generic[T]):
         parts, self._parts, self._last = self._parts, [None] * self._n, -1
         entered, self._entered = self._entered, True
         return [parts] if entered or parts[0] is not None else []
+
+
+class CodecOfParts(CanCodec):
+    """A device on CAN of which each frame carries a part of a sample, see `Rounds`."""
+
+    def __init__(self, spec: ArraySpec, parts: int) -> None:
+        super().__init__(spec)
+        self._shape = spec.shape
+        self._rounds: Rounds[bytes] = Rounds(parts)
+
+    @abstractmethod
+    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+        """Which part a frame carries, and its least length; None if it is not this device's."""
+
+    @abstractmethod
+    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+        """Add the sample of a round."""
+
+    def forget(self) -> None:
+        self._rounds.forget()
+
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch, stats = SampleBatch(), self.stats
+        for identifier, data, extended, _, remote in packet:
+            found = None if extended or remote else self._part(identifier, data)
+            if found is None:
+                stats.skipped += 1
+            elif len(data) < found[1]:
+                stats.corrupt += 1
+            else:
+                stats.intact += 1
+                for parts in self._rounds.add(found[0], data):
+                    stats.incomplete += None in parts
+                    self._sample(batch, parts)
+        return batch.take(self._shape, t_ns)

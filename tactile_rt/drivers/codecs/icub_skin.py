@@ -8,8 +8,8 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.framing import Rounds
+from tactile_rt.drivers.codec import CanFrame, Command, SampleBatch, Step
+from tactile_rt.drivers.codecs.framing import CodecOfParts
 
 __all__ = ["IcubSkin", "IcubSkinOptions"]
 
@@ -66,7 +66,7 @@ class IcubSkinOptions:
         return tuple(sorted(found))
 
 
-class IcubSkin(CanCodec):
+class IcubSkin(CodecOfParts):
     """A frame with the first seven taxels of a triangle, one with the other five and its errors.
 
     Values are the board's counts from 0 to 255, which fall as a taxel is pressed; newtons need a
@@ -99,35 +99,20 @@ class IcubSkin(CanCodec):
         self._options = options
         self._first = CLASS[options.firmware] | options.board << 4
         self._numbers = options.numbers()
-        self._part = {n: 2 * i for i, n in enumerate(self._numbers)}
+        self._parts = {n: 2 * i for i, n in enumerate(self._numbers)}
         cells = {f"t{n}.{k}": (n, k) for n in self._numbers for k in range(TAXELS)}
         # where the taxels are depends on the robot's part that the board sits in: left at zero
         name, rate_hz = f"icub-skin-{options.board}", 1e3 / options.period_ms
-        super().__init__(ArraySpec.at_origin(name, rate_hz, {"c": "1"}, "board", cells))
-        self._rounds: Rounds[bytes] = Rounds(2 * len(self._numbers))
+        spec = ArraySpec.at_origin(name, rate_hz, {"c": "1"}, "board", cells)
+        super().__init__(spec, parts=2 * len(self._numbers))
         self.streaming = options.firmware == "old"
 
-    def forget(self) -> None:
-        self._rounds.forget()
-
-    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
-        batch, stats, parts = SampleBatch(), self.stats, self._part
-        for identifier, data, extended, _, remote in packet:
-            part = parts.get(identifier - self._first)
-            if part is None or extended or remote:
-                stats.skipped += 1
-                continue
-            tail = bool(data and data[0] & 0x80)
-            if len(data) < (6 if tail else 8):
-                stats.corrupt += 1
-                continue
-            stats.intact += 1
-            for ended in self._rounds.add(part + tail, data):
-                self._sample(batch, ended)
-        return batch.take((len(self._numbers) * TAXELS, 1), t_ns)
+    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+        part = self._parts.get(identifier - self._first)
+        tail = bool(data and data[0] & 0x80)
+        return None if part is None else (part + tail, 6 if tail else 8)
 
     def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
-        self.stats.incomplete += None in parts
         counts = bytearray()
         valid: list[bool] = []
         status = 0

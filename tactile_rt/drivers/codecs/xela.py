@@ -9,8 +9,8 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.framing import Rounds
+from tactile_rt.drivers.codec import CanFrame, Command, SampleBatch, Step
+from tactile_rt.drivers.codecs.framing import CodecOfParts
 
 __all__ = ["Xela", "XelaOptions"]
 
@@ -44,7 +44,7 @@ class XelaOptions:
             )
 
 
-class Xela(CanCodec):
+class Xela(CodecOfParts):
     """uSPa44: each taxel in a frame of its own, byte 0 not known, then x, y, z as u16 big-endian.
 
     Values are the device's counts: the newtons per count differ from patch to patch and go into a
@@ -77,34 +77,19 @@ class Xela(CanCodec):
             ArraySpec.at_origin(
                 "uSPa44", options.rate_hz, dict.fromkeys("xyz", "1"), "patch",
                 {f"T{i}": divmod(i, SIDE) for i in range(TAXELS)},
-            )
+            ),
+            TAXELS,
         )  # fmt: skip
-        self._rounds: Rounds[bytes] = Rounds(TAXELS)
         self.streaming = False
 
-    def forget(self) -> None:
-        self._rounds.forget()
+    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+        taxel = identifier - self._first
+        return (taxel, 1 + XYZ.size) if 0 <= taxel < TAXELS else None
 
-    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
-        batch, stats, first = SampleBatch(), self.stats, self._first
-        for identifier, data, extended, _, remote in packet:
-            taxel = identifier - first
-            if extended or remote or not 0 <= taxel < TAXELS:
-                stats.skipped += 1
-            elif len(data) < 1 + XYZ.size:
-                stats.corrupt += 1
-            else:
-                stats.intact += 1
-                for taxels in self._rounds.add(taxel, data[1 : 1 + XYZ.size]):
-                    self._sample(batch, taxels)
-        return batch.take((TAXELS, 3), t_ns)
-
-    def _sample(self, batch: SampleBatch, taxels: list[bytes | None]) -> None:
-        valid = [t is not None for t in taxels]
-        self.stats.incomplete += not all(valid)
-        raw = b"".join([t or bytes(XYZ.size) for t in taxels])
+    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+        raw = b"".join([p[1 : 1 + XYZ.size] if p else bytes(XYZ.size) for p in parts])
         batch.values.append(np.frombuffer(raw, ">u2"))
-        batch.valid.append(valid)
+        batch.valid.append([p is not None for p in parts])
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         if command == Command.START:  # how to stop it is not public: it stops without power
