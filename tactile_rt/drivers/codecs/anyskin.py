@@ -1,8 +1,7 @@
 """AnySkin and ReSkin: magnetometers under a magnetised elastomer.
 
-A frame has neither beginning, counter nor check: per magnetometer temperature, x, y, z as float32
-(little-endian, degrees Celsius and microtesla), then 0D 0A. Those two bytes also occur inside the
-floats, so where frames end is concluded from several frames at once (`endings`).
+A frame (``frames/anyskin.toml``) has neither beginning, counter nor check, and its line end also
+occurs inside the floats: where frames end is concluded from several at once (`endings`).
 """
 
 import struct
@@ -48,11 +47,7 @@ class AnySkinOptions:
 
 
 class AnySkin(DescribedFrame):
-    """n MLX90393 magnetometers of an AnySkin or ReSkin board, or of eFlesh on one.
-
-    Source: github.com/raunaqbhirangi/anyskin, arduino/5X_binary_burst_stream (frame, order of the
-    chips), anyskin/sensor.py (the host's side), visualizations/anyskin_viz.py (drawing).
-    """
+    """n MLX90393 magnetometers of an AnySkin or ReSkin board, or of eFlesh on one."""
 
     Options = AnySkinOptions
     cannot_detect = (

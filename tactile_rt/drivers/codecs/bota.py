@@ -1,12 +1,8 @@
 """Bota Systems SensONE and Rokubi, generation 2, over RS-422 or USB.
 
-37 bytes a frame: AA, a payload of 34 bytes, CRC-16/X-25 of the payload, all little-endian. The
-payload: u16 status, 6 float32 (N and N m), u32 time in us, float32 temperature in degrees Celsius.
-Commands are ASCII without an end; the device reads 64 bytes of them at once and answers
-``r,0,COMMAND,ERROR``.
-
-Sources: Bota Systems, Rokubi serial interface (frame, commands); facts of the public drivers
-bota_driver/rokubimini_serial and of the maker's Python and Arduino examples.
+Its frame and where we have it from: ``frames/bota.toml``; a float32 after the time is the
+temperature in degrees Celsius. Commands are ASCII without an end; the device reads 64 bytes of them
+at once and answers ``r,0,COMMAND,ERROR``.
 """
 
 import re

@@ -1,11 +1,8 @@
 """Robotiq FT 150 and FT 300 on RS-485 (or its USB adapter), streaming.
 
 The device is a Modbus RTU slave until its register 410 is set to 0x0200: then it sends, unasked and
-deaf to Modbus, 20 4E, six i16 (N / 100, N m / 1000) and CRC-16/MODBUS, all little-endian, 100 times
-a second. A run of 50 bytes FF jams the line and makes it a slave again.
-
-Sources: Robotiq, FT 300 Instruction Manual, section 4 (control); facts of the maker's driver
-robotiq_ft_sensor (rq_sensor_com.cpp).
+deaf to Modbus, the frame of ``frames/ft300.toml``, which says where we have it from. A run of 50
+bytes FF jams the line and makes it a slave again.
 """
 
 import struct

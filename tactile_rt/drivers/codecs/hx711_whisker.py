@@ -1,7 +1,6 @@
 """Strain-gauge whiskers on HX711 converters, two bridges each, read by an Arduino.
 
-A frame is two float32 per whisker, little-endian, in millivolts, then 0D 0A and the float32 2024:
-six bytes that end no possible reading, and by which frames are told apart.
+Frames (``frames/hx711_whisker.toml``) are told apart by six bytes that end no possible reading.
 """
 
 import re
