@@ -137,12 +137,8 @@ class TestSimulation:
         ("url", "said"),
         [
             ("sim:cat", "no simulated array 'cat'"),
-            ("sim:mouse?sede=1", "did you mean seed?"),
-            ("sim:mouse?seed=one", "seed: expected a whole number, got 'one'"),
             ("sim:mouse?pace=slow", "no pace 'slow': there are realtime, fast"),
-            ("sim:mouse?profile=quick", "no profile 'quick': there are realtime"),
             ("sim:mouse?sweeps=-1", "sweeps must be 0 or more"),
-            ("sim:mouse?repeat=0", "repeat 1 or more"),
             ("sim:mouse?objects=mugg", "did you mean 'mug'?"),
         ],
     )
