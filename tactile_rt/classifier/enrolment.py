@@ -39,6 +39,7 @@ Floats = NDArray[np.float64]
 
 ENROLLED, JUDGED = 5, 2  # touches, at most, that thresholds tell apart
 
+
 class IdentityRule(msgspec.Struct, frozen=True):
     """When touches are of an enrolled object. Bytes are float16, little-endian.
 

@@ -24,11 +24,11 @@ from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.catalogue import CODECS
 
 __all__ = [
+    "SIX_AXES",
     "CanCodec",
     "CanFrame",
     "Codec",
     "Command",
-    "SIX_AXES",
     "Samples",
     "SerialCodec",
     "Step",
