@@ -81,6 +81,14 @@ def seal_modbus(message: bytes) -> bytes:
     return message + crc16_modbus(message).to_bytes(2, "little")
 
 
+def _begun(data: bytearray, sync: bytes, at: int = 0) -> int:
+    """How many of the last bytes, none before a place, may become `sync`."""
+    for n in range(min(len(sync) - 1, len(data) - at), 0, -1):
+        if data.endswith(sync[:n]):
+            return n
+    return 0
+
+
 class ByteBuffer:
     """Bytes that have come and are not yet taken."""
 
@@ -91,11 +99,7 @@ class ByteBuffer:
         """Drop all before the first `sync` (or what may become one); return how many bytes."""
         at = self.data.find(sync)
         if at < 0:
-            at = len(self.data)
-            for n in range(min(len(sync) - 1, len(self.data)), 0, -1):
-                if self.data.endswith(sync[:n]):
-                    at -= n
-                    break
+            at = len(self.data) - _begun(self.data, sync)
         del self.data[:at]
         return at
 
@@ -150,7 +154,7 @@ class FrameFinder:
         while True:
             start = data.find(self._sync, at)
             if start < 0:
-                start = len(data) - self._begun(at)
+                start = len(data) - _begun(data, self._sync, at)
             self._skip(data[at:start])
             at = start
             if len(data) - at < self._size:
@@ -175,13 +179,6 @@ class FrameFinder:
         self._data.clear()
         self._gap.clear()
         self._synchronised, self._damaged = False, 0
-
-    def _begun(self, at: int) -> int:
-        """How many of the last bytes may become `sync`."""
-        for n in range(min(len(self._sync) - 1, len(self._data) - at), 0, -1):
-            if self._data.endswith(self._sync[:n]):
-                return n
-        return 0
 
     def _skip(self, some: bytearray) -> None:
         if not some:
