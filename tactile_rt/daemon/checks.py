@@ -49,12 +49,7 @@ def check_config(loaded: Loaded) -> None:
         try:
             wanted.make()
         except TactileError as error:
-            table = wanted.name.partition(".")[0]
-            path: KeyPath = [table]
-            if table == "publisher":
-                names = [p.name for p in config.publisher]
-                path.append(names.index(wanted.name.partition(".")[2]))
-            loaded.refuse(path, str(error))
+            loaded.refuse(_path(loaded, wanted), str(error))
 
 
 def _check_names(loaded: Loaded, config: Config) -> None:
@@ -66,27 +61,18 @@ def _check_names(loaded: Loaded, config: Config) -> None:
             loaded.refuse(["source", i, "name"], f"the name {name!r} is taken")
     for i, model in enumerate(config.model):
         if model.source not in names:
-            loaded.refuse(
-                ["model", i, "source"],
-                no_such("source", model.source, names),
-            )
+            loaded.refuse(["model", i, "source"], no_such("source", model.source, names))
 
 
 def _check_source(loaded: Loaded, i: int, source: SourceConfig) -> ArraySpec | None:
     """The array that it will be, where that is known beforehand."""
     path: KeyPath = ["source", i]
     spec: ArraySpec | None = _try(loaded, [*path, "url"], check_source, source.url)
-    if source.calibration:
-        spec = _try(
-            loaded, [*path, "calibration"],
-            lambda c: check_source(source.url, calibration=c), source.calibration,
-        )  # fmt: skip
-    if source.array:
-        spec = _try(
-            loaded, [*path, "array"],
-            lambda a: check_source(source.url, calibration=source.calibration, array=a),
-            source.array,
-        )  # fmt: skip
+    given: dict[str, str] = {}
+    for key in ("calibration", "array"):
+        if value := getattr(source, key):
+            given[key] = value
+            spec = _try(loaded, [*path, key], lambda _: check_source(source.url, **given), value)
     return spec
 
 
@@ -270,9 +256,10 @@ def _split(address: str) -> tuple[str, int]:
     return host, int(port) if port.isdecimal() else 0
 
 
-def _path(loaded: Loaded, wanted: Wanted, key: str) -> KeyPath:
-    """Where a key of a consumer's table is, or would be."""
+def _path(loaded: Loaded, wanted: Wanted, key: str = "") -> KeyPath:
+    """Where a consumer's table is; with a key, where that is, or would be."""
     table, _, name = wanted.name.partition(".")
     if table != "publisher":
-        return [table, key]
-    return ["publisher", [p.name for p in loaded.config.publisher].index(name), "options", key]
+        return [table, key] if key else [table]
+    path: KeyPath = [table, [p.name for p in loaded.config.publisher].index(name)]
+    return [*path, "options", key] if key else path
