@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import no_such
@@ -33,6 +33,10 @@ class ShapeObjects:
     """
 
     choice: ObjectChoice
+    # a category is of one kind, all can be made, and none is a mesh: see `MeshObjects`
+    kind_of: ClassVar[dict[str, str]] = {}
+    skipped: ClassVar[dict[str, str]] = {}
+    mesh_options: ClassVar[dict[str, Any]] = {}
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
@@ -84,16 +88,6 @@ class ShapeObjects:
         names = chain.from_iterable(self.split.values())
         return {name: name[len(self._prefix) : name.rindex("-")] for name in names}
 
-    @property
-    def kind_of(self) -> dict[str, str]:
-        """Nothing: a category of them is of one kind."""
-        return {}
-
-    @property
-    def skipped(self) -> dict[str, str]:
-        """Nothing: all of them can be made."""
-        return {}
-
     def load(self, name: str) -> TactileObject:
         """An object by its name."""
         return load_object(name)
@@ -101,11 +95,6 @@ class ShapeObjects:
     def target(self, name: str) -> str:
         """What a ``sim:`` URL calls an object: its name."""
         return name
-
-    @property
-    def mesh_options(self) -> dict[str, Any]:
-        """Nothing: they are no meshes."""
-        return {}
 
 
 @dataclass(frozen=True)
