@@ -41,7 +41,13 @@ from tactile_rt.sim_backend.sweep_simulation import (
     ringing,
 )
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
-from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, engine_version
+from tactile_rt.sim_backend.world import (
+    CHANNELS,
+    PROFILES,
+    SAMPLE_MS,
+    engine_version,
+    stamp_samples,
+)
 
 __all__ = [
     "CHUNK_SAMPLES",
@@ -326,15 +332,9 @@ class SimSource(PacedSource):
                 )
             if not self._left and contacts[-1, :, 0].any():
                 self._left = DRAGGED_SAMPLES
-        return self._stamp(values, start_ns)
-
-    def _stamp(self, values: np.ndarray, start_ns: int) -> Chunk:
-        seq = self._sent + np.arange(len(values), dtype=np.int64)
-        self._sent += len(values)
-        period = round(SAMPLE_MS * 1e6)
-        return Chunk(
-            seq, start_ns + seq * period, values, np.ones(values.shape[:2], dtype=np.bool_)
-        )
+        chunk = stamp_samples(values, self._sent, start_ns)
+        self._sent += n
+        return chunk
 
     def _begin_sweep(self, start_ns: int) -> None:
         done = len(self.passes)

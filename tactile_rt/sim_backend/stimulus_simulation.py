@@ -27,11 +27,11 @@ from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.packages import VERSION
-from tactile_rt.core.stream import ArraySpec, Chunk
+from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
-from tactile_rt.sim_backend.world import SAMPLE_MS
+from tactile_rt.sim_backend.world import SAMPLE_MS, stamp_samples
 
 __all__ = ["Surface", "whisk_against", "write_input"]
 
@@ -184,13 +184,7 @@ def model_input(felt: Touch) -> NDArray[np.float32]:
             f"it: the trajectory must last {stop} ms or more, not {len(felt.loads)} ms, and begin "
             f"{round(period)} ms or more before the contact"
         )
-    values = felt.loads[start:stop]
-    chunk = Chunk(
-        np.arange(len(values), dtype=np.int64),
-        np.arange(len(values), dtype=np.int64) * round(SAMPLE_MS * 1e6),
-        values,
-        np.ones(values.shape[:2], dtype=np.bool_),
-    )
+    chunk = stamp_samples(felt.loads[start:stop])
     resampled = Resampler(PERIOD_NS, 1e3 / SAMPLE_MS).push(chunk)
     assert resampled is not None
     return resampled.values[:WINDOW_SAMPLES]

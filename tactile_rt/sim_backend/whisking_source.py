@@ -20,7 +20,7 @@ from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedOptions, PacedSource
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec, stamp_samples
 
 __all__ = ["Placing", "WhiskingOptions", "WhiskingSource", "parse_point"]
 
@@ -192,9 +192,7 @@ class WhiskingSource(PacedSource):
         values, _ = simulation.advance(n)
         self._sent += n
         angles = self._angles(seq)
-        valid = np.ones(values.shape[:2], dtype=np.bool_)
-        t_ns = start_ns + seq * round(SAMPLE_MS * 1e6)
-        felt = self._sensor.push(Chunk(seq, t_ns, values.astype(np.float32), valid))
+        felt = self._sensor.push(stamp_samples(values.astype(np.float32), seq[0], start_ns))
         self.stats.missing = self._sensor.dropped
         if felt is None:
             return None

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.core.stream import ArraySpec
+from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import (
     DAMPING_RATIO,
@@ -44,6 +44,7 @@ __all__ = [
     "quaternion",
     "read_base_loads",
     "set_damping",
+    "stamp_samples",
     "world_spec",
 ]
 
@@ -142,6 +143,13 @@ def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
         orientations=tuple(quaternion(turn @ w.orientation) for turn, _, w in whiskers),
         frame="world",
     )
+
+
+def stamp_samples(values: NDArray[np.float32], first: int = 0, start_ns: int = 0) -> Chunk:
+    """Make a chunk of values at the simulator's rate, all valid, from sample `first` on."""
+    seq = first + np.arange(len(values), dtype=np.int64)
+    valid = np.ones(values.shape[:2], dtype=np.bool_)
+    return Chunk(seq, start_ns + seq * round(SAMPLE_MS * 1e6), values, valid)
 
 
 def quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:

@@ -38,7 +38,7 @@ from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, engine_version
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, engine_version, stamp_samples
 
 __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
 
@@ -351,9 +351,7 @@ def _chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
     lead, total = _lengths(recipe)
     values = np.zeros((total, *loads.shape[1:]), dtype=np.float32)
     values[lead : lead + len(loads)] = loads
-    seq = np.arange(total, dtype=np.int64)
-    t_ns = seq * round(SAMPLE_MS * 1e6)
-    return Chunk(seq, t_ns, values, np.ones(values.shape[:2], dtype=np.bool_))
+    return stamp_samples(values)
 
 
 def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> Floats:

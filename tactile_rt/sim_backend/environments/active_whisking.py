@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from tactile_rt.core.errors import ConfigError, SourceError, name_some
-from tactile_rt.core.stream import Chunk
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.environments.whisking_head import Stretch, WhiskingHead, place_beside
@@ -21,7 +20,7 @@ from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance, usual_size
 from tactile_rt.sim_backend.whisking_drive import Whisking
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec, stamp_samples
 
 __all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking", "picture", "whisker_nodes"]
 
@@ -286,11 +285,8 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _observed(self, felt: Stretch) -> Observation:
         assert self._head is not None and self._sensor is not None
-        n = len(felt.loads)
-        seq = np.arange(self._head.samples - n, self._head.samples)
-        t_ns = seq * round(SAMPLE_MS * 1e6)
-        valid = np.ones(felt.loads.shape[:2], dtype=np.bool_)
-        read = self._sensor.push(Chunk(seq, t_ns, felt.loads.astype(np.float32), valid))
+        loads = felt.loads.astype(np.float32)
+        read = self._sensor.push(stamp_samples(loads, self._head.samples - len(loads)))
         assert read is not None
         means = read.values.reshape(FRAMES, -1, *self.array_spec.shape).mean(1, dtype=np.float64)
         head = np.concatenate([self._head.position, self._head.velocity]) * 1e-3
