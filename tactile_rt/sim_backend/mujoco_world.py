@@ -4,6 +4,7 @@ The object is a mocap body: prescribed motion leaves the whiskers independent of
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -31,6 +32,7 @@ __all__ = [
     "UNSTABLE",
     "ContactProbe",
     "MujocoWorld",
+    "add_piece",
     "contact_distances",
     "sweep_model",
 ]
@@ -121,6 +123,21 @@ def contact_distances(felt: NDArray[np.float32]) -> NDArray[np.float32]:
     return distances
 
 
+def add_piece(
+    world: mujoco.MjSpec, body: mujoco.MjsBody, name: str, corners: Floats, **faces: Any
+) -> None:
+    """Add a convex piece of an object, of (corner, 3) mm, to a body."""
+    world.add_mesh(name=name, uservert=corners.astype(np.float32).ravel(), **faces)
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        contype=OBJECT_BIT,
+        conaffinity=WHISKER_BIT,
+        group=OBJECT_BIT,
+        rgba=(0.75, 0.55, 0.3, 1.0),
+    )
+
+
 def sweep_model(
     animals: Sequence[WhiskerArray],
     names: set[str],
@@ -134,19 +151,8 @@ def sweep_model(
         add_whiskers(world, some, profile, animal.mount, f"head {animal.name}")
     body = world.worldbody.add_body(name="object", mocap=True)
     for i, piece in enumerate(pieces):
-        world.add_mesh(
-            name=f"piece {i}",
-            uservert=piece.vertices.astype(np.float32).ravel(),
-            userface=piece.faces.astype(np.int32).ravel(),
-        )
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"piece {i}",
-            contype=OBJECT_BIT,
-            conaffinity=WHISKER_BIT,
-            group=OBJECT_BIT,
-            rgba=(0.75, 0.55, 0.3, 1.0),
-        )
+        faces = piece.faces.astype(np.int32).ravel()
+        add_piece(world, body, f"piece {i}", piece.vertices, userface=faces)
     model = world.compile()
     set_damping(model, [w for animal in animals for w in animal.whiskers])
     return model

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.whisker_array import Mount
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
-from tactile_rt.sim_backend.mujoco_world import UNSTABLE
+from tactile_rt.sim_backend.mujoco_world import UNSTABLE, add_piece
 from tactile_rt.sim_backend.trajectories import ANGLES, Trajectory, mirror
 from tactile_rt.sim_backend.world import (
-    OBJECT_BIT,
     SAMPLE_MS,
-    WHISKER_BIT,
     Profile,
     add_whiskers,
     empty_world,
@@ -71,7 +69,8 @@ class WhiskSimulation:
         set_damping(clamped, whiskers)  # by the resonance of a whisker whose base stands still
         for whisker in whiskers:
             _add_base_joints(world, whisker)
-        _add_object(world, pieces)
+        for i, points in enumerate(pieces):
+            add_piece(world, world.worldbody, f"piece {i}", points)
         self.model = world.compile()
         self.data = mujoco.MjData(self.model)
         joints = [self.model.joint(f"{w.name} {a}") for w in whiskers for a in ANGLES]
@@ -161,19 +160,6 @@ def _add_base_joints(world: mujoco.MjSpec, whisker: Whisker) -> None:
     if whisker.mount_stiffness:  # nothing is fixed to the base then, and a body that moves has mass
         base.explicitinertial = True
         base.mass, base.inertia = NO_MASS, (NO_MASS, NO_MASS, NO_MASS)
-
-
-def _add_object(world: mujoco.MjSpec, pieces: tuple[NDArray[np.float64], ...]) -> None:
-    for i, points in enumerate(pieces):
-        world.add_mesh(name=f"piece {i}", uservert=points.astype(np.float32).ravel())
-        world.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"piece {i}",
-            contype=OBJECT_BIT,
-            conaffinity=WHISKER_BIT,
-            group=OBJECT_BIT,
-            rgba=(0.75, 0.55, 0.3, 1.0),
-        )
 
 
 def _owners(model: mujoco.MjModel, whiskers: tuple[Whisker, ...]) -> NDArray[np.int64]:

@@ -283,15 +283,9 @@ def _mount(path: Path, mount: _Mount) -> Mount:
 def _sensor(nodes: settings.SettingNode, sensor: _Sensor | None) -> SensorSpec | None:
     if sensor is None:
         return None
+    given = msgspec.structs.asdict(sensor)
     try:
-        return SensorSpec(
-            channels=sensor.channel,
-            rate_hz=sensor.rate_hz,
-            bandwidth_hz=sensor.bandwidth_hz,
-            latency_ms=sensor.latency_ms,
-            magnet=sensor.magnet,
-            matrix=sensor.matrix,
-        )
+        return SensorSpec(channels=given.pop("channel"), **given)
     except ConfigError as error:
         raise ConfigError(f"{nodes.at(['sensor']).where}: {error}") from None
 

@@ -189,22 +189,16 @@ class Whisker:
         if "base_radius" not in fields:
             radii = keratin_radii(length, row, column)
             fields["base_radius"], fields["tip_radius"] = radii
+        x, y, z = (_number(given, f"base_{axis}_mm") for axis in "xyz")
+        theta, phi, zeta = (_angle(given, f"base_{a}_rad") for a in ("theta", "phi", "zeta"))
         return cls(
             name=name.strip(),
             row=row,
             column=column,
             length=length,
             curvature=_number(given, "curvature_a_per_mm"),
-            base=(
-                _number(given, "base_x_mm"),
-                _number(given, "base_y_mm"),
-                _number(given, "base_z_mm"),
-            ),
-            angles=(
-                _angle(given, "base_theta_rad"),
-                _angle(given, "base_phi_rad"),
-                _angle(given, "base_zeta_rad"),
-            ),
+            base=(x, y, z),
+            angles=(theta, phi, zeta),
             **fields,
         )
 

@@ -74,22 +74,14 @@ def picture(head: WhiskingHead) -> NDArray[np.uint8]:
     for panel, axes in enumerate(VIEWS):
         low, high = everything[:, axes].min(axis=0), everything[:, axes].max(axis=0)
         middle, span = (low + high) / 2, (high - low).max() + MARGIN_MM
-
-        def project(
-            points: Floats,
-            axes: tuple[int, int] = axes,
-            middle: Floats = middle,
-            span: float = span,
-            panel: int = panel,
-        ) -> list[tuple[float, float]]:
-            at = (points[:, axes] - middle) * (SIDE / span)
-            return [(panel * SIDE + SIDE / 2 + u, SIDE / 2 - v) for u, v in at]
-
-        for points in corners:
-            outline = points[ConvexHull(points[:, axes]).vertices]
-            draw.polygon(project(outline), fill=THING, outline=EDGE)
+        scale, origin = np.array((1, -1)) * (SIDE / span), (panel * SIDE + SIDE / 2, SIDE / 2)
+        for points in (points[:, axes] for points in corners):
+            outline = points[ConvexHull(points).vertices]
+            places = ((outline - middle) * scale + origin).ravel().tolist()
+            draw.polygon(places, fill=THING, outline=EDGE)
         for line, touches in zip(whisker_nodes(head), touching, strict=True):
-            draw.line(project(line), fill=TOUCHING if touches else WHISKER, width=2)
+            places = ((line[:, axes] - middle) * scale + origin).ravel().tolist()
+            draw.line(places, fill=TOUCHING if touches else WHISKER, width=2)
     return np.asarray(image, dtype=np.uint8)
 
 
