@@ -104,11 +104,6 @@ class SweepSet:
         return replace(self, sweeps=self.sweeps[at])
 
     @property
-    def _levels(self) -> tuple[float, ...]:
-        largest = max(self.manifest.faults.noise, 1.0)
-        return tuple(level for level in NOISE_LEVELS if level <= largest)
-
-    @property
     def refusals(self) -> tuple[str, ...]:
         """What a network that learns from these sweeps may decide without naming a category."""
         unknown = (UNKNOWN,) if (self.sweeps.labels < 0).any() else ()
@@ -145,7 +140,8 @@ class SweepSet:
         Of levels that training never draws there are none. Recorded sweeps have their own noise at
         every level.
         """
-        rng = np.random.default_rng(0)
+        rng, largest = np.random.default_rng(0), max(self.manifest.faults.noise, 1.0)
+        levels = [level for level in NOISE_LEVELS if level <= largest]
         starts, parts = [], max(len(self.sweeps) // 256, 1)
         for values, recorded in zip(
             np.array_split(self.sweeps.values, parts),
@@ -154,7 +150,7 @@ class SweepSet:
         ):
             noise = rng.standard_normal(values.shape, dtype=np.float32) * self.noise
             noise[recorded] = 0
-            noisy = (values + np.float32(level) * noise for level in self._levels)
+            noisy = (values + np.float32(level) * noise for level in levels)
             starts.append(np.stack([self.onsets(v).start for v in noisy]))
         return np.concatenate(starts, axis=1)
 

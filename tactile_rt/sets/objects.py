@@ -19,6 +19,7 @@ from tactile_rt.sets.manifest import CONTACTS, SKIPPED, SweepManifest, has_objec
 
 __all__ = [
     "Sweeps",
+    "read_arrays",
     "read_object",
     "read_skipped",
     "read_split",
@@ -117,9 +118,9 @@ def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
     at = 0
     for name, count in zip(names, counts, strict=True):
         path = object_path(folder, name)
-        values[at : at + count] = _read_arrays(path, "values")["values"]
+        values[at : at + count] = read_arrays(path, "values")["values"]
         if contacts is not None:
-            stored = _read_arrays(path, CONTACTS)[CONTACTS]
+            stored = read_arrays(path, CONTACTS).get(CONTACTS, contacts[:0])
             if stored.shape != contacts[at : at + count].shape:
                 raise _damage_error(
                     path, ValueError(f"contacts {stored.shape} beside other values")
@@ -146,7 +147,7 @@ def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str,
         RecordingError: the file is damaged.
     """
     path = object_path(folder, name)
-    arrays = _read_arrays(path)
+    arrays = read_arrays(path)
     arrays.pop(CONTACTS, None)
     if "values" not in arrays:
         raise _damage_error(path, KeyError("no values"))
@@ -181,12 +182,13 @@ def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
     return tuple(stored)
 
 
-def _read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
+    """Read of an object's file what there is of some arrays; without a name, of all."""
     check_no_pointer(path)
     try:
         # Opened here because numpy leaves its own file open when it is damaged.
         with path.open("rb") as file, np.load(file) as arrays:
-            return {key: arrays[key] for key in keys or arrays.files}
+            return {key: arrays[key] for key in arrays.files if not keys or key in keys}
     except MemoryError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file

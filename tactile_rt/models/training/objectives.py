@@ -23,6 +23,7 @@ At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -266,13 +267,7 @@ class SimCLR(Objective):
         self._temperature = temperature
         width, features = model.network.config.width, model.network.feature_size
         hidden, out = _scaled(CONTRASTED[0], width), _scaled(CONTRASTED[1], width, LEAST)
-        self.neck = nn.Sequential(
-            nn.Linear(features, hidden, bias=False),
-            nn.BatchNorm1d(hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, out, bias=False),
-            nn.BatchNorm1d(out),
-        )
+        self.neck = _normed(features, hidden, out, bias=False)
         for layer in self.neck:
             if isinstance(layer, nn.Linear):
                 nn.init.normal_(layer.weight, std=NECK_SPREAD)
@@ -316,22 +311,8 @@ class SimSiam(Objective):
         super().__init__(model, augmentation)
         width, features = model.network.config.width, model.network.feature_size
         out, hidden = _scaled(PROJECTED, width), _scaled(BOTTLENECK, width)
-        self.projector = nn.Sequential(
-            nn.Linear(features, out),
-            nn.BatchNorm1d(out),
-            nn.ReLU(),
-            nn.Linear(out, out),
-            nn.BatchNorm1d(out),
-            nn.ReLU(),
-            nn.Linear(out, out),
-            nn.BatchNorm1d(out),
-        )
-        self.predictor = nn.Sequential(
-            nn.Linear(out, hidden),
-            nn.BatchNorm1d(hidden),
-            nn.ReLU(),
-            nn.Linear(hidden, out),
-        )
+        self.projector = _normed(features, out, out, out)
+        self.predictor = nn.Sequential(*_normed(out, hidden), nn.ReLU(), nn.Linear(hidden, out))
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         first, second = (self.projector(self.embedding(frames)) for frames in seen)
@@ -406,6 +387,14 @@ class Predictive(Objective):
 def _in_single_precision(like: Tensor) -> torch.autocast:
     """Compute losses in it: mixed precision ends at the network's output."""
     return torch.autocast(like.device.type, enabled=False)
+
+
+def _normed(*sizes: int, bias: bool = True) -> nn.Sequential:
+    """Linear layers of these sizes, each with a batch norm, and a ReLU between two."""
+    layers: list[nn.Module] = []
+    for of, to in pairwise(sizes):
+        layers += [nn.Linear(of, to, bias), nn.BatchNorm1d(to), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
 
 
 def _scaled(size: int, width: float, least: int = 1) -> int:

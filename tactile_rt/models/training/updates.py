@@ -74,17 +74,14 @@ class RunState:
         self.schedule: LRScheduler = build_schedule(
             self.optimizer, self.config, self.updates, self.per_epoch
         )
+        self._parts: dict[str, Any] = {
+            "model": self.objective, "optimizer": self.optimizer, "schedule": self.schedule
+        }  # fmt: skip
 
     def state(self) -> dict[str, Any]:
         """Gather what `last.pt` holds."""
-        return {
-            "model": self.objective.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": self.schedule.state_dict(),
-            "epoch": self.epoch,
-            "done": self.done,
-            "best": self.best,
-        }
+        kept = {name: part.state_dict() for name, part in self._parts.items()}
+        return kept | {"epoch": self.epoch, "done": self.done, "best": self.best}
 
     def resume(self, folder: Path) -> None:
         """Go on from the `last.pt` of a folder, if there is one.
@@ -97,9 +94,8 @@ class RunState:
             return
         try:
             saved = torch.load(last, map_location="cpu", weights_only=True)
-            self.objective.load_state_dict(saved["model"])
-            self.optimizer.load_state_dict(saved["optimizer"])
-            self.schedule.load_state_dict(saved["schedule"])
+            for name, part in self._parts.items():
+                part.load_state_dict(saved[name])
             self.epoch, self.done, self.best = saved["epoch"], saved["done"], saved["best"]
         except Exception as error:  # torch raises many unrelated types for a damaged file
             raise ModelError(

@@ -9,16 +9,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from tactile_rt.core.errors import RecordingError, name_some
-from tactile_rt.core.files import check_no_pointer, write_whole
+from tactile_rt.core.files import write_whole
 from tactile_rt.sets.manifest import MANIFEST, SKIPPED, SweepManifest, has_object, object_path
-from tactile_rt.sets.objects import read_skipped
+from tactile_rt.sets.objects import read_arrays, read_skipped
 
 __all__ = ["SUMS", "Tally", "check_sums", "remove_leftovers", "tally", "write_sums", "written_sum"]
 
 SUMS = "SHA256SUMS"
+COUNTED = ("touches", "unstable", "wedged", "saturated")  # of each sweep
 STALE_S = 60  # no file of a set takes as long to write
 
 
@@ -56,22 +55,11 @@ class Tally:
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
     """Count what there is of these objects."""
     there = [name for name in names if has_object(folder, name)]
-    misses = unstable = wedged = saturated = 0
+    counts = dict.fromkeys(COUNTED, 0)
     for name in there:
-        path = object_path(folder, name)
-        check_no_pointer(path)
-        try:
-            with path.open("rb") as file, np.load(file) as arrays:
-                known = set(arrays.files)
-                misses += int((~arrays["touches"]).sum()) if "touches" in known else 0
-                unstable += int(arrays["unstable"].sum()) if "unstable" in known else 0
-                wedged += int((arrays["wedged"] > 0).sum()) if "wedged" in known else 0
-                saturated += int((arrays["saturated"] > 0).sum()) if "saturated" in known else 0
-        except Exception as error:  # numpy and zipfile raise a dozen unrelated types
-            reason = str(error) or type(error).__name__
-            raise RecordingError(
-                f"{path} is damaged ({reason}): delete it and sweep again"
-            ) from None
+        for key, each in read_arrays(object_path(folder, name), *COUNTED).items():
+            counts[key] += int((~each if key == "touches" else each > 0).sum())
+    misses, unstable, wedged, saturated = counts.values()
     skipped = len(read_skipped(folder))
     return Tally(len(there) * sweeps, misses, unstable, wedged, saturated, skipped)
 

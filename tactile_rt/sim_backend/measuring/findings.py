@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from tactile_rt.core.errors import name_some
 from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.sim_backend.measuring.resting import FORGETS_S, TO_SIGMA, Rest, drift_likelihood
 from tactile_rt.sim_backend.transducer import FASTEST_HZ
 
 __all__ = [
+    "MANY",
     "MEDIAN",
     "SIGMAS",
     "ArrayFinding",
@@ -25,7 +27,6 @@ __all__ = [
     "about",
     "change",
     "compare_sensor",
-    "listed",
     "pooled",
     "spread_of",
 ]
@@ -158,12 +159,6 @@ def change(
     return (Edit(path, float(f"{found.value or found.high:.4g}"), f"{found}{why}"),)
 
 
-def listed(names: Sequence[str]) -> str:
-    """The first of several names, and how many more there are."""
-    more = f" and {len(names) - MANY} more" if len(names) > MANY else ""
-    return ", ".join(names[:MANY]) + more
-
-
 def compare_sensor(
     sensor: SensorSpec,
     rate: Figure,
@@ -218,9 +213,10 @@ class _Channel:
             error = SIGMAS * MEDIAN / math.sqrt(2 * counted) * (rest.noise[c] / white) ** 2
             figures.append(about(white / math.sqrt(passed_hz), error))
         figure, strange = pooled(figures, NOISIER)
-        notes = [f"unlike most: {listed([self._fine[k] for k in strange])}"] if strange else []
+        unlike = [self._fine[k] for k in strange]
+        notes = [f"unlike most: {name_some(unlike, MANY)}"] if unlike else []
         if dead := [name for name in self._rests if name not in self._live]:
-            notes.append(f"always read the same: {listed(dead)}")
+            notes.append(f"always read the same: {name_some(dead, MANY)}")
         return self._finding("noise_density", figure, "; ".join(notes), "per root of a hertz")
 
     def resolution(self) -> ArrayFinding:
@@ -251,7 +247,7 @@ class _Channel:
         if low >= 0:
             found = Figure(float(sizes[total.argmax()]), float(sizes[low]), float(sizes[high]))
         strange = [self._fine[k] for k in np.flatnonzero(~alike)]
-        note = f"unlike most: {listed(strange)}" if strange else ""
+        note = f"unlike most: {name_some(strange, MANY)}" if strange else ""
         return self._finding("drift", found, note)
 
     def offset(self, untouched: Mapping[str, NDArray[np.float64]], drift: float) -> ArrayFinding:
@@ -268,7 +264,7 @@ class _Channel:
         # The levels themselves are not known better than this.
         figure = spread_of(off[alike].tolist(), drift**2 + float(np.mean(errors**2)))
         strange = [name for name, one in zip(names, alike, strict=True) if not one]
-        note = f"unlike most: {listed(strange)}" if strange else ""
+        note = f"unlike most: {name_some(strange, MANY)}" if strange else ""
         return self._finding("offset", figure, note)
 
     def _finding(self, key: str, found: Figure | None, note: str, per: str = "") -> ArrayFinding:

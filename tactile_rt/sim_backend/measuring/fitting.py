@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from tactile_rt.core.errors import ConfigError, SpecMismatch
+from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.core.settings import find_lines, parse_toml, read_text, read_toml
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.measuring.findings import (
+    MANY,
     SIGMAS,
     ArrayFinding,
     Edit,
     Figure,
     compare_sensor,
-    listed,
 )
 from tactile_rt.sim_backend.measuring.mechanics import compare_whiskers
 from tactile_rt.sim_backend.measuring.resting import Rest, find_rest
@@ -85,7 +85,7 @@ def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
         *compare_whiskers(whiskers, rings, rate.value, _tables(text)),
     ]
     if restless := [e for e in spec.elements if e not in rests]:
-        note = f"never at rest for 3 s, or often invalid: {listed(restless)}"
+        note = f"never at rest for 3 s, or often invalid: {name_some(restless, MANY)}"
         findings.append(ArrayFinding("rest", "", None, None, note))
     findings += _beyond_range(sensor, recorded)
     text = edit_text(path, text, [e for f in findings for e in f.edits])

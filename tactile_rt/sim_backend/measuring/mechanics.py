@@ -14,13 +14,14 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import brentq
 
+from tactile_rt.core.errors import name_some
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, PLAUSIBLE, SOFTEST_MOUNT, Whisker
 from tactile_rt.sim_backend.measuring.findings import (
+    MANY,
     MEDIAN,
     ArrayFinding,
     Figure,
     change,
-    listed,
     pooled,
 )
 from tactile_rt.sim_backend.measuring.ringing import HEARD, Ring
@@ -84,7 +85,8 @@ def compare_whiskers(
         stiff = _changed(whisker, stiffness, solved.value)
         found[damping][whisker.name] = _damping(stiff, damping, ratio)
     for why, names in silent.items():
-        findings.append(ArrayFinding("resonance", "Hz", None, None, f"{why}: {listed(names)}"))
+        note = f"{why}: {name_some(names, MANY)}"
+        findings.append(ArrayFinding("resonance", "Hz", None, None, note))
     for field, figures in found.items():
         findings += _brought(field, figures, by_name, tables)
     return findings
@@ -178,6 +180,6 @@ def _brought(
             figure, _ = pooled([figures[n] for n in names], math.inf)
         value = getattr(whiskers[names[0]], field) if column in tables[names[0]][1] else None
         edits = change(("whisker", number, column), value, figure)
-        what = f"{column} of {listed(names)}"
+        what = f"{column} of {name_some(names, MANY)}"
         findings.append(ArrayFinding(what, unit, value, figure, "", edits))
     return findings

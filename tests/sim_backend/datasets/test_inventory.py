@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.sets.manifest import object_path
 from tactile_rt.sets.objects import write_object, write_skipped
