@@ -158,11 +158,6 @@ class WhiskingHead:
         found: Floats = (self._lags[1] - self._lags[2]) / LAG_MS * 1e3
         return found
 
-    @property
-    def protraction(self) -> float:
-        """How far the bases are turned from rest now, rad, rostral positive."""
-        return float(self._drive.protraction(np.array([self.samples * SAMPLE_MS * 1e-3]))[0])
-
     def command(self, whisking: Whisking) -> None:
         """Whisk like this from now on; the motion glides there."""
         self._drive.command(whisking, self.samples * SAMPLE_MS * 1e-3)
