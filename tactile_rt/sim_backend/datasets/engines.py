@@ -11,7 +11,7 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -50,10 +50,8 @@ def run_processes(work: Work, names: Sequence[str], processes: int) -> Iterator[
                 connection, process = idle.pop() if idle else _start(work)
                 name, tries = waiting.popleft()
                 busy[connection] = (process, name, tries)
-                try:
+                with suppress(OSError):  # it died while it waited: told by the read below
                     connection.send(name)
-                except OSError:  # it died while it waited: told by the read below
-                    pass
             for ready in wait(list(busy)):
                 assert isinstance(ready, Connection)
                 process, name, tries = busy.pop(ready)

@@ -7,6 +7,7 @@
 Gymnasium imports the module that stands before the colon, and this one registers the environment.
 """
 
+from contextlib import suppress
 from typing import Final
 
 __all__ = ["ENVIRONMENT", "WHISKERS", "register"]
@@ -32,7 +33,5 @@ def register() -> None:
         )
 
 
-try:
+with suppress(ModuleNotFoundError):  # without the extra, nothing to be known to
     register()
-except ModuleNotFoundError:  # without the extra, nothing to be known to
-    pass
