@@ -45,7 +45,6 @@ class Metrics(Consumer):
 
     def __init__(self, name: str, config: MetricsConfig) -> None:
         self._name, self._config = name, config
-        self._view: View | None = None
         self._server: HttpServer | None = None
 
     def open(self, view: View) -> None:
@@ -82,7 +81,6 @@ class Metrics(Consumer):
         # A page of a foreign site may have its name resolve to us, and then ask from a browser.
         if is_loopback(self._config.host) and not _local(request.headers.get("host", "localhost")):
             raise Refused(403, "this is served to its own computer, under localhost, only")
-        assert self._view is not None
         if request.path == "/metrics":
             return Response(200, exposition(self._view.snapshot()), EXPOSITION)
         if request.path == "/state":
@@ -102,7 +100,6 @@ class Metrics(Consumer):
         raise Refused(404, "there are /metrics, /state and /health")
 
     def _failed(self, reason: str) -> None:
-        assert self._view is not None
         self._view.report(self._name, "request", reason, "error")
 
 

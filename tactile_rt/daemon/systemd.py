@@ -40,7 +40,6 @@ class Systemd(Consumer):
         # systemd asks for a ping at half of the time; twice as often misses none.
         self.tick_s = min(TICK_S, self._watchdog_s / 4) if self._watchdog_s else TICK_S
         self._socket: socket.socket | None = None
-        self._view: View | None = None
         self._status = ""
         self._ready = False
         self._pings = self._withheld = 0
@@ -53,7 +52,6 @@ class Systemd(Consumer):
         self._socket.connect(self._address)
 
     def handle(self, items: list[Item]) -> None:
-        assert self._view is not None
         for item in items:
             if isinstance(item, Event) and item.part == "daemon":
                 self._daemon(item.state)

@@ -43,7 +43,6 @@ class Page(Consumer):
             )
         self._name, self._options = name, options
         self._feed = Feed()
-        self._view: View | None = None
         self._routes: routes.PageRoutes | None = None
         self._server: HttpServer | None = None
         self._told_state = 0.0
@@ -114,7 +113,6 @@ class Page(Consumer):
 
     def _greet(self) -> list[bytes]:
         """The first lines, made in the server's thread."""
-        assert self._view is not None
         snapshot = self._view.snapshot()
         hello = {
             "type": "hello", "version": FEED_VERSION, "control": self._options.control,
@@ -125,16 +123,13 @@ class Page(Consumer):
         return [msgspec.json.encode(hello) + b"\n", *arrays, self._state(), *recent]
 
     def _state(self) -> bytes:
-        assert self._view is not None
         return encode(state_message(self._view.snapshot())) + b"\n"
 
     def _control(self, action: str, who: str) -> bool:
-        assert self._view is not None
         there = self._view.send("recorder", Control(action))
         if there:
             self._view.report(self._name, "control", f"{who} asked the recorder to {action}")
         return there
 
     def _failed(self, reason: str) -> None:
-        assert self._view is not None
         self._view.report(self._name, "request", reason, "error")

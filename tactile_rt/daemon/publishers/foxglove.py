@@ -42,8 +42,9 @@ from tactile_rt.daemon.publishers.scene import Scene
 from tactile_rt.daemon.publishers.sending import (
     ConnectionLimit,
     Connections,
+    Due,
     Prefix,
-    Repeated,
+    repeat_messages,
     tell_exposed,
 )
 
@@ -87,9 +88,8 @@ class FoxglovePublisher(Consumer):
         self._channels: dict[str, Any] = {}
         self._log: LogChannel | None = None
         self._scenes: dict[str, Scene] = {}
-        self._repeated = Repeated(REPEAT_S)
+        self._repeat_due = Due(REPEAT_S)
         self._due: dict[str, float] = {}
-        self._view: View | None = None
         self._messages = 0
         self._port = options.port
 
@@ -131,8 +131,7 @@ class FoxglovePublisher(Consumer):
                 self._publish(message)
         for samples in newest.values():
             self._show(samples)
-        if self._view is not None:
-            self._repeat(self._view)
+        self._repeat(self._view)
 
     def close(self) -> None:
         server, self._server = self._server, None
@@ -200,7 +199,7 @@ class FoxglovePublisher(Consumer):
     def _closed(self, item: Closed) -> None:
         scene = self._scenes.pop(item.source, None)
         channel = self._channels.get(f"{self._base(item.source)}/scene")
-        if scene is not None and channel is not None and self._view is not None:
+        if scene is not None and channel is not None:
             utc_ns = item.t_ns + self._view.utc_offset_ns()
             channel.log(scene.gone(utc_ns), log_time=utc_ns)
 
@@ -225,16 +224,17 @@ class FoxglovePublisher(Consumer):
             self._messages += 1
 
     def _repeat(self, view: View) -> None:
-        messages = self._repeated.messages(view)
+        if not self._repeat_due.now():
+            return
+        messages = repeat_messages(view)
         for message in messages:
             self._publish(message)
-        if messages:
-            utc_ns = messages[-1].utc_ns
-            for source, scene in self._scenes.items():
-                channel = self._channels[f"{self._base(source)}/scene"]
-                if channel.has_sinks():
-                    channel.log(scene.bases(utc_ns), log_time=utc_ns)
-                    self._messages += 1
+        utc_ns = messages[-1].utc_ns
+        for source, scene in self._scenes.items():
+            channel = self._channels[f"{self._base(source)}/scene"]
+            if channel.has_sinks():
+                channel.log(scene.bases(utc_ns), log_time=utc_ns)
+                self._messages += 1
 
     def _base(self, source: str) -> str:
         return f"/{self._options.prefix}/{quote(source, safe='')}"

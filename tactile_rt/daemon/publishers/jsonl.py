@@ -58,7 +58,7 @@ class JsonlPublisher(Publisher):
         for start in range(0, len(items), TOGETHER):
             found = map(message_of, items[start : start + TOGETHER])
             self._write([message for message in found if message is not None])
-        if self._view is not None and self._state_due.now():
+        if self._state_due.now():
             self._write([state_message(self._view.snapshot())])
 
     def _write(self, messages: list[Message]) -> None:

@@ -129,7 +129,7 @@ class Ros2Publisher(Publisher):
                 self._opened(item)
             elif (message := message_of(item)) is not None:
                 self._tell(message)
-        if self._view is not None and self._state_due.now():
+        if self._state_due.now():
             self._tell(state_message(self._view.snapshot()))
 
     def close(self) -> None:

@@ -36,11 +36,11 @@ __all__ = [
     "ListenerOptions",
     "Prefix",
     "Publisher",
-    "Repeated",
     "Sender",
     "SenderOptions",
     "StateSeconds",
     "is_port",
+    "repeat_messages",
     "tell_exposed",
 ]
 
@@ -224,18 +224,10 @@ class Due:
         return True
 
 
-class Repeated:
-    """Messages that are sent again and again: the state and the arrays that are open."""
-
-    def __init__(self, every_s: float) -> None:
-        self._due = Due(every_s)
-
-    def messages(self, view: View) -> list[Message]:
-        """Those that are due."""
-        if not self._due.now():
-            return []
-        arrays = [m for m in map(message_of, view.streams().values()) if m is not None]
-        return [*arrays, state_message(view.snapshot())]
+def repeat_messages(view: View) -> list[Message]:
+    """Make those that are sent again and again: the arrays that are open, and the state."""
+    arrays = [m for m in map(message_of, view.streams().values()) if m is not None]
+    return [*arrays, state_message(view.snapshot())]
 
 
 class Publisher(Consumer):
@@ -246,7 +238,6 @@ class Publisher(Consumer):
         wants = {Opened, Decision, Contact, Skipped, Event}
         self.wants = frozenset(wants | {SourceChunk} if samples else wants)
         self.tick_s, self._state_due = state_s, Due(state_s)
-        self._view: View | None = None
         self._messages = self._bytes = 0
 
 
@@ -255,7 +246,6 @@ class Sender(Publisher):
 
     def __init__(self, name: str, options: SenderOptions) -> None:
         super().__init__(name, options.samples, options.state_s)
-        self._repeated = Repeated(options.state_s)
         self._limit: ConnectionLimit | None = None
 
     def open(self, view: View) -> None:
@@ -264,8 +254,8 @@ class Sender(Publisher):
 
     def handle(self, items: list[Item]) -> None:
         messages: list[Message] = [m for m in map(message_of, items) if m is not None]
-        if self._view is not None:
-            messages += self._repeated.messages(self._view)
+        if self._state_due.now():
+            messages += repeat_messages(self._view)
         for message in messages:
             self._bytes += self._send(message)
             self._messages += 1
