@@ -174,7 +174,6 @@ class Classifier:
             None is the step's length.
         late: what becomes of a late decision, see `tactile_rt.classifier.decision_rules.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
-        threads: that may share one operator of the network.
         embedding: whether decisions carry the step's embedding, a copy each.
         age: of a live stream: how old the sample of a stream time (ns) is now, s.
         catch_up: what is done where a live stream's decisions would be older than `behind_s`: the
@@ -214,7 +213,6 @@ class Classifier:
         deadline_s: float | None = None,
         late: Policy = "count",
         providers: Sequence[str] = ("cpu",),
-        threads: int = 1,
         embedding: bool = False,
         age: Callable[[int], float] | None = None,
         catch_up: CatchUp = "all",
@@ -230,7 +228,7 @@ class Classifier:
             raise ConfigError(f"fuse_s: {fuse_s} s; it must be 0 or more")
         self._exit = EarlyExit(sure, in_a_row)
         names = onnxruntime_names(providers)
-        session, self.card = load_model(model, names, threads)
+        session, self.card = load_model(model, names)
         self.providers = tuple(session.get_providers())
         order = fit_source(model, self.card, spec)
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))

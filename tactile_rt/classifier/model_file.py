@@ -127,7 +127,6 @@ def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Content
 def load_model(
     path: Path,
     providers: Sequence[str] = ("CPUExecutionProvider",),
-    threads: int = 1,
     kind: Kind | None = "step",
 ) -> tuple[ort.InferenceSession, ModelCard]:
     """Open a model file for inference and read its card.
@@ -135,8 +134,6 @@ def load_model(
     Args:
         path: the ``.onnx`` file.
         providers: onnxruntime's execution providers in the order of preference.
-        threads: of the CPU's provider. A 1 ms step gains nothing from more than one, and the
-            robot has other work for its cores.
         kind: the kind of model that is needed; None takes any.
 
     Raises:
@@ -150,8 +147,8 @@ def load_model(
             raise ConfigError(f"no {provider} in this onnxruntime: it has {', '.join(available)}")
     card, _, data = read_model(path, kind)
     options = ort.SessionOptions()
-    options.intra_op_num_threads = threads
-    options.inter_op_num_threads = 1
+    # A 1 ms step gains nothing from more threads, and the robot has other work for its cores.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
     # For helper threads; this one's mode onnxruntime may change for ever: `FlushDenormals`.
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
     options.log_severity_level = 4  # failures come as exceptions; the log would repeat them

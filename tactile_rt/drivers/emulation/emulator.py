@@ -21,7 +21,7 @@ from tactile_rt.drivers.emulation.transmitter import EmulatedClock, RateConverte
 __all__ = ["PACES", "Emulator"]
 
 PACES = ("realtime", "fast")
-SETTLE_S: Final = 0.2  # a host that opens a port throws away what was there before
+SETTLE_S: Final = 0.2  # unasked none is sent: who opens a port throws away what was there before
 SLICE_S: Final = 0.05  # how soon a wait notices that the emulator is closed
 YIELD_S: Final = 1e-5  # a source that never waits would keep the host's commands waiting
 PIECE: Final = 16  # samples encoded at a time when nobody waits for the clock
@@ -50,7 +50,6 @@ class Emulator:
         start_count: First value of the device's counter, e.g. just before it wraps.
         start_tick: First value of the device's clock, in ticks.
         drift_ppm: How much faster than true the device's clock runs, parts per million.
-        settle_s: How long after a host has come a device begins that sends unasked, s.
 
     Raises:
         ConfigError: codec and endpoint are of different wires, or a fault cannot happen there.
@@ -69,7 +68,6 @@ class Emulator:
         start_count: int = 0,
         start_tick: int = 0,
         drift_ppm: float = 0.0,
-        settle_s: float = SETTLE_S,
     ) -> None:
         if codec.wire != endpoint.wire:
             raise ConfigError(f"a {codec.wire} codec cannot speak over a {endpoint.wire} endpoint")
@@ -87,7 +85,6 @@ class Emulator:
         self._rate = RateConverter(source.spec.rate_hz, codec) if pace == "realtime" else None
         self._seconds = seconds
         self._ahead_ns = QUIET_S * NS_PER_S if faults and not source.live else 0.0
-        self._settle_s = settle_s
         self._waits = pace == "fast" and not source.live  # the host sets the pace
         self._unasked = codec.streaming  # when switched on
         tick_ns = codec.tick_ns or 1.0
@@ -295,7 +292,7 @@ class Emulator:
                 wanted = self.codec.streaming or self.codec.polled > 0 or measures
                 left = SLICE_S
                 if self._heard_at is not None and self.endpoint.heard and wanted:
-                    settled = self._heard_at + (self._settle_s if self._unasked else 0.0)
+                    settled = self._heard_at + (SETTLE_S if self._unasked else 0.0)
                     left = min(left, settled - time.monotonic())
                     if left <= 0:
                         if self.endpoint.backlog < AHEAD_BYTES:
