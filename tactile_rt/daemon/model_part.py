@@ -226,7 +226,8 @@ class ModelPart(Part):
             self._report(self.name, "refused", f"the one before goes on: {new.error}", "error")
             return
         self._trial = new.stamp, new.trial
-        waited = self._ready_s()
+        self._ready_at = self._ready_at or time.monotonic()
+        waited = time.monotonic() - self._ready_at
         if new.classifier is None:  # there is no stream: it is loaded when there is one
             self.config, self.file, self.refused = new.config, new.file, ""
             assert new.trial is not None
@@ -242,11 +243,6 @@ class ModelPart(Part):
             else ""
         )
         self._report(self.name, "admitted", f"{new.words}{late}")
-
-    def _ready_s(self) -> float:
-        """How long the next model has been ready, s."""
-        self._ready_at = self._ready_at or time.monotonic()
-        return time.monotonic() - self._ready_at
 
     def _settled(self, new: Classifier, came: bool, waited: float) -> bool:
         """Whether a new model may take over: nothing is under way, and it knows the baseline."""

@@ -139,19 +139,16 @@ class Ros2Publisher(Publisher):
         self._domain = None
 
     def details(self) -> dict[str, str | int | float]:
+        listeners = [len(w.get_matched_subscriptions()) for w in tuple(self._writers.values())]
         return {
             "domain": self._options.domain,
             "interface": self._options.config_file or self._options.interface,
             "topics": len(self._writers),
-            "nodes": self._nodes(),  # the most that listen to one topic
+            "nodes": max(listeners, default=0),  # the most that listen to one topic
             "messages": self._messages,
             "bytes": self._bytes,
             "dropped": self._dropped,  # messages that at least one node did not get
         }
-
-    def _nodes(self) -> int:
-        writers = tuple(self._writers.values())
-        return max((len(w.get_matched_subscriptions()) for w in writers), default=0)
 
     def _opened(self, item: Opened) -> None:
         """A source's topics are there before anything is said: a node finds them, and misses
