@@ -278,7 +278,7 @@ def _samples(item: SourceChunk) -> SamplesMessage:
     )  # fmt: skip
 
 
-# By the bits of a float32's exponent: the power of ten that leaves 9 digits before the point, or 10.
+# By the bits of a float32's exponent: the power of ten that leaves 9 digits before the point; or 10
 _DECIMAL = np.floor((np.arange(256) - 127) * np.log10(2.0)).astype(int)
 SCALES = np.array([10.0 ** min(max(MOST - 1 - e, 0), 22) for e in _DECIMAL])
 

@@ -231,7 +231,7 @@ def repeat_messages(view: View) -> list[Message]:
 
 
 class Publisher(Consumer):
-    """What all have that publish messages: samples only if asked for, and the state now and then."""
+    """Base of what publishes messages: samples only if asked for, the state now and then."""
 
     def __init__(self, name: str, samples: bool, state_s: float) -> None:
         self.name = name
