@@ -32,8 +32,6 @@ from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.encoders.gru import GRUEncoder
 
-__all__ = ["checkpoint_layers", "reach", "untrained_card_layers", "untrained_layers"]
-
 Traces = dict[str, Tensor]
 Change = Callable[[Tensor], Tensor]
 

@@ -19,19 +19,6 @@ from tactile_rt.alignment.statistics import standard_error
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = [
-    "PROTOCOLS",
-    "Benchmark",
-    "Consistency",
-    "Frozen",
-    "Target",
-    "benchmark_sha256",
-    "check_benchmark",
-    "load_benchmark",
-    "load_strict",
-    "save_benchmark",
-]
-
 PROTOCOLS = ("strict", "paper-code")
 
 

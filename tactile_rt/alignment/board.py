@@ -22,18 +22,6 @@ from tactile_rt.alignment.selection import part_of
 from tactile_rt.alignment.statistics import held_out, standard_error
 from tactile_rt.alignment.stimuli_input import StimuliInput
 
-__all__ = [
-    "ANOTHER",
-    "Alignments",
-    "BoardCell",
-    "BoardDataset",
-    "BoardRow",
-    "joined",
-    "traces_of",
-    "traces_of_stimuli",
-    "with_cells",
-]
-
 Traces = Mapping[str, Floats]  # by layer, (6, step, unit), NaN where input cannot reach
 
 ANOTHER = "another animal"

@@ -6,8 +6,6 @@ from tactile_rt.alignment.board import ANOTHER, Alignments, BoardCell, BoardData
 from tactile_rt.alignment.html_page import format_number, join_notes, make_page, make_table
 from tactile_rt.alignment.metrics import MINIMUM_CEILING
 
-__all__ = ["board_page"]
-
 STYLE = """
 td small{display:block;white-space:nowrap}
 .bar{display:block;height:5px;border-radius:2px;margin:.2rem 0 .1rem;background:var(--rule)}

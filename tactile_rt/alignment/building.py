@@ -19,8 +19,6 @@ from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["animal_means", "build", "checked_sessions", "refuse_copies"]
-
 # Of the time that a build takes; the rest is bootstraps.
 READING = 0.8
 # Of two copies of a session.

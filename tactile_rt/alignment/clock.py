@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.rdm import Floats
 
-__all__ = ["CLOCKS", "WARNING", "ContactResponse", "contact_response", "said_of"]
-
 CLOCKS = ("session", "recording")  # NWB's; and the published shift by the starting time
 WARNING = "WARNING: "  # begins a note that must not be overlooked
 

@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 from tactile_rt.alignment.rdm import Floats, rdm, square
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
-__all__ = ["Decoded", "decode", "decode_paper", "decode_rdm", "mean_decoded"]
-
 Labels = tuple[int, ...]
 
 SHAPE: Labels = tuple(SHAPES.index(name.split("-")[0]) for name in STIMULI)

@@ -21,8 +21,6 @@ from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
-__all__ = ["MODELS", "Brain", "example_models"]
-
 FEATURES = 6
 # Of a unit: the middle of the rates in spikes per second, the spread of their logarithm over units.
 MIDDLE_HZ, SPREAD = 5.0, 0.8

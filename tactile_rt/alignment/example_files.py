@@ -27,8 +27,6 @@ from tactile_rt.core.stream.stimuli import STIMULI
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["write_example"]
-
 TRIAL_S = 4.0
 FIRST_S, BEGIN_S = 5.9, 10.03  # when the first trial and the electrical recording begin
 CONTACT_S, CHOICE_S = (0.8, 1.2), (0.8, 1.2)  # first contact after the start; choice after contact

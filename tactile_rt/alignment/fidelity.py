@@ -14,8 +14,6 @@ from tactile_rt.alignment.layers import Layers
 from tactile_rt.alignment.rdm import pearson, rdm
 from tactile_rt.alignment.stimuli_input import StimuliInput
 
-__all__ = ["LayerFidelity", "compare", "export_layers", "fidelity_check"]
-
 OUTPUT = "output"
 LEAST_PEARSON = {"fp32": 0.9999}
 REDUCED_PEARSON = 0.98  # of any other precision

@@ -38,21 +38,6 @@ from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = [
-    "FAIL",
-    "INCONCLUSIVE",
-    "LOST",
-    "PASS",
-    "Check",
-    "Mice",
-    "exit_code",
-    "mice_of",
-    "neural_checks",
-    "regression",
-    "turing",
-    "validity",
-]
-
 MARGIN = 0.65  # of the noise ceiling
 WORSE, SURE = 10, 8  # a mouse is called worse in one of so many cases, a floor is too high in one
 LOST = (0.25, 0.5)  # shares of its geometry that a damaged mouse has lost, for the power

@@ -8,8 +8,6 @@ import numpy as np
 
 from tactile_rt.core.files import write_whole
 
-__all__ = ["format_number", "join_notes", "make_page", "make_table", "write_page"]
-
 STYLE = """
 :root{color-scheme:light dark;--page:#fcfcfa;--ink:#22252a;--soft:#666b73;--rule:#dfe1e4;
 --model:#3a6fb8;--untrained:#8fa3bf;--input:#8a8f98;--animal:#b98a1a;--good:#2f8a58;--bad:#c4523a}

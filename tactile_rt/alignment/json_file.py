@@ -9,8 +9,6 @@ import numpy as np
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer, write_whole
 
-__all__ = ["Number", "encode", "read_json", "write_json"]
-
 T = TypeVar("T")
 LARGEST = 1e12  # beyond it nothing can be drawn
 

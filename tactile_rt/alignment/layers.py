@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PARTS", "Layers", "first_difference", "table"]
-
 PARTS = ("encoder", "attender", "decoder")  # every layer's name begins with one of them and a dot
 # Lanes of one batch that compute the same may differ by rounding.
 SAME = 1e-6

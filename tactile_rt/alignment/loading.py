@@ -16,8 +16,6 @@ from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoints import describe_checkpoint
 
-__all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
-
 CHECKPOINT, BEST = ".pt", "best.pt"
 OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
 FIGURES = re.compile(r"(test_|validation_)?top1")

@@ -14,16 +14,6 @@ from tactile_rt.core.errors import ConfigError, describe_error, name_some
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = [
-    "Animal",
-    "NeuralSession",
-    "by_animal",
-    "pad",
-    "published_layout",
-    "rates_sha256",
-    "read_published",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class NeuralSession:

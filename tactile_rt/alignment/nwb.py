@@ -35,8 +35,6 @@ from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["BIN_S", "WINDOWS", "Reading", "find_nwb", "read_nwb", "read_session"]
-
 Progress = Callable[[float], None]
 
 BIN_S = 0.045

@@ -19,30 +19,6 @@ from tactile_rt.core.errors import ConfigError, name_some
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "COLUMNS",
-    "CONTACTS",
-    "EXPERIMENT",
-    "LARGEST",
-    "SUBJECT",
-    "TRIALS",
-    "WHISKER",
-    "animal_name",
-    "contact_times",
-    "flags",
-    "last_time",
-    "mark_overlaps",
-    "name_rows",
-    "numbers",
-    "spike_times",
-    "starting_time",
-    "task_of",
-    "text",
-    "trial_columns",
-    "unit_column",
-    "usable_units",
-]
-
 COLUMNS = ("start_time", "choice_time", "outcome", "stimulus", "servo_position", "ignore_trial")
 TRIALS = "intervals/trials"
 RECORDING = "extracellular array recording"  # of the published files; else the only one there is

@@ -27,8 +27,6 @@ from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.runtime import FlushDenormals
 from tactile_rt.core.errors import ModelError, explain_errors
 
-__all__ = ["GRU_LAYERS", "named_taps", "onnx_layers", "precision_of", "step_graph", "with_outputs"]
-
 QUANTISED = {"MatMulInteger", "ConvInteger", "DynamicQuantizeLinear", "QLinearMatMul",
              "QLinearConv", "DequantizeLinear", "MatMulNBits", "MatMulIntegerToFloat"}  # fmt: skip
 GRAPH_NODE = re.compile(r"encoder\.(convs\.|dense\.|drives\.|)(\w+)")

@@ -30,8 +30,6 @@ from tactile_rt.alignment.rdm import Floats, pearson, rdm
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["POOLED", "freeze_paper_code"]
-
 POOLED = "concatenated"  # the published name of all animals as one
 
 

@@ -14,8 +14,6 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from tactile_rt.alignment.rdm import Floats, square
 
-__all__ = ["Bar", "Level", "Point", "draw_bars", "draw_heat_maps", "draw_profiles", "draw_scatter"]
-
 COLOURS = {
     "raw": "#8a8f98", "encoder": "#c4523a", "attender": "#2f8a58", "decoder": "#3a6fb8",
 }  # fmt: skip

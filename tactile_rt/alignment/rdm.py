@@ -14,20 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
-__all__ = [
-    "CONSTANT",
-    "PAIRS",
-    "UPPER",
-    "Floats",
-    "normalised",
-    "pearson",
-    "rdm",
-    "relabellings",
-    "rsa",
-    "square",
-    "stimulus_index",
-]
-
 Floats = NDArray[np.float64]
 
 PAIRS = tuple(combinations(range(len(STIMULI)), 2))

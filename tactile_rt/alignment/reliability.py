@@ -14,18 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from tactile_rt.alignment.rdm import Floats, pearson, rdm
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "BOOTSTRAPS",
-    "SEED",
-    "filtered_mean",
-    "first_halves",
-    "half_rdms",
-    "noise_corrected",
-    "spearman_brown",
-    "split_half",
-    "trial_mean",
-]
-
 BOOTSTRAPS = 1000
 SEED = 1234  # of the first bootstrap in the published analysis
 CUTOFF = 0.5

@@ -12,8 +12,6 @@ from tactile_rt.alignment.results import ModelResult, Results
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["report_page"]
-
 VERDICTS = {
     "pass": '<span class="good">passes</span>',
     "fail": '<span class="bad">fails</span>',

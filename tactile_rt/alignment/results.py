@@ -18,8 +18,6 @@ from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["ModelResult", "Results", "baseline_of", "model_result", "read_results", "results_of"]
-
 
 class ModelResult(Score, frozen=True, eq=False, kw_only=True):
     """Everything that is shown of a model: its score, and fields as in `layers.Layers`."""

@@ -13,8 +13,6 @@ from tactile_rt.alignment.rdm import PAIRS, Floats, pearson, rdm
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["Score", "layer_rdms", "score", "score_rdms"]
-
 
 class Score(msgspec.Struct, frozen=True, eq=False):
     """How well a model's layers fit a benchmark's targets.

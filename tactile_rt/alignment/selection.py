@@ -12,8 +12,6 @@ from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.settings import no_such
 
-__all__ = ["CELLS", "LAYERS_UM", "TARGET_PARTS", "TASKS", "Selection", "part_of"]
-
 TASKS = ("discrimination", "detection")
 CELLS = ("excitatory", "inhibitory")
 # Depth below the pia in um, as the recordings' author draws them (github.com/cxrodgers/my,

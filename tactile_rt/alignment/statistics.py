@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.rdm import Floats, normalised, relabellings
 
-__all__ = ["held_out", "highest", "max_statistic", "mean_held_out", "standard_error", "student"]
-
 # Points of Student's t that it exceeds in one of so many cases, for 1, 2, ... degrees of freedom;
 # and the normal's beyond.
 STUDENT = {

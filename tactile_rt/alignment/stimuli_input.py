@@ -18,8 +18,6 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["SHIPPED", "STEPS", "SUBSTEPS", "StimuliInput", "read_stimuli"]
-
 SHIPPED = Path(__file__).parents[1] / "assets" / "six_stimuli.npz"
 STEPS, SUBSTEPS, PERIOD_MS = 22, 5, 9
 

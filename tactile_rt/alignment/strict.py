@@ -36,8 +36,6 @@ from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["MINIMUM_TRIALS", "MINIMUM_UNITS", "divided", "freeze_strict"]
-
 MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves
 TIE = 1e-9

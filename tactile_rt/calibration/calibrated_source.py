@@ -7,8 +7,6 @@ from typing import Any
 from tactile_rt.calibration.device_calibration import Calibration
 from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
-__all__ = ["CalibratedSource", "declare", "declared"]
-
 
 class CalibratedSource(Source):
     """A source whose samples are corrected; all else (statistics, health, commands) is its own.

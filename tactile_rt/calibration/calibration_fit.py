@@ -22,8 +22,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import convert, nearest, read_csv
 from tactile_rt.core.stream import ArraySpec, Chunk
 
-__all__ = ["AXES", "Fit", "LoadTable", "calibrate", "raw_readings", "read_loads"]
-
 AXES = {"fx": "N", "fy": "N", "fz": "N", "mx": "N m", "my": "N m", "mz": "N m"}
 RAW = "raw_"
 TIMES = ("start_s", "end_s")

@@ -14,8 +14,6 @@ from tactile_rt.core.errors import ConfigError, SpecMismatch
 from tactile_rt.core.settings import no_such
 from tactile_rt.core.stream import ArraySpec, Chunk, quaternion_product
 
-__all__ = ["Calibration", "Mirror", "check_device"]
-
 Quaternion = tuple[float, float, float, float]
 
 AXES = ("x", "y", "z")

@@ -18,8 +18,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.core.settings import SettingNode, convert, nearest, read_toml
 
-__all__ = ["calibration_path", "load_calibration", "save_calibration"]
-
 Row = tuple[float, ...]
 
 VERSION = 1

@@ -20,8 +20,6 @@ from tactile_rt.calibration.calibrated_source import CalibratedSource
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, concatenate
 
-__all__ = ["Tare", "record", "tare"]
-
 Floats = NDArray[np.float64]
 
 BLOCKS = 8

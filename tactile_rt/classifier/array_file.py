@@ -9,8 +9,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import convert, make_node, read_text
 from tactile_rt.core.stream import SPEC_VERSION, ArraySpec
 
-__all__ = ["read_array"]
-
 
 def read_array(path: Path) -> ArraySpec:
     """The array that a file describes.

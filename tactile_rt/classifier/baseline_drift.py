@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Drift", "RestLevels"]
-
 # A level to which the signal returns so often within one contact is that of rest: the baseline
 # was taken while something was touched.
 RETURNS = 3

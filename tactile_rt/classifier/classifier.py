@@ -44,8 +44,6 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["Classification", "Classifier", "ClassifierStats", "fuse", "without_bad_samples"]
-
 Mode = Literal["episode", "sliding"]
 Floats = NDArray[np.float32]
 EVERY = 4

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.baseline_drift import Drift, RestLevels
 
-__all__ = ["ContactDetector"]
-
 MIN_BASELINE_SAMPLES = 20  # quiet samples before the first decision: 180 ms at 9 ms
 BASELINE_SAMPLES = 100  # the baseline is the mean of at most this many of the last quiet samples
 # The latest quiet samples may already hold a faint onset: they wait outside until it would have

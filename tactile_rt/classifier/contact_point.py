@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["ESTIMATES", "WhiskerShapes", "bent", "resting", "straight"]
-
 Floats = NDArray[np.float64]
 
 POINTS = 64  # pieces that a whisker is cut into

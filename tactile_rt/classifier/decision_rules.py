@@ -19,25 +19,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "IN_A_ROW",
-    "MASS_ABOVE",
-    "POSTERIOR",
-    "UNKNOWN",
-    "Count",
-    "Deadline",
-    "EarlyExit",
-    "Lanes",
-    "OpenSetRule",
-    "Policy",
-    "Positive",
-    "PredictionSetRule",
-    "Share",
-    "fitting",
-    "mass_above",
-    "named",
-]
-
 MAX_NAME = 200  # characters
 UNKNOWN = "unknown"  # what is decided of an object of no class that the model knows
 POSTERIOR = "posterior of unknown"  # the score of an `OpenSetRule`: of the label `unknown`

@@ -17,20 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.classifier.decision_rules import MAX_NAME, Count, Positive, Share, named
 
-__all__ = [
-    "ENROLLED",
-    "JUDGED",
-    "LOG_ODDS",
-    "NONE_OF_THESE",
-    "EnrolledObject",
-    "IdentityRule",
-    "enrolment_fault",
-    "identify",
-    "log_odds",
-    "margins",
-    "project",
-]
-
 NONE_OF_THESE = "none of these"  # what is decided of an object that is not enrolled
 LOG_ODDS = "log odds"  # the score of an `IdentityRule`: of the same object
 

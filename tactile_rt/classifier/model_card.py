@@ -32,20 +32,6 @@ from tactile_rt.core.errors import ConfigError, ModelError, SpecMismatch, name_s
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import SensorSpec, channel_limits
 
-__all__ = [
-    "Kind",
-    "ModelCard",
-    "StateTensor",
-    "decided",
-    "element_order",
-    "fit_source",
-    "kind_columns",
-    "one_line",
-    "parse_card",
-    "rated_noise",
-    "sensor_of",
-]
-
 CARD_VERSION = 3
 STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
 MAX_STEPS = 1_000_000

@@ -14,8 +14,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["MAX_BYTES", "BadModel", "Contents", "graph_sha256", "read_onnx", "split_fields"]
-
 MAX_BYTES = 2**31 - 1  # protobuf's own limit
 MAX_METADATA = 4 * 2**20  # bytes: labels, array, provenance and figures take some 10 kB
 MAX_PARTS = 1_000_000  # protobuf fields: the largest network has some 30,000

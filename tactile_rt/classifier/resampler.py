@@ -10,8 +10,6 @@ import numpy as np
 
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 
-__all__ = ["Resampler"]
-
 # A silence beyond it (or two input periods) is skipped instead of filled with invalid rows.
 LONGEST_GAP_NS = NS_PER_S
 # Of the kernel's nominal weight. Half would blank a slow sensor whose samples jitter by a fifth of

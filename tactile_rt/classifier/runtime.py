@@ -20,8 +20,6 @@ import onnxruntime as ort
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["PROVIDERS", "FlushDenormals", "available", "device_of", "onnxruntime_names"]
-
 PROVIDERS = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",

@@ -17,8 +17,6 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-__all__ = ["Session"]
-
 POLL_S = 0.1  # how soon a reader thread notices that it should stop
 
 

@@ -17,8 +17,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["CatchUp", "Skip", "Skips"]
-
 CatchUp = Literal["newest", "all"]
 
 SMOOTHING = 0.2  # of the time that a step is expected to take

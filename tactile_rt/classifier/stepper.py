@@ -17,8 +17,6 @@ from tactile_rt.classifier.model_file import output_sizes
 from tactile_rt.classifier.runtime import PROVIDERS, FlushDenormals, device_of
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["Stepper"]
-
 WARM_UP = 4  # runs, two of each binding: the first ones allocate, and may even compile
 
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from tactile_rt.classifier.model_card import ModelCard
 
-__all__ = ["Trial", "TrialLimits", "try_model"]
-
 MB = 1_000_000
 LOOK_S = 0.02  # how soon it is seen that the child has ended, or that nobody waits for it
 CPU_S = 2  # beyond the limit on the clock: threads of onnxruntime may share the work

@@ -26,8 +26,6 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-__all__ = ["BoundedQueue", "QueueState"]
-
 LOOK_S = 0.2  # how long to wait for the counts
 
 T = TypeVar("T")

@@ -13,20 +13,6 @@ They are apart from `stream`, which needs numpy, so that a command starts quickl
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-__all__ = [
-    "ConfigError",
-    "ModelError",
-    "RecordingError",
-    "SourceError",
-    "SpecMismatch",
-    "TactileError",
-    "describe_error",
-    "explain_errors",
-    "length",
-    "name_some",
-    "shorten",
-]
-
 LONGEST, WORD = 200, 80  # characters of a message, and of a word of it that is no path
 
 

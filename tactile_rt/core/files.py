@@ -12,18 +12,6 @@ from typing import BinaryIO, Final, cast
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "POINTER",
-    "check_no_pointer",
-    "is_pointer",
-    "open_regular",
-    "replaced",
-    "sync_folder",
-    "whole_folder",
-    "write_whole",
-]
-
-
 POINTER: Final = "is a Git LFS pointer, not the file itself: `git lfs pull`"
 _LFS: Final = b"version https://git-lfs.github.com/spec/"
 

@@ -18,8 +18,6 @@ from urllib.parse import unquote, urlsplit
 
 from tactile_rt.core.errors import ConfigError, TactileError
 
-__all__ = ["AlreadyRunning", "Locks", "alone_in", "device_keys", "lock_keys"]
-
 DEVICES = ("serial", "can")
 TRIES = 20  # at a name whose holder does not answer: it has just begun, or has just ended
 PAUSE_S = 0.01

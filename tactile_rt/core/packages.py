@@ -24,22 +24,6 @@ from typing import Any
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "ARRAYS",
-    "CELLS",
-    "CODECS",
-    "OBJECTS",
-    "PUBLISHERS",
-    "SOURCES",
-    "VERSION",
-    "added",
-    "added_names",
-    "install_extra",
-    "install_line",
-    "lacking",
-    "require_extra",
-]
-
 VERSION = "0.2.0"  # which recordings, sweep sets and model files carry
 ROOT = Path(__file__).parents[2]  # of a checkout or an unpacked source archive
 ARRAYS = "tactile_rt.arrays"  # paths of .csv or .toml files

@@ -15,8 +15,6 @@ from tactile_rt.core.errors import ModelError, TactileError
 from tactile_rt.daemon.config import ADMISSION, LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
 
-__all__ = ["Admission", "file_stamp", "model_path"]
-
 
 class Admission:
     """Begins at once.

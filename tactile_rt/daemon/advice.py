@@ -11,8 +11,6 @@ from datetime import UTC, datetime
 
 from tactile_rt.daemon.states import BREAKS, Diagnostic
 
-__all__ = ["ADVICE", "DiagnosticOnsets"]
-
 LOAD = "Stop other programs, or take a faster machine or a smaller model; see `tactile-rt top URL`."
 VERIFY = "Look at the model's file: `tactile-rt model verify FILE`; then send SIGHUP."
 # What to do, by what is missing.

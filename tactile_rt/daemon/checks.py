@@ -23,8 +23,6 @@ from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.service import MADE
 from tactile_rt.sources.opening import check_source
 
-__all__ = ["check_config"]
-
 SHORTEST_TOKEN = 16  # of a page that others can reach
 HOST = re.compile(r"(?=.{1,253}\Z)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.?)+\Z")
 ANY = ("", "*", "0.0.0.0", "::")

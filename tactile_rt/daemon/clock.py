@@ -6,8 +6,6 @@ from pathlib import Path
 
 from tactile_rt.daemon.diagnostics import LossWindow
 
-__all__ = ["Clock", "Turns"]
-
 STEP_NS = 100_000_000  # what neither slewing nor a busy host makes between two looks
 STARVED_S = 1.0  # a watch that has no turn for so long: neither has anybody else
 WAITED_S = 0.25  # for a processor, of the newest second: others take it, or a quota

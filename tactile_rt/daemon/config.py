@@ -12,23 +12,6 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-__all__ = [
-    "ADMISSION",
-    "CONFIG_VERSION",
-    "EXAMPLE",
-    "Config",
-    "LimitsConfig",
-    "LogConfig",
-    "MetricsConfig",
-    "ModelConfig",
-    "PageConfig",
-    "PublisherConfig",
-    "RecorderConfig",
-    "SourceConfig",
-    "config_text",
-    "is_loopback",
-]
-
 ADMISSION = "tactile-rt admission"  # the thread that loads a model, not to be torn out of that
 CONFIG_VERSION = 1
 

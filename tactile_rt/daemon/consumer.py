@@ -22,8 +22,6 @@ from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.states import ConsumerState, LatencyMeter, OnDisk, Snapshot
 
-__all__ = ["Consumer", "ConsumerPart", "View"]
-
 TAKEN = "all its connections are taken, and others are turned away"
 
 

@@ -33,8 +33,6 @@ from tactile_rt.daemon.states import Diagnostic, Snapshot
 from tactile_rt.daemon.trends import Trends, read_resident_bytes
 from tactile_rt.drivers.health import Identity
 
-__all__ = ["Daemon"]
-
 WATCH_S = 0.25
 LOGGER = logging.getLogger("tactile_rt.classifier")
 STARTED_S = 5.0  # what has not started by then is told as degraded instead

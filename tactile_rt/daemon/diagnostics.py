@@ -33,8 +33,6 @@ from tactile_rt.daemon.states import (
 )
 from tactile_rt.drivers.health import State
 
-__all__ = ["LossWindow", "diagnose", "oldest_s"]
-
 NS = 1e9
 MINUTE_S, SECOND_S, LOOK_S = 60.0, 1.0, 0.05
 PERIODS = 3  # of a slow sensor, before a sample of it is old

@@ -27,8 +27,6 @@ from typing import Any
 
 from tactile_rt.core.errors import SourceError
 
-__all__ = ["HttpLimits", "HttpServer", "Refused", "Request", "Response", "listen", "parse_head"]
-
 BACKLOG = 64
 END_S = 0.5  # what streams have for their end when the server closes
 TURNS = 5  # of the loop, however late: from an accepted connection to `_meet` it is three

@@ -10,19 +10,6 @@ from typing import Any
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
-__all__ = [
-    "Closed",
-    "Contact",
-    "Control",
-    "Decision",
-    "Event",
-    "Item",
-    "Opened",
-    "Packet",
-    "Skipped",
-    "SourceChunk",
-]
-
 
 @dataclass(frozen=True)
 class Opened:

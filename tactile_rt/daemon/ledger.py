@@ -6,8 +6,6 @@ import time
 from tactile_rt.daemon.states import OnDisk
 from tactile_rt.recording.writer import RecordingWriter
 
-__all__ = ["Ledger"]
-
 Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
 
 

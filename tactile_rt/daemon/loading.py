@@ -18,8 +18,6 @@ from tactile_rt.core.files import open_regular
 from tactile_rt.core.settings import SettingNode, convert, read_toml, refusal, set_key
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
 
-__all__ = ["Loaded", "load_config"]
-
 LARGEST = 1 << 20  # bytes of a configuration
 FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
 

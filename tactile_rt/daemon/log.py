@@ -16,8 +16,6 @@ from tactile_rt.daemon.config import LogConfig
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Event, Item
 
-__all__ = ["EventHandler", "Log"]
-
 LEVELS = ("info", "warning", "error")
 REMEMBERED = 256  # different lines
 

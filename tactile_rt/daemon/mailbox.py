@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping
 from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.daemon.items import Closed, Decision, Item, Opened, Packet, SourceChunk
 
-__all__ = ["Hub", "Mailbox"]
-
 AROUND_BYTES = 500  # what Python needs around an item
 FRAME_BYTES = 200  # and around a CAN frame
 

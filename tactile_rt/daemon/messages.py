@@ -25,23 +25,6 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.states import Snapshot
 
-__all__ = [
-    "MESSAGE_VERSION",
-    "ArrayMessage",
-    "ContactMessage",
-    "DecisionMessage",
-    "HealthMessage",
-    "Message",
-    "SamplesMessage",
-    "SkipMessage",
-    "StateMessage",
-    "encode",
-    "message_of",
-    "shortest",
-    "state_message",
-    "topic_of",
-]
-
 MESSAGE_VERSION = 1
 DIGITS = 4  # of probabilities
 # Of float32s, see `shortest`.

@@ -23,8 +23,6 @@ from tactile_rt.daemon.states import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.trends import read_resident_bytes
 from tactile_rt.drivers.health import State
 
-__all__ = ["ALERTS", "Metrics", "exposition"]
-
 ALERTS = Path(__file__).parents[1] / "assets" / "alerts.yml"
 
 LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0, newest_first=True)

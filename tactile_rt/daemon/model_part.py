@@ -25,8 +25,6 @@ from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.source_part import keeps_host_time
 from tactile_rt.daemon.states import LatencyMeter, ModelState
 
-__all__ = ["ModelPart"]
-
 MODEL_BYTES = 64 << 20
 WAKE_S, LOOK_S = 0.25, 0.02
 LONGEST_S = 10.0  # a touch that lasts longer does not keep a new model waiting

@@ -15,8 +15,6 @@ from tactile_rt.core.errors import SpecMismatch, TactileError
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.states import PartState
 
-__all__ = ["Part", "Report", "reason_of"]
-
 STEADY_S = 10.0  # whoever has worked so long begins with the shortest pause again
 
 

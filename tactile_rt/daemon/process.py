@@ -24,8 +24,6 @@ from tactile_rt.daemon.config import ADMISSION
 if TYPE_CHECKING:
     from tactile_rt.daemon.daemon import Daemon
 
-__all__ = ["ExitCode", "leave", "note_signals", "run_daemon"]
-
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
 TURN_S = 0.25  # how often the main loop tells that it goes on

@@ -10,8 +10,6 @@ from statistics import median
 
 from tactile_rt.core.stream import NS_PER_S
 
-__all__ = ["RateMeter"]
-
 STRETCH_NS = NS_PER_S // 5
 LONGEST_NS = 60 * NS_PER_S  # longer: the device's clock has begun anew
 FEWEST = 5  # stretches, so that two hiccups are fewer than the others

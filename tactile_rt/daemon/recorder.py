@@ -48,8 +48,6 @@ from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.recording.writer import RecordingWriter
 
-__all__ = ["Recorder"]
-
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
 PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # after a failure, and another; then all is well

@@ -13,8 +13,6 @@ from tactile_rt.core.files import sync_folder
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.recording.writer import PART
 
-__all__ = ["RecordingsFolder", "words"]
-
 STALE_S = 3600.0  # a file that is begun has its name long before
 MB = 1e6
 EVERY_S, POINTS, LEAST_S = 5.0, 120, 60.0  # of the newest ten minutes: how fast it fills

@@ -15,8 +15,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.loading import Loaded
 
-__all__ = ["MADE", "check_folders", "install_script", "unit_text"]
-
 # Where systemd makes a folder for the service.
 MADE = {
     "StateDirectory": Path("/var/lib/tactile-rt"),

@@ -39,8 +39,6 @@ from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
 
-__all__ = ["Acquisition", "SourcePart", "keeps_host_time"]
-
 POLL_S = 0.1  # how soon it notices that it should stop
 LOOK_NS = 50_000_000  # between two looks at a device's health
 AWAY_S = 0.3  # how long a source whose device is away may take to end

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 
-__all__ = ["StuckAtDetector", "derive_stuck_at_s"]
-
 LEAST_S = 0.25  # a hiccup of a driver that repeats a sample is no device that hangs
 LEAST_EACH_S = 2.0  # of one element: a firm touch may hold it at the end of its range
 LEAST_PAIRS = 3

@@ -12,8 +12,6 @@ from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Event, Item
 from tactile_rt.daemon.states import Snapshot
 
-__all__ = ["Systemd", "hanging", "status_of"]
-
 TICK_S = 1.0
 SEND_S = 0.2  # a manager that does not read must not keep us
 LEAST_S = 1.0  # a busy host may keep a thread from its turn for less

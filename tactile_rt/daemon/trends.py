@@ -9,8 +9,6 @@ from statistics import median
 
 from tactile_rt.daemon.states import Diagnostic
 
-__all__ = ["Trend", "Trends", "read_resident_bytes"]
-
 EVERY_S, KEPT, FEWEST = 20.0, 90, 10  # of half an hour; in a third of it
 SOON_H = 24.0
 LATER, LATE_MS = 3.0, 5.0  # times as late as before, and at least so late

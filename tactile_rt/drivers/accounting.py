@@ -28,8 +28,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codec import Samples
 
-__all__ = ["Sequencer"]
-
 REMEMBERED = 1024  # samples back that a repeated one is looked for
 HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
 RATE_TOLERANCE = 0.02  # of the nominal rate, when the clock is to tell how many samples passed

@@ -6,8 +6,6 @@ Nothing of a codec is imported here, so that `tactile-rt codecs` answers at once
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["CODECS", "FRAMES", "Entry"]
-
 
 class Entry(NamedTuple):
     """A codec of the catalogue.

@@ -39,8 +39,6 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, SourceStats
 from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Codec, Samples
 
-__all__ = ["DeviceClock", "DeviceTime", "Stamper", "SteadyClock", "host_stamps"]
-
 COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the device's only clock
 FIRST_BUCKET_NS: Final = NS_PER_S // 4  # of each only the promptest arrival is kept
 BUCKETS: Final = 240

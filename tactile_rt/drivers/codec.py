@@ -23,20 +23,6 @@ from tactile_rt.core.settings import no_such
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.catalogue import CODECS
 
-__all__ = [
-    "SIX_AXES",
-    "CanCodec",
-    "CanFrame",
-    "Codec",
-    "Command",
-    "Samples",
-    "SerialCodec",
-    "Step",
-    "WireStats",
-    "codec_class",
-    "six_axis",
-]
-
 SIX_AXES = {**dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my", "mz"), "N m")}
 
 

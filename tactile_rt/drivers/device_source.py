@@ -19,8 +19,6 @@ from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.links import Link
 
-__all__ = ["ArrayChanged", "DeviceOptions", "DeviceSource", "Tap", "device_of", "share_of_changes"]
-
 # Called with each packet as it came and its arrival (host time, ns), and with None whenever the
 # line has been opened. It must be quick: the device is not read meanwhile.
 Tap = Callable[[Any, int], None]

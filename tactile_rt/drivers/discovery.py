@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-__all__ = ["CanBus", "Finding", "Port", "can_buses", "diagnose", "serial_ports", "udev_rules"]
-
 ARPHRD_CAN = 280  # type of a CAN network interface, linux/if_arp.h
 
 # USB (vendor, product; None: any) -> what it is likely to be, and the URL's codec or scheme.

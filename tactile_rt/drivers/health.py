@@ -6,8 +6,6 @@ from enum import StrEnum
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import WireStats
 
-__all__ = ["Health", "Identity", "State"]
-
 
 @dataclass(frozen=True)
 class Identity:

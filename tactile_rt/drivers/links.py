@@ -13,8 +13,6 @@ from tactile_rt.core.errors import ConfigError, SourceError, describe_error
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 
-__all__ = ["CanLink", "Link", "SerialLink", "SlcanLink", "convert_message"]
-
 READ_BYTES = 65_536
 TERMINAL_BYTES = 4095  # that Linux's terminals give at most at a time
 STALLED_S = 0.15  # for so long nobody looked: what has come meanwhile is one packet

@@ -16,11 +16,6 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 
-__all__ = [
-    "TRC_COLUMNS", "AscLines", "Found", "TrcLines", "of_candump", "of_gvret", "of_heard", "of_hex",
-    "of_slcan", "read_csv_line",
-]  # fmt: skip
-
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
     r"(?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"

@@ -24,8 +24,6 @@ from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers import log_lines
 from tactile_rt.drivers.links import convert_message
 
-__all__ = ["CAN_FORMS", "FORMS", "LineLog", "Occurrences", "open_log_file", "read_log"]
-
 CAN_FORMS: Final = ("candump", "slcan", "gvret", "asc", "blf", "trc", "csv", "db")
 BINARY: Final = ("blf", "db")
 FORMS: Final = ("raw", "hex", "terminal", *CAN_FORMS)

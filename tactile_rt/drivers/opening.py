@@ -24,8 +24,6 @@ from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
 
-__all__ = ["CanOptions", "Prepared", "SerialOptions", "make_codec", "open_line"]
-
 
 @dataclass(frozen=True)
 class Prepared:

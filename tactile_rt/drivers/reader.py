@@ -15,8 +15,6 @@ from collections.abc import Iterable, Iterator
 
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-__all__ = ["Reader"]
-
 BLIND_S = 0.005  # how often sources are looked at that have no descriptor to wait for
 LOOK_S = 0.1  # how often each source is: a device is silent only when somebody has looked
 

@@ -12,8 +12,6 @@ from typing import Final
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 
-__all__ = ["SlcanAdapter", "SlcanDecoder", "closing", "encode", "opening"]
-
 CR, BELL = b"\r", b"\a"
 # S7 is 800 kbit/s to LAWICEL and 750 kbit/s to CANable.
 BITRATES: Final = {

@@ -28,19 +28,6 @@ from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import Link, SerialLink
 from tactile_rt.drivers.opening import make_codec, open_line
 
-__all__ = [
-    "LOOK_BYTES",
-    "LOOK_FRAMES",
-    "CodecFit",
-    "Tried",
-    "ask_devices",
-    "hear_bus",
-    "hear_port",
-    "line_speeds",
-    "sniff_bytes",
-    "sniff_frames",
-]
-
 LOOK_BYTES: Final = 65_536
 LOOK_FRAMES: Final = 20_000
 PIECE: Final = 512  # bytes fed at a time

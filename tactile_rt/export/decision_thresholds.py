@@ -39,8 +39,6 @@ from tactile_rt.models.evaluation.measures import (
     split_by_class,
 )
 
-__all__ = ["fit_names", "fit_open_set", "fit_prediction_sets", "fit_rules", "fit_temperature"]
-
 TEMPERATURES = np.geomspace(0.25, 4.0, 81)
 COVERAGE = 0.9
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step

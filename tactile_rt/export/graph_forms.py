@@ -26,8 +26,6 @@ from onnx import TensorProto, helper, numpy_helper
 from tactile_rt.classifier.model_card import StateTensor
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["OUTPUTS", "PRECISIONS", "Precision", "in_precision", "window_graph"]
-
 Precision = Literal["fp32", "fp16", "bf16", "int8"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "fp16", "bf16", "int8")
 BLOCK, LEAST_BLOCK = 128, 16  # inputs that share a scale; onnxruntime wants a power of two

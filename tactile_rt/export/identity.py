@@ -16,8 +16,6 @@ from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation.measures import Floats, Names, Step, cut_windows, run_over
 
-__all__ = ["Doubles", "fit_gaussians", "fit_identity", "identity_thresholds"]
-
 REFUSED = 0.05  # of touches of enrolled objects
 AMONG = (1, 5, 20, 100)  # objects that are enrolled
 FEWEST = 20  # objects below which that share is not measured

@@ -14,8 +14,6 @@ from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.models.evaluation.records import Record
 
-__all__ = ["Subject", "measure_model", "step_times"]
-
 TAIL = "<= 1.3"  # p99 over p50 of every step
 
 

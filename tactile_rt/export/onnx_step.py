@@ -41,16 +41,6 @@ from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.splits import join_manifests, trained_objects
 
-__all__ = [
-    "OPSET",
-    "PARITY_BAR",
-    "export_checkpoint",
-    "export_step",
-    "parity",
-    "step_graph",
-    "write_model",
-]
-
 OPSET = 20
 PARITY_BAR = 1e-5  # largest difference of logits between the file and the torch window
 

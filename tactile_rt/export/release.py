@@ -26,8 +26,6 @@ from tactile_rt.models.evaluation.measures import (
 )
 from tactile_rt.sets.splits import join_manifests
 
-__all__ = ["release"]
-
 
 def release(
     checkpoint: Path,

@@ -23,8 +23,6 @@ from tactile_rt.models.ead import EAD
 from tactile_rt.models.encoders.cells import FORGET_BIAS, Cell, IntersectionCell, State
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 
-__all__ = ["Pointwise", "StreamingGraph", "streaming"]
-
 LARGE = 2**18  # numbers of a convolution's weights, from where on `Pointwise` was the faster form
 WIDE = 256  # features, from where on convolutions were the faster products
 

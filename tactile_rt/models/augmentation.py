@@ -29,16 +29,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.models import published_pictures
 
-__all__ = [
-    "Augmentation",
-    "as_published",
-    "build",
-    "image",
-    "mask_steps",
-    "symmetries",
-    "tactile_paper",
-]
-
 # A symmetry S (a reflection or a rotation of the mount frame) takes element i to the place of
 # element j, whose own direction is R_j x. Loads are in each element's own frame: what j would feel
 # is the image S R_i f of the force, turned by the smallest rotation Q that takes the image of i's

@@ -26,20 +26,6 @@ from tactile_rt.sets.splits import check_labelled, join_manifests
 if TYPE_CHECKING:
     from tactile_rt.models.ead import TactileClassifier
 
-__all__ = [
-    "NETWORK",
-    "begin_from",
-    "describe_checkpoint",
-    "fill_checkpoint",
-    "load_checkpoint",
-    "network_of",
-    "probed_on",
-    "reason",
-    "save_whole",
-    "trained_on",
-    "untrained",
-]
-
 PICKLE = "/data.pkl"  # in the archive, in a folder of any name
 NEEDED = ("model", "network", "config", "spec", "period_ns", "categories", "refusals")
 # of a network's configuration, what a training configuration says

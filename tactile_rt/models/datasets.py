@@ -24,18 +24,6 @@ from tactile_rt.sets.objects import Sweeps, read_split
 from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sets.splits import join_manifests, read_manifests
 
-__all__ = [
-    "NOISE_LEVELS",
-    "SweepSet",
-    "check_sets",
-    "drawn_as",
-    "joined",
-    "of_categories",
-    "read_splits",
-    "relabelled",
-    "windows",
-]
-
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets
 
 

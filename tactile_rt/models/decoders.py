@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-__all__ = ["HIDDEN", "KINDS", "LinearDecoder", "MLPAllDecoder", "MLPDecoder"]
-
 HIDDEN = (1024, 512)  # at width 1
 
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
 
-__all__ = ["CLEAN", "OFFSET", "RATED", "Disturbance"]
-
 OFFSET = 2.0  # a unit of offset that appears after the baseline, in units of the rated noise
 
 Floats = NDArray[np.float32]

@@ -6,19 +6,6 @@ from dataclasses import dataclass
 from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError, name_some
 
-__all__ = [
-    "ATTENDERS",
-    "CELLS",
-    "DECODERS",
-    "ENCODERS",
-    "MAX_STEPS",
-    "MOUSE_FRAME",
-    "READOUTS",
-    "EADConfig",
-    "added_cells",
-    "encoder_class",
-]
-
 # of `encoders.cells`
 CELLS = (
     "timedecay", "timedecay-ln", "vanilla", "vanilla-ln", "vanilla-elu", "vanilla-elu-ln", "ugrnn",

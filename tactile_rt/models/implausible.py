@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.stream import ArraySpec
 
-__all__ = ["IMPLAUSIBLE", "implausible"]
-
 Samples = NDArray[np.float32]  # (sweep, ..., element, channel), SI
 
 AXES = "xyz"

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier import contact
 
-__all__ = ["Onsets", "find_onsets"]
-
 BATCH = 128  # sweeps at a time: their histories should stay in the cache
 
 

@@ -16,8 +16,6 @@ import torch
 from torch import Generator, Tensor
 from torch.nn import functional as F
 
-__all__ = ["COLOURS", "JITTERS", "Draw", "Jitter", "as_drawn", "augment"]
-
 COLOURS = 3
 JITTER_CHANCE, GREY_CHANCE, HALF = 0.8, 0.2, 0.5
 SIGMA = (0.1, 2.0)  # of the blur, in cells

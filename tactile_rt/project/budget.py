@@ -22,8 +22,6 @@ from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.transducer import device_spec
 
-__all__ = ["Budget", "budget_sweeps", "described", "read_budget", "sized", "write_budget"]
-
 SWEEPS_SHARE = 0.45  # of the time given; training has as much, and the rest is for the report
 PILOTS = 5  # sweeps that are timed
 AT_ONCE = 0.85  # what a further core adds

@@ -41,8 +41,6 @@ from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.transducer import device_spec, sensor_drift, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
 
-__all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
-
 RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
 NO_NAME = re.compile(r"[^\w.+-]+")  # what a URL or a file in TOML would take for something else

@@ -44,8 +44,6 @@ from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.views.contact_sheet import write_contact_sheet
 from tactile_rt.sim_backend.world import PROFILES
 
-__all__ = ["MakeProgress", "make", "preview_sweeps"]
-
 LEAST_MINUTES = 1.0
 SWEPT_BY = 0.48  # of the time given, even where sweeps take longer than those that were timed
 TRAINED_BY = 0.87  # of the time given: the rest is for export, evaluation and report

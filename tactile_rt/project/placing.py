@@ -12,8 +12,6 @@ from tactile_rt.sim_backend.sweep import Sweep, centrelines, draw_sweep, usual_d
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
 
-__all__ = ["ObjectPlacing", "place_objects"]
-
 SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
 ABOUT_MM = 6.0  # how far an object of 40 mm passes above or below the middle of the tips
 NEARER = (1.0, 0.8, 0.6, 0.45, 0.3)  # shares of the usual distance, tried in turn

@@ -21,8 +21,6 @@ from tactile_rt.sets.manifest import SPLITS, SweepManifest, has_object
 from tactile_rt.sim_backend.datasets.inventory import tally
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 
-__all__ = ["confused", "write_report"]
-
 HEADLINES = {
     "top-1": "right on objects it never met, no sensor noise",
     "top-1 at rated noise": "the same, with the noise that the sensor is rated at",

@@ -29,8 +29,6 @@ from tactile_rt.recording import lerobot_meta as meta
 from tactile_rt.recording.conversion import about_text
 from tactile_rt.recording.reader import Recording
 
-__all__ = ["write_dataset"]
-
 STATE = "observation.state"
 TACTILE = "observation.tactile"
 COUNT = f"{TACTILE}.count"

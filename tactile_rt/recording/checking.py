@@ -23,8 +23,6 @@ from tactile_rt.recording.layout import WIRE
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.replay import prepare_replay
 
-__all__ = ["check_decisions", "compare_decoding", "file_of_model", "live_model", "samples_given"]
-
 FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
          "prediction_set", "coverage", "names", "names_coverage",
          "object", "object_margin", "object_touches")  # fmt: skip

@@ -42,8 +42,6 @@ from tactile_rt.recording.writer import McapFile
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
-__all__ = ["about_text", "convert", "write_bag"]
-
 COLUMNS = ("seq", "t_ns", "values", "valid")
 BLOCK = 1 << 14  # samples that are written at once
 PIECE = 1024  # samples that HDF5 stores together, with a checksum

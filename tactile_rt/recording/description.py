@@ -13,17 +13,6 @@ from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.device_source import device_of
 
-__all__ = [
-    "METADATA",
-    "RECOVERED",
-    "SESSION",
-    "SUMMARY",
-    "Description",
-    "describe",
-    "seal",
-    "utc_offset_ns",
-]
-
 LAYOUT_VERSION = "3"
 METADATA, SESSION, SUMMARY, RECOVERED = "tactile_rt", "session", "summary", "recovered"
 

@@ -21,8 +21,6 @@ from tactile_rt.recording.touches import REST
 from tactile_rt.sets.manifest import RECORDED_VERSION, RECORDINGS, SPLITS, UNLABELLED, SweepManifest
 from tactile_rt.sets.objects import write_object
 
-__all__ = ["SHARES", "check_shares", "write_set"]
-
 SHARES = (0.7, 0.15, 0.15)  # of the objects of each category, by split
 ENOUGH = 3  # recordings of a label that may be its objects, one for each split
 DIGITS = 6  # of a recording's checksum, in the names of its objects

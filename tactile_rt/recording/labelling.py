@@ -26,16 +26,6 @@ from tactile_rt.recording.replay import prepare_replay
 from tactile_rt.recording.touches import RecordedTouch, find_touches
 from tactile_rt.sets.manifest import UNLABELLED, SweepManifest
 
-__all__ = [
-    "LabelledTouch",
-    "LabelledTouches",
-    "find_labelled",
-    "intervals_beside",
-    "intervals_by_name",
-    "intervals_of_all",
-    "like",
-]
-
 PERIOD_NS = 9_000_000  # of a set's samples, unless the sensor is slower
 TELL_NS = NS_PER_S  # of the stream, between reports of how far it is
 # why a touch is not used, besides those of `touches`

@@ -23,21 +23,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer, open_regular, sync_folder, write_whole
 from tactile_rt.core.settings import check_columns, convert, nearest, read_csv, refusal
 
-__all__ = [
-    "LABELS",
-    "LabelledInterval",
-    "append_label",
-    "check_appendable",
-    "check_name",
-    "drop_torn_label",
-    "label_of_file",
-    "lines_of",
-    "read_labels",
-    "relabel",
-    "relabel_line",
-    "remove_label",
-]
-
 LABELS = "labels.csv"  # beside the recordings
 NEEDED = ("start_s", "end_s", "label")
 COLUMNS = ("recording", *NEEDED, "object")

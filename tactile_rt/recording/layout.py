@@ -14,23 +14,6 @@ import numpy as np
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame
 
-__all__ = [
-    "DECISIONS",
-    "EVENTS",
-    "HEALTH",
-    "SAMPLES",
-    "WIRE",
-    "Packet",
-    "Raw",
-    "decode_packet",
-    "decode_samples",
-    "encode_packet",
-    "encode_samples",
-    "is_samples",
-    "last_ns",
-    "samples_in",
-]
-
 SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
 DECISIONS, EVENTS = "decisions", "events"  # of the daemon, in its messages
 

@@ -17,19 +17,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.packages import require_extra
 
-__all__ = [
-    "DATA",
-    "FRAME",
-    "CameraFilm",
-    "Episode",
-    "Statistics",
-    "describe_feature",
-    "film_of",
-    "import_pyarrow",
-    "write_film",
-    "write_meta",
-]
-
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 CODEC = "libx264"
 OPTIONS = {"g": "2", "crf": "20"}  # as LeRobot: any frame is found within two

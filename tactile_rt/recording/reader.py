@@ -18,8 +18,6 @@ from tactile_rt.recording.ros2_form import is_in_file_form, name_channel, plain
 if TYPE_CHECKING:
     from tactile_rt.recording.records import Record
 
-__all__ = ["Recording", "is_finished"]
-
 FOOTER = b"\x02" + (20).to_bytes(8, "little")  # its opcode and length
 FOOTER_BYTES = len(FOOTER) + 20 + len(MAGIC)
 

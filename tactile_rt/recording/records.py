@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     Record = Channel | Message | Metadata
 
-__all__ = ["MAGIC", "read_records", "read_whole_records"]
-
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 1, 2, 3, 4, 5, 6, 12, 15
 

@@ -17,8 +17,6 @@ from tactile_rt.recording.writer import McapFile, check_not_recorded
 if TYPE_CHECKING:
     from tactile_rt.recording.records import Record
 
-__all__ = ["recover"]
-
 MOST_NONE = 1000  # messages that are none, after which the file is no damaged recording
 
 

@@ -34,8 +34,6 @@ from tactile_rt.recording.records import MAGIC
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_object
 
-__all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "prepare_replay"]
-
 # Six objects sweep past simulated whiskers, see bench/write_demo.py: `replay:demo`.
 DEMO = Path(__file__).parents[1] / "assets" / "demo.mcap"
 NPZ = b"PK"  # how it begins

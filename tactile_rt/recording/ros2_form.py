@@ -8,18 +8,6 @@ from tactile_rt.recording import layout
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import CDR
 
-__all__ = [
-    "ARRAY",
-    "CHANNELS",
-    "PREFIX",
-    "TEXTS",
-    "WRENCH",
-    "is_in_file_form",
-    "name_channel",
-    "plain",
-    "put_in_form",
-]
-
 ARRAY, WRENCH = "array", "wrench"
 # In the order in which they are numbered, by which a file is recovered whose beginning is damaged.
 CHANNELS = {

@@ -18,8 +18,6 @@ from tactile_rt.core.stream import NS_PER_S, Source
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.writer import RecordingWriter
 
-__all__ = ["Rotation"]
-
 MB = 1e6
 SUFFIX = ".mcap"
 

@@ -23,8 +23,6 @@ from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Syncer
 from tactile_rt.recording.writer import RecordingWriter, WriterStats
 
-__all__ = ["StreamWriter"]
-
 WAKE_S = 0.05  # how often the thread looks: what a recording is late by, at most
 SYNC_S = 1.0
 FLUSH_S = 0.5  # with the wake and a slow write still well under the second that may be lost

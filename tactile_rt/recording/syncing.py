@@ -9,8 +9,6 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import NamedTuple
 
-__all__ = ["Extent", "Syncer"]
-
 
 class Extent(NamedTuple):
     """How much of a recording there is, up to some moment."""

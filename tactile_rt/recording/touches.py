@@ -25,8 +25,6 @@ from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.stream import ArraySpec, Chunk, Timing
 
-__all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]
-
 REST = 2 * contact.BASELINE_SAMPLES  # before the onset: a whole baseline, measured on a whole one
 SURE = contact.FIRST_GUARD_SAMPLES  # by which an onset may be found elsewhere than in the stream
 # why a touch is none to learn from

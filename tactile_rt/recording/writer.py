@@ -47,8 +47,6 @@ from tactile_rt.recording.ros2.cdr import schema_text, token
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, PREFIX, put_in_form
 from tactile_rt.recording.syncing import Extent, Syncer
 
-__all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats", "check_not_recorded"]
-
 SEQUENCES = 1 << 32
 PART = ".mcap.part"  # ends the name of a file until it says what it is of
 

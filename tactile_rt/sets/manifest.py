@@ -20,18 +20,6 @@ from tactile_rt.core.stream import ArraySpec, Timing
 from tactile_rt.core.stream.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.sets.sensor_faults import SensorFaults
 
-__all__ = [
-    "OUTLIERS",
-    "RECORDED_VERSION",
-    "RECORDINGS",
-    "SPLITS",
-    "UNLABELLED",
-    "WITHHELD",
-    "SweepManifest",
-    "has_object",
-    "object_path",
-]
-
 SET_VERSION = 2
 RECORDED_VERSION = 3  # of recordings: who does not know them would add their noise again
 READABLE = (SET_VERSION, RECORDED_VERSION)

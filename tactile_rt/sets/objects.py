@@ -17,17 +17,6 @@ from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import check_no_pointer, write_whole
 from tactile_rt.sets.manifest import CONTACTS, SKIPPED, SweepManifest, has_object, object_path
 
-__all__ = [
-    "Sweeps",
-    "read_arrays",
-    "read_object",
-    "read_skipped",
-    "read_split",
-    "read_sweeps",
-    "write_object",
-    "write_skipped",
-]
-
 
 @dataclass(frozen=True)
 class Sweeps:

@@ -8,8 +8,6 @@ from dataclasses import dataclass, fields
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["SensorFaults"]
-
 LARGEST = 100.0  # of amounts: beyond it is a slip of the pen
 
 

@@ -8,16 +8,6 @@ from typing import Any
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.sets.manifest import OUTLIERS, SPLITS, UNLABELLED, WITHHELD, SweepManifest
 
-__all__ = [
-    "check_labelled",
-    "check_split",
-    "join_manifests",
-    "merge_categories",
-    "read_manifests",
-    "split_by_object",
-    "trained_objects",
-]
-
 
 def split_by_object(
     categories: Sequence[str], objects: int, validation: int, test: int

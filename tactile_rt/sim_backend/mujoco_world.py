@@ -27,16 +27,6 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 
-__all__ = [
-    "CONTACT_CHANNELS",
-    "UNSTABLE",
-    "ContactProbe",
-    "MujocoWorld",
-    "add_piece",
-    "contact_distances",
-    "sweep_model",
-]
-
 # Additive, so that they can be averaged over time as loads are.
 CONTACT_CHANNELS = ("touching", "normal force, N", "normal force x arc length, N m")
 TOUCHING_SHARE = 0.5  # of a sample's time

@@ -14,8 +14,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 
-__all__ = ["Randomisation"]
-
 MATERIAL = ("young_modulus", "density", "damping_ratio", "friction")
 SHAPE = ("length", "radius", "curvature")
 

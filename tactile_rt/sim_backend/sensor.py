@@ -19,8 +19,6 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.sensor_model import SensorModel
 
-__all__ = ["Sensor"]
-
 log = logging.getLogger("tactile_rt.sim_backend")
 
 # Cross-talk between forces and moments needs a length to be a fraction: 10 mm, the ratio of the

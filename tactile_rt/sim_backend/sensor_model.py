@@ -4,8 +4,6 @@ from dataclasses import dataclass, fields
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["SensorModel"]
-
 DEAD = ("dead_probability", "dead_row_probability")
 LARGEST = 1e6  # of any value: beyond it time stamps and single precision overflow
 

@@ -49,15 +49,6 @@ from tactile_rt.sim_backend.world import (
     stamp_samples,
 )
 
-__all__ = [
-    "CHUNK_SAMPLES",
-    "PacedOptions",
-    "PacedSource",
-    "SimOptions",
-    "SimSource",
-    "compile_simulator",
-]
-
 log = logging.getLogger("tactile_rt.sim_backend")
 CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")

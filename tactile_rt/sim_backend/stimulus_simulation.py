@@ -33,8 +33,6 @@ from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS, stamp_samples
 
-__all__ = ["Surface", "whisk_against", "write_input"]
-
 # Middle of the close surfaces' faces, from the array's origin (see `whisking.HEAD`), mm.
 CLOSE = {"convex": (17.26, 0.68, 1.46), "concave": (24.27, -5.37, 1.46)}
 PERIOD_NS = 9_000_000  # of the model input

@@ -19,18 +19,6 @@ from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, rotation
 
-__all__ = [
-    "EARTH",
-    "Sweep",
-    "centrelines",
-    "draw_sweep",
-    "faces_right",
-    "usual_distance",
-    "usual_size",
-    "way_to_contact",
-    "within_reach",
-]
-
 SPACING_MM = 0.25
 TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off the centreline
 PASSED_BY_MM = 0.5  # a miss by less is simulated

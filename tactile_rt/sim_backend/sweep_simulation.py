@@ -26,8 +26,6 @@ from tactile_rt.sim_backend.sweep import (
 )
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, engine_of
 
-__all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation", "ringing"]
-
 TOO_MUCH = 1.1  # a damping ratio so many times the wanted one is told
 FINER = ("dataset", "accurate")
 FAR_MM = 200.0  # where the object is when the way to first contact is measured

@@ -17,8 +17,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import convert, read_csv
 from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
 
-__all__ = ["ANGLES", "Trajectory", "Whisk", "base_angles", "coupled", "mirror", "read_trajectory"]
-
 # d phi / d theta and d zeta / d theta of rows A-E (Knutsen et al. 2008, Neuron)
 ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
 TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)

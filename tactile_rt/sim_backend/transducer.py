@@ -17,8 +17,6 @@ from tactile_rt.core.stream.sensor_spec import FIELD, MagnetSpec, SensorSpec, ch
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.world import SAMPLE_MS, world_spec
 
-__all__ = ["FASTEST_HZ", "Transducer", "device_spec", "dipole_field", "sensor_drift", "sensor_of"]
-
 FORCES_MOMENTS = 6
 MU0_4PI = 1e-7  # of the vacuum's permeability, T m / A
 FASTEST_HZ = 1e3 / SAMPLE_MS

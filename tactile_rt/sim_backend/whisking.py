@@ -27,8 +27,6 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 
-__all__ = ["ENDLESS", "HEAD", "WhiskSimulation"]
-
 # Head of the published whisking simulations (Chung et al. 2025, code): its "pitch" of 15 degrees is
 # about the rostral axis there, right side down. The world's origin is that of the array: x to the
 # right, y rostral, z up.

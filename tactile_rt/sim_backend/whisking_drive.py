@@ -20,8 +20,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
 from tactile_rt.sim_backend.trajectories import coupled
 
-__all__ = ["FASTEST_HZ", "LAG_S", "LARGEST_RAD", "MOST", "STEEPEST", "Drive", "Whisking"]
-
 LAG_S: Final = 0.04
 FASTEST_HZ: Final = 30.0  # a mouse explores at up to 25
 LARGEST_RAD: Final = 1.05  # 60 degrees to either side of rest

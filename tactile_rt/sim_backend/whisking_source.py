@@ -22,8 +22,6 @@ from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec, stamp_samples
 
-__all__ = ["Placing", "WhiskingOptions", "WhiskingSource", "parse_point"]
-
 LARGEST_MM = 1e3  # of an object and its position
 
 

@@ -10,8 +10,6 @@ from contextlib import suppress
 
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-__all__ = ["chunks"]
-
 LOOK_S = 0.1  # how often a source is looked at though nothing has come
 
 

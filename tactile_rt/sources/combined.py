@@ -42,8 +42,6 @@ from tactile_rt.core.stream import (
 from tactile_rt.drivers.opening import Prepared
 from tactile_rt.sources.opening import check_source, open_source
 
-__all__ = ["CombinedSource", "MemberArray", "combine_specs", "prepare_combined"]
-
 LATEST_NS = NS_PER_S // 5  # an array that lags so far is left out: its elements are invalid
 SLICE_S = 0.005
 

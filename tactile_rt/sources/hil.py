@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.faults import FaultSchedule
     from tactile_rt.drivers.health import Health
 
-__all__ = ["Loop", "LoopReport", "check_line", "named_right", "pair"]
-
 WIRES: Final = ("serial", "slcan", "virtual")
 SAME_LABEL: Final = 0.99  # of the decisions, where the format rounds
 START_S: Final = 30.0  # for a simulation to build its world before the first sample

@@ -23,8 +23,6 @@ from tactile_rt.core.settings import nearest, split_url, take_options
 from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.opening import Prepared
 
-__all__ = ["SCHEMES", "check_model", "check_source", "is_made_up", "open_source"]
-
 # scheme: (module, name, extra that it needs). The name is of a class of the target and an `Options`
 # dataclass that it names, which may have a `check` of both for what can be told without opening,
 # the array for one; or of a function of the target and the options as written, which checks both

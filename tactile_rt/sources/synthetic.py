@@ -18,8 +18,6 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
-__all__ = ["SyntheticOptions", "SyntheticSource", "synthetic_spec"]
-
 COLUMNS = 7  # of the grid that the whiskers stand on
 PITCH_M = 0.002
 CHUNK_S = 0.009

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
 
-__all__ = ["FeatureNetwork"]
-
 KERNELS = 256
 TAPS = 9
 DILATIONS = (1, 2, 4, 8)  # samples between taps

@@ -16,16 +16,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "ENOUGH",
-    "FEWEST",
-    "LeaveOneOut",
-    "TouchClasses",
-    "count_refused",
-    "fit_classes",
-    "leave_one_out",
-]
-
 FEWEST = 2  # touches of a class
 AXES = 16  # directions in which touches of a class differ
 SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction

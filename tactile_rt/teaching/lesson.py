@@ -32,19 +32,6 @@ from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
 from tactile_rt.teaching.model import TOUCH, Enrolment, FewShot, write_features
 
-__all__ = [
-    "ANYTHING_ELSE",
-    "BEFORE_NS",
-    "FEATURES",
-    "MODEL",
-    "NAMING",
-    "ORDERS",
-    "Lesson",
-    "LessonProgress",
-    "TaughtTouch",
-    "check_label",
-]
-
 ORDERS = ("next", "undo", "done", "list")  # to a teacher; another word is the label from now on
 NAMING = ("forget", "rename")  # those with names after them
 FEATURES, MODEL = "features.onnx", "model.onnx"

@@ -10,8 +10,6 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["Listener", "find_motion", "measure_changes", "measured_floor"]
-
 HASTY_NS = 200_000_000  # after the end of a contact, within which another is not a touch of its own
 FELT = 6.0  # times the noise, for two samples running, is felt
 LONG_AGO_NS = 2**62

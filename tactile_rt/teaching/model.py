@@ -32,14 +32,6 @@ from tactile_rt.teaching import head
 from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph, with_metadata
 
-__all__ = [
-    "FASTEST_NS",
-    "TOUCH",
-    "Enrolment",
-    "FewShot",
-    "write_features",
-]
-
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
 LARGER, NOISES = 3.0, 1e3  # times the largest load felt, or the noise, that may come later

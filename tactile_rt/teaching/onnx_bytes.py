@@ -13,8 +13,6 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from tactile_rt.classifier.onnx_check import split_fields
 
-__all__ = ["OnnxGraph", "with_metadata"]
-
 IR_VERSION, OPSET = 10, 20
 PRODUCER = "tactile_rt"
 FLOAT, INT, STRING, INTS = 1, 2, 3, 7  # kinds of attributes

@@ -9,8 +9,6 @@ import msgspec
 from tactile_rt.daemon.http import HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.page.routes import HEADERS, LIMITS, Guard, json_body, only
 
-__all__ = ["TeachingPage"]
-
 MAX_ORDER = 200  # characters
 STATIC = {
     "/": ("index.html", "text/html; charset=utf-8"),

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.teaching.lesson import ANYTHING_ELSE, NAMING, Lesson, LessonProgress, check_label
 
-__all__ = ["Teacher"]
-
 ELSE_S = 20.0  # for touches of anything else
 LONG = 9  # digits: more are no class's number
 

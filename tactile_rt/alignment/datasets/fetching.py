@@ -25,8 +25,6 @@ from tactile_rt.core.files import write_whole
 if TYPE_CHECKING:
     import urllib3
 
-__all__ = ["connections", "counted", "fetch", "published_files"]
-
 UNITS = ("spike_times", "spike_times_index", "depth", "inhibitory")
 BLOCK = 1 << 16  # bytes
 KEPT = 1 << 10  # blocks

@@ -9,8 +9,6 @@ from tactile_rt.alignment.neural import by_animal
 from tactile_rt.alignment.nwb import find_nwb
 from tactile_rt.alignment.stimuli_input import StimuliInput
 
-__all__ = ["DANDI_000231", "EXAMPLE"]
-
 
 def _read(
     paths: Sequence[Path], stimuli: StimuliInput, progress: Callable[[float], None]

@@ -19,8 +19,6 @@ from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.rdm import UPPER, Floats, pearson
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["crossnobis", "distances", "shrunk_covariance"]
-
 
 def crossnobis(animal: Animal) -> Measure:
     """Correlation of a layer's squared distances with an animal's cross-validated ones."""

@@ -22,8 +22,6 @@ from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = ["PENALTIES", "linear", "predicted"]
-
 PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel's diagonal
 
 

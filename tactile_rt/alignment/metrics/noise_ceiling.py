@@ -12,16 +12,6 @@ from tactile_rt.alignment.rdm import Floats
 from tactile_rt.alignment.reliability import spearman_brown
 from tactile_rt.core.stream.stimuli import STIMULI
 
-__all__ = [
-    "bins_of",
-    "ceiling_of",
-    "divisions",
-    "half_means",
-    "means_of",
-    "sessions_of",
-    "values_of",
-]
-
 DIVISIONS = 100
 SEED = 1234
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two in each half

@@ -20,8 +20,6 @@ from tactile_rt.alignment.metrics import Measure, noise_ceiling
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import UPPER, Floats, pearson, rdm
 
-__all__ = ["NOTHING", "cka", "cosine", "mean_pattern", "rsa", "rsa_time", "time_course"]
-
 NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # of an animal that has too little
 
 

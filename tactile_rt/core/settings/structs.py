@@ -26,8 +26,6 @@ import msgspec
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.settings.tree import SettingNode, named
 
-__all__ = ["convert", "hint", "is_list", "is_text", "nearest", "no_such", "refusal", "types_of"]
-
 UNITS = {"_s": "seconds", "_ms": "milliseconds", "_mb": "megabytes", "_hz": "hertz"}
 ALIKE = (  # units that one may take for another
     ("s", "ms", "us", "ns", "sec", "seconds", "min", "minutes", "h", "hours"),

@@ -14,17 +14,6 @@ from typing import Any
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "SettingNode",
-    "find_lines",
-    "make_node",
-    "named",
-    "parse_toml",
-    "plain_value",
-    "read_text",
-    "read_toml",
-]
-
 LARGEST = 1 << 26  # bytes of a file that people write, or have a program write for them
 # Strings and comments, in which a bracket or a line's end means nothing; and what ends a statement.
 TOKEN = re.compile(

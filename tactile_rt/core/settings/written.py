@@ -20,17 +20,6 @@ from tactile_rt.core.settings.structs import (
 )
 from tactile_rt.core.settings.tree import SettingNode, make_node, named, plain_value, read_text
 
-__all__ = [
-    "CsvTable",
-    "check_columns",
-    "read_csv",
-    "set_key",
-    "set_keys",
-    "split_url",
-    "take_options",
-    "take_sets",
-]
-
 LONGEST_URL = 4096  # characters
 NAMES = ("name", "kind")  # keys that an item of a list goes by
 

@@ -16,16 +16,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream import NS_PER_S, ArraySpec
 
-__all__ = [
-    "CHANNEL_FLOOR",
-    "LOADS",
-    "ChannelLimits",
-    "ChannelSpec",
-    "MagnetSpec",
-    "SensorSpec",
-    "channel_limits",
-]
-
 # What a sensor can be sensitive to: the base loads, N and N m, and by how much the base of a
 # whisker whose mount gives is turned about the element's y and z, rad.
 LOADS = {

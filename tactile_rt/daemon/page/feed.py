@@ -20,8 +20,6 @@ from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, message_of
 
-__all__ = ["FEED_VERSION", "Feed", "Line", "array_line", "map_axes"]
-
 FEED_VERSION = 1
 FRAME_S = 0.024  # with the gathering, some thirty a second
 KEPT_EVENTS, KEPT_DECISIONS = 40, 160

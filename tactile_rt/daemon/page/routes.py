@@ -25,17 +25,6 @@ from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.daemon.http import HttpLimits, Refused, Request, Response
 from tactile_rt.daemon.page.feed import Line
 
-__all__ = [
-    "HEADERS",
-    "LIMITS",
-    "MAX_STREAMS",
-    "Guard",
-    "PageClient",
-    "PageRoutes",
-    "json_body",
-    "only",
-]
-
 LIMITS = HttpLimits(connections=64, head_bytes=16384, head_s=10.0, send_s=20.0)
 MAX_STREAMS = 16
 MAX_BODY, BODY_S = 2048, 5.0

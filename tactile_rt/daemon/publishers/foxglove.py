@@ -48,8 +48,6 @@ from tactile_rt.daemon.publishers.sending import (
     tell_exposed,
 )
 
-__all__ = ["FoxgloveOptions", "FoxglovePublisher", "schema_of"]
-
 REPEAT_S = 1.0  # whoever comes late sees the array after so long
 LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "error": LogLevel.Error}
 

@@ -10,8 +10,6 @@ from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import Message, encode, message_of, state_message
 from tactile_rt.daemon.publishers.sending import Publisher, StateSeconds
 
-__all__ = ["JsonlOptions", "JsonlPublisher"]
-
 TOGETHER = 64  # messages in one write
 
 

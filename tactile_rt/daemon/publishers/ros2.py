@@ -38,8 +38,6 @@ from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import SIMPLE, dds_type, fields_of, token
 
-__all__ = ["Ros2Options", "Ros2Publisher"]
-
 OF_SOURCE = {
     "samples": messages.SAMPLES, "wrench": messages.WRENCH, "decision": messages.DECISION,
     "contact": messages.EVENT, "skip": messages.EVENT,

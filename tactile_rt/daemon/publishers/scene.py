@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.stream import ArraySpec, rotation_matrices
 
-__all__ = ["Scene", "force_columns", "turn_x_to"]
-
 FORCES = ("fx", "fy", "fz")
 SINGLE_M = 0.05  # extent of an array of one element
 LIFETIME_S = 1  # after which an arrow of a source that is silent goes

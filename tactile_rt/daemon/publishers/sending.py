@@ -29,21 +29,6 @@ from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
 
-__all__ = [
-    "ConnectionLimit",
-    "Connections",
-    "Due",
-    "ListenerOptions",
-    "Prefix",
-    "Publisher",
-    "Sender",
-    "SenderOptions",
-    "StateSeconds",
-    "is_port",
-    "repeat_messages",
-    "tell_exposed",
-]
-
 LOOK_S: Final = 0.1  # on loopback, some thousand may come meanwhile
 BYE_S: Final = 0.2
 AGAIN_S: Final = 0.002  # while they come

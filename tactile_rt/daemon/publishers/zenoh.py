@@ -20,8 +20,6 @@ from tactile_rt.daemon.publishers.sending import (
     tell_exposed,
 )
 
-__all__ = ["ZenohOptions", "ZenohPublisher"]
-
 ON_PORTS = ("tcp", "udp", "tls", "quic", "ws")
 DROP = zenoh.CongestionControl.DROP
 

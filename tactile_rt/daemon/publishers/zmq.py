@@ -18,8 +18,6 @@ from tactile_rt.daemon.publishers.sending import (
     tell_exposed,
 )
 
-__all__ = ["ZmqOptions", "ZmqPublisher"]
-
 LINGER_MS = 200  # how long what was sent last may take to leave
 
 

@@ -12,8 +12,6 @@ from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame, Command, SampleBatch, Step, six_axis
 from tactile_rt.drivers.codecs.framing import CodecOfParts
 
-__all__ = ["Aft200", "Aft200Options"]
-
 COMMAND_ID: Final = 0x102
 BIAS, TRANSMIT, PERIOD = 2, 3, 5  # second byte of a command
 XYZ: Final = struct.Struct(">3H")

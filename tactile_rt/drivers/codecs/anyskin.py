@@ -19,8 +19,6 @@ from tactile_rt.drivers.codecs.ascii_mapping import Element
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD
 
-__all__ = ["AnySkin", "AnySkinOptions"]
-
 CHIPS: Final = 5  # of the board whose places are known
 BYTES: Final = 16  # of a chip
 ABSENT: Final = -998.1  # C, a chip that does not answer: raw temperature 0

@@ -28,8 +28,6 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
 )
 from tactile_rt.drivers.codecs.ascii_text import Names, fields, is_text, number, quoted
 
-__all__ = ["AsciiLine", "AsciiLineOptions"]
-
 TICK_NS: Final = {"s": 1e3, "iso": 1e3, "ms": 1e6, "us": 1e3, "ns": 1.0}
 NEVER_WRAPS: Final = 62  # bits, for a time in seconds
 EXACT: Final = 2.0**53  # whole numbers up to here are exact

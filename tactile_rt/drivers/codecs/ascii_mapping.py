@@ -35,18 +35,6 @@ from tactile_rt.core.settings import convert, nearest, read_toml, refusal
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.column_words import expand_columns
 
-__all__ = [
-    "UNITS",
-    "ArrayTable",
-    "Column",
-    "Element",
-    "LineMapping",
-    "array_of",
-    "order_columns",
-    "parse_columns",
-    "read_mapping",
-]
-
 VERSION: Final = 1
 MOST_BITS: Final = 53  # of a counter: what a float64 holds
 

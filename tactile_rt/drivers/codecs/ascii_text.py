@@ -11,8 +11,6 @@ from typing import Any, Final
 
 import msgspec
 
-__all__ = ["Names", "fields", "in_seconds", "is_text", "number", "quoted"]
-
 NAN: Final = float("nan")
 # What boards print in place of a number; ovf is Arduino's for what is over 4e9.
 MISSING: Final = frozenset(

@@ -26,8 +26,6 @@ from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import SIX_AXES, Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import seal_modbus
 
-__all__ = ["Ati485", "Ati485Options"]
-
 SIZE: Final = 13
 ORDER: Final = np.array([0, 2, 4, 1, 3, 5])  # the gauges as they come
 STREAM: Final = b"\x46\x55"  # Modbus function and its argument

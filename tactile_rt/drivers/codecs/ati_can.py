@@ -21,8 +21,6 @@ from tactile_rt.drivers.codec import (
     six_axis,
 )
 
-__all__ = ["AtiCan", "AtiCanOptions"]
-
 # the low four bits of an identifier; a request and its first reply have the same
 GAUGES_A, GAUGES_B, ROW_A, ROW_B, ROW_C = range(5)
 CALIBRATION, COUNTS, UNITS = 6, 7, 8

@@ -19,15 +19,6 @@ from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
 from tactile_rt.drivers.codecs.frame_mapping import FrameMapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
 
-__all__ = [
-    "BinaryFrame",
-    "BinaryFrameOptions",
-    "DescribedFrame",
-    "FrameOptions",
-    "frame_codec",
-    "shipped_frame",
-]
-
 DISTINCT = 4  # bytes of an ending that no measurement has
 
 

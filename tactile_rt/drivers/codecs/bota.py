@@ -17,8 +17,6 @@ from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import Values
 
-__all__ = ["Bota", "BotaOptions"]
-
 BAUDS: Final = {9600: 0, 57_600: 1, 115_200: 2, 230_400: 3, 460_800: 4}
 SINC_S: Final = 19.53125e-6  # of time between samples, for each unit of the sinc filter's length
 LEAST_SINC, LARGEST_SINC = 51, 512

@@ -15,8 +15,6 @@ from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, S
 from tactile_rt.drivers.codecs.dbc_file import FramePart, Signal, read_mapping
 from tactile_rt.drivers.codecs.framing import Rounds
 
-__all__ = ["CanDbc", "CanDbcOptions"]
-
 
 @dataclass(frozen=True)
 class CanDbcOptions:

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
 from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 
-__all__ = ["guess_columns", "guess_line_columns", "list_unread_units"]
-
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
 MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers

@@ -15,8 +15,6 @@ from typing import Final
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["compress_columns", "expand_columns"]
-
 MOST: Final = 100_000  # columns of a line
 _RANGE: Final = re.compile(r"\{(\d{1,6})\.\.(\d{1,6})\}")
 _NUMBER: Final = re.compile(r"\d{1,6}")

@@ -24,8 +24,6 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
 
-__all__ = ["DbcMapping", "FramePart", "Signal", "read_mapping"]
-
 LARGEST: Final = 1e30  # reading that an integer of a frame may stand for
 FLOATS: Final = {16: ">e", 32: ">f", 64: ">d"}
 

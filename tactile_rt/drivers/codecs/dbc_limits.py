@@ -10,8 +10,6 @@ from typing import Final
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["DEEPEST", "MOST_BYTES", "check_dbc"]
-
 MOST_BYTES: Final = 1 << 20  # of the file; 20,000 signals, a second
 MOST_FRAME: Final = 64  # bytes of a CAN FD frame
 MOST_MESSAGES: Final = 10_000

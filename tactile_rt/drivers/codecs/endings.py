@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import WireStats
 
-__all__ = ["EndFinder", "Found", "StrideFinder"]
-
 GAP: Final = 16  # frames without an ending, then what comes is not this device's
 FIRST: Final = 2  # frames in a row that must fit before any is believed
 MOST: Final = 8  # frames to wait for while several places fit

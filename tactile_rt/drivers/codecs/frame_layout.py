@@ -17,8 +17,6 @@ from tactile_rt.drivers.codecs.ascii_mapping import UNITS, Column, array_of
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD, FrameCounter, FrameMapping, Values
 from tactile_rt.drivers.codecs.framing import crc16_modbus, crc16_x25, crc16_xmodem
 
-__all__ = ["CHECKSUMS", "Block", "FrameLayout", "Numbers", "as_bytes"]
-
 # Name: width in bytes, and what it is of the bytes that it covers.
 CHECKSUMS: Final[dict[str, tuple[int, Callable[[bytes], int]]]] = {
     "sum8": (1, lambda data: sum(data) & 0xFF),

@@ -9,8 +9,6 @@ import msgspec
 
 from tactile_rt.drivers.codecs.ascii_mapping import ArrayTable
 
-__all__ = ["UNHEARD", "FrameCounter", "FrameMapping", "Message", "Values"]
-
 LONGEST: Final = 65_536  # bytes of a frame
 UNHEARD: Final = "-"  # channel of numbers that are not delivered
 

@@ -30,11 +30,6 @@ from typing import Final, Generic, TypeVar
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanCodec, CanFrame, SampleBatch, Samples, WireStats
 
-__all__ = [
-    "ByteBuffer", "CodecOfParts", "FrameFinder", "Rounds", "crc16_modbus", "crc16_x25",
-    "crc16_xmodem", "seal_modbus",
-]  # fmt: skip
-
 GAP: Final = 64  # frames: what is remembered of bytes that are none
 FILL: Final = 7  # bytes at most that fill a part, of a CAN frame's 8
 NEAR: Final = 2  # wrong bits in a beginning: of 16 bits, noise has so few once in 500 times

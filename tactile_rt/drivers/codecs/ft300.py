@@ -15,8 +15,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.framing import seal_modbus
 
-__all__ = ["Ft300", "Ft300Options"]
-
 READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE = REQUESTS = (3, 4, 6, 16)  # Modbus functions
 ERROR, NO_SUCH_ADDRESS = 0x80, 2
 OUTPUT, STREAM = 410, 0x0200  # the register that selects the output, and its value

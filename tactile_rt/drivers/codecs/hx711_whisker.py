@@ -15,8 +15,6 @@ from tactile_rt.drivers.codecs.ascii_mapping import Element
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import Message
 
-__all__ = ["Hx711Whisker", "Hx711WhiskerOptions"]
-
 MOST: Final = 9  # whiskers that the board has pins for
 BYTES: Final = 8  # of a whisker
 _COUNT: Final = re.compile(rb"N=([1-9])[\r\n]|[SE]")

@@ -11,8 +11,6 @@ from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import CanFrame, Command, SampleBatch, Step
 from tactile_rt.drivers.codecs.framing import CodecOfParts
 
-__all__ = ["IcubSkin", "IcubSkinOptions"]
-
 TAXELS: Final = 12  # of a triangle
 TRIANGLES: Final = 16  # of a board, at most
 HEAD, TAIL = 0x40, 0xC0  # first byte of a triangle's two frames; bit 7 tells them apart

@@ -14,8 +14,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import SampleBatch, Samples, SerialCodec
 
-__all__ = ["MlxHex", "MlxHexOptions"]
-
 # uT per count at RES = 0 by GAIN_SEL, of x and y and of z; each step of RES doubles them
 # (datasheet MLX90393, table of sensitivities, by HALLCONF).
 SENSITIVITY: Final = {

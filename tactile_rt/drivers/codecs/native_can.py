@@ -38,8 +38,6 @@ from tactile_rt.drivers.codecs import native_common as common
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType, NativeOptions
 
-__all__ = ["NativeCan", "NativeCanOptions"]
-
 COMMAND, ACK, HEADER, PART, DESCRIPTION = range(5)  # identifiers from the base
 WHISKING: Final = struct.Struct("<BHhh")  # type, mHz, 0.1 mrad, 0.1 mrad: one frame, so one change
 LENGTHS: Final = (8, 12, 16, 20, 24, 32, 48, 64)  # of CAN FD frames, above 7

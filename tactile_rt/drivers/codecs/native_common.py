@@ -10,18 +10,6 @@ import numpy as np
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
 
-__all__ = [
-    "FORMATS",
-    "HARMLESS",
-    "IMPOSSIBLE",
-    "STATUS",
-    "UNKNOWN",
-    "DeviceDescription",
-    "MessageType",
-    "NativeOptions",
-    "encode_samples",
-]
-
 # What an ACK says went wrong: a type or length that the device does not know; a thing it cannot do.
 UNKNOWN: Final = 1
 IMPOSSIBLE: Final = 2

@@ -33,8 +33,6 @@ from tactile_rt.drivers.codec import (
 )
 from tactile_rt.drivers.codecs.framing import FrameFinder
 
-__all__ = ["OptoForceCan", "OptoForceCanOptions", "OptoForceOptions", "OptoForceSerial"]
-
 SAMPLE: Final = b"\xaa\x07\x08"
 CONFIGURE: Final = b"\xaa\x00\x32\x03"
 ANSWER: Final = b"\xaa\x00\x50\x01"

@@ -23,8 +23,6 @@ from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import Command, SampleBatch, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import ByteBuffer
 
-__all__ = ["Tsf85", "Tsf85Options"]
-
 START: Final = b"\x9a"
 READ, SEND, SEND_WHEN_NEW = 0x61, 0x58, 0x59  # commands; packets carry the one they answer
 STATIC, DYNAMIC, ACCELERATION, TURNING, FIELD, TEMPERATURE, TIME = range(1, 8)  # types

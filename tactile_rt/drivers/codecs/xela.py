@@ -12,8 +12,6 @@ from tactile_rt.core.stream import ArraySpec, Chunk
 from tactile_rt.drivers.codec import CanFrame, Command, SampleBatch, Step
 from tactile_rt.drivers.codecs.framing import CodecOfParts
 
-__all__ = ["Xela", "XelaOptions"]
-
 SIDE: Final = 4
 TAXELS: Final = SIDE * SIDE
 CONTROL_ID: Final = 0x200  # | board

@@ -24,8 +24,6 @@ from tactile_rt.drivers.opening import make_codec
 
 SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
 
-__all__ = ["EmulatedCan", "EmulatedDevice", "EmulatedSerial"]
-
 
 class EmulatedDevice(Emulator):
     """An emulated device on a line that exists; a context manager, plugged in while entered."""

@@ -18,8 +18,6 @@ from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedule
 from tactile_rt.drivers.emulation.transmitter import EmulatedClock, RateConverter, Transmitter, fit
 
-__all__ = ["PACES", "Emulator"]
-
 PACES = ("realtime", "fast")
 SETTLE_S: Final = 0.2  # unasked none is sent: who opens a port throws away what was there before
 SLICE_S: Final = 0.05  # how soon a wait notices that the emulator is closed

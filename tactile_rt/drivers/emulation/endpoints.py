@@ -17,8 +17,6 @@ from tactile_rt.drivers.emulation.pseudo_terminal import Pty, Wire, bytes_s, fra
 from tactile_rt.drivers.links import CanLink
 from tactile_rt.drivers.slcan import SlcanAdapter
 
-__all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
-
 UART_BYTES = 4096  # what a device holds that the line has not yet carried
 FIFO_BYTES = 1 << 20  # a second of 1 kHz x 850 B: a busy host machine is no fault of the device
 LOOK_S = 0.005  # how often a bus that is not there is looked at

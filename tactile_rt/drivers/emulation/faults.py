@@ -36,17 +36,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import convert, no_such, read_toml
 from tactile_rt.drivers.codec import Packet
 
-__all__ = [
-    "KINDS",
-    "QUIET_S",
-    "DeviceLog",
-    "Fate",
-    "Fault",
-    "FaultSchedule",
-    "damaged",
-    "read_faults",
-]
-
 FOR_EVER = ("clock_drift", "gather")  # kinds that may last to the end
 QUIET_S = 0.5  # undisturbed at either end
 BESIDE_RESET_S = 0.05  # undisturbed on either side of a restart

@@ -25,8 +25,6 @@ from typing import Final
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 
-__all__ = ["Pty", "Wire", "bytes_s", "frames_s", "misheard"]
-
 STANDARD, EXTENDED = 47, 67  # bits of a frame beside its data, the gap to the next one included
 FD_SLOW, FD_SLOW_EXTENDED = 30, 49  # of CAN FD, at the speed of the arbitration
 FD_FAST, FD_FAST_LONG = 31, 36  # at that of the data: up to 16 bytes, and more

@@ -18,8 +18,6 @@ from tactile_rt.drivers.emulation.faults import (
     damaged,
 )
 
-__all__ = ["EmulatedClock", "RateConverter", "Transmitter", "fit"]
-
 SAME = 1e-3  # relative: rates that differ by less are one
 
 

@@ -22,8 +22,6 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-__all__ = ["MambaBlock", "MambaStack", "selective_scan"]
-
 LAYERS = 4
 STATES = 16
 TAPS = 4  # of the causal convolution

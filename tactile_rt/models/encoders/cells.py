@@ -22,8 +22,6 @@ from tactile_rt.core import packages
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.encoders.convolution import Convolution, convolve
 
-__all__ = ["CELLS", "FORGET_BIAS", "Cell", "IntersectionCell", "make_cell"]
-
 FORGET_BIAS = 1.0
 # Where nothing is touched the gates have no variance, and the gradient through a norm grows by
 # 1 / sqrt(epsilon) with every step: at the usual 1e-5 it reaches 1e29 in a window of 22. At 1 it

@@ -29,8 +29,6 @@ from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.settings import convert, parse_toml
 from tactile_rt.models.ead_config import CELLS, added_cells
 
-__all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node", "parse_graph"]
-
 FUSIONS = ("concatenate", "sum", "gate")
 KINDS = ("valid", "same", "dense")
 DENSE_CELLS = ("none", "timedecay", "timedecay-ln")

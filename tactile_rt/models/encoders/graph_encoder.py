@@ -15,8 +15,6 @@ from tactile_rt.models.encoders.cells import Cell, make_cell
 from tactile_rt.models.encoders.convolution import Convolution, convolve, convolve_valid
 from tactile_rt.models.encoders.graph import Graph, Input, Node, parse_graph
 
-__all__ = ["GraphEncoder", "build_encoder", "draw_as_published"]
-
 
 class Fusion(nn.Module):
     """The edges of a node that are summed or gated into those that are concatenated.

@@ -8,8 +8,6 @@ from torch.nn import functional as F
 
 from tactile_rt.models.ead_config import MOUSE_FRAME
 
-__all__ = ["FEATURES", "GRUEncoder"]
-
 FEATURES = 512  # per step, at width 1
 LAYERS = 2
 

@@ -8,8 +8,6 @@ from tactile_rt.models.attenders.mamba import MambaStack
 from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.gru import FEATURES
 
-__all__ = ["MambaEncoder"]
-
 
 class MambaEncoder(nn.Module):
     """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.

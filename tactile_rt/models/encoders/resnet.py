@@ -13,8 +13,6 @@ from torch.nn import functional as F
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.ead_config import MOUSE_FRAME
 
-__all__ = ["FoldedResNet18", "ResNet18Encoder"]
-
 STAGES = (64, 128, 256, 512)  # channels at width 1
 FEATURES = 512
 

@@ -24,8 +24,6 @@ from torch.nn import functional as F
 from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.gru import FEATURES
 
-__all__ = ["FoldedS4", "S4Block", "S4Encoder", "hippo_legs", "kernels"]
-
 STATES = 64  # N, in conjugate pairs
 LAYERS = 4
 DROPOUT = 0.2

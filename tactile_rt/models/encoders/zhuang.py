@@ -4,8 +4,6 @@ from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 
-__all__ = ["ZhuangEncoder", "zhuang_graph"]
-
 # Channels and predecessors, in the order of their channels: alphabetical.
 EDGES = {
     "conv1": (96, ("frame",)),

@@ -16,15 +16,6 @@ from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.measures import Floats, Interval, Labels, run_steps
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-__all__ = [
-    "NAMES_LEFT",
-    "Coverage",
-    "measure_coverage",
-    "measure_names",
-    "named_faults",
-    "score_known",
-]
-
 NAMES_LEFT = "names at the last step"  # a number, where the others are shares
 Doubles = NDArray[np.float64]
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))

@@ -24,32 +24,6 @@ from tactile_rt.models.disturbances import CLEAN, Disturbance
 if TYPE_CHECKING:
     from tactile_rt.models.ead import TactileClassifier
 
-__all__ = [
-    "CutWindows",
-    "Interval",
-    "Step",
-    "accuracy",
-    "among",
-    "at_temperature",
-    "auroc",
-    "bootstrap",
-    "confusion",
-    "cut_windows",
-    "deciding_step",
-    "expected_calibration_error",
-    "fused_accuracy",
-    "hits",
-    "macro_accuracy",
-    "open_set",
-    "posteriors",
-    "predict",
-    "run_on",
-    "run_over",
-    "run_steps",
-    "softmax",
-    "split_by_class",
-]
-
 Floats = NDArray[np.float32]
 Labels = NDArray[np.int64]
 Names = NDArray[np.str_]

@@ -30,8 +30,6 @@ from tactile_rt.models.evaluation.records import Record, record_count, record_sh
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
 from tactile_rt.sets.manifest import WITHHELD
 
-__all__ = ["evaluate_model"]
-
 # By the number of classes: of the shipped recipes `mouse12` and `default24`.
 BARS = {
     12: {"top-1": ">= 91", "top-5": ">= 99", "fused": ">= 97"},

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.models.evaluation import measures
 
-__all__ = ["draw_confusion", "draw_over_time"]
-
 
 def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path) -> None:
     """Draw a confusion matrix (true, decided) as percentages of each true class.

@@ -13,8 +13,6 @@ from rich.table import Table
 if TYPE_CHECKING:
     from tactile_rt.models.evaluation.measures import Interval
 
-__all__ = ["Record", "as_dicts", "as_table", "record_count", "record_share", "show", "write"]
-
 COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
 

@@ -8,8 +8,6 @@ from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.records import Record, record_share
 
-__all__ = ["conditions", "measure_robustness", "rated_amount"]
-
 REST = 80  # samples: 0.7 s of a mouse's, which a baseline can be taken from
 
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet
     from tactile_rt.models.disturbances import Disturbance
 
-__all__ = ["PENALTIES", "FittedSVM", "fit", "fit_svm", "window_features"]
-
 MOST_PAIRED = 8000  # sweeps whose kernel, 8 bytes a pair, is kept: half a gigabyte
 PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
 

@@ -13,24 +13,6 @@ from tactile_rt.core.files import write_whole
 from tactile_rt.models.grid.plan import OF_UNTRAINED, SUPERVISED, Grid, Task
 from tactile_rt.models.training.config import TrainingConfig
 
-__all__ = [
-    "POINT",
-    "SUBSET",
-    "TESTED",
-    "Outcome",
-    "Tested",
-    "Training",
-    "outcome_path",
-    "read_outcome",
-    "read_point",
-    "read_tested",
-    "runs_of",
-    "settings_of",
-    "training_settings",
-    "waiting_tasks",
-    "write_tested",
-]
-
 SUBSET, OUTCOMES, RUNS = "sweeps", "outcomes", "runs"  # folders of a grid
 TESTED = "tested.json"  # a file of it
 POINT = "point.json"  # a file of one of its trainings

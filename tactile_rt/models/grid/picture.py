@@ -12,8 +12,6 @@ from tactile_rt.models.evaluation.measures import Interval
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
 from tactile_rt.models.grid.results import GridResults, Row
 
-__all__ = ["draw_grid"]
-
 FAMILIES = {
     "zhuang": ("ConvRNN (Zhuang's graph)", "tab:blue"),
     "resnet18": ("ResNet18", "tab:orange"),

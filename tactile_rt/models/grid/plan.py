@@ -20,8 +20,6 @@ from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 
-__all__ = ["Candidate", "Grid", "Growth", "SweepCounts", "Task", "read_grid", "shipped_grids"]
-
 SHIPPED = resources.files("tactile_rt.models.grid")
 # of a training's configuration, what a grid sets task by task
 OWN = ("data", "also", "begin", "seed", "learning_rate", "warmup", "epochs", "updates")

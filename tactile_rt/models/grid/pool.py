@@ -23,8 +23,6 @@ from tactile_rt.models.grid.work import Workbench
 from tactile_rt.sets.manifest import SET_VERSION, SPLITS, SweepManifest, has_object
 from tactile_rt.sets.objects import read_object, read_skipped, write_object, write_skipped
 
-__all__ = ["prepare", "run_grid", "write_subset"]
-
 Report = Callable[[Outcome, int, int], None]
 _bench: Workbench | None = None  # of a process of the pool
 

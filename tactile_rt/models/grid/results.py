@@ -12,8 +12,6 @@ from tactile_rt.models.evaluation.measures import Interval, Names, accuracy
 from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid
 
-__all__ = ["Answer", "GridResults", "Row", "gather", "table", "write_results"]
-
 
 @dataclass(frozen=True)
 class Row:

@@ -39,8 +39,6 @@ from tactile_rt.models.training.probing import probe
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.splits import check_split
 
-__all__ = ["Workbench"]
-
 BATCH = 128
 Report = Callable[..., None]
 

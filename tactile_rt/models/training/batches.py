@@ -23,19 +23,6 @@ from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.datasets import NOISE_LEVELS, SweepSet, windows
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-__all__ = [
-    "JITTER",
-    "Batch",
-    "BatchFeed",
-    "Share",
-    "TrainingBatches",
-    "check_batches",
-    "generator_of",
-    "order_in_twos",
-    "partners",
-    "prefetched",
-]
-
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are drawn evenly
 CPU = torch.device("cpu")
 AHEAD = 2  # batches that wait for the network: more only take memory

@@ -18,19 +18,6 @@ from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
 from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sets.splits import read_manifests
 
-__all__ = [
-    "AUGMENTATIONS",
-    "SCHEDULES",
-    "TWO_SWEEPS",
-    "WINDOWS",
-    "DivergedError",
-    "ProbeConfig",
-    "Progress",
-    "TrainingConfig",
-    "as_json",
-    "begin_run",
-]
-
 OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder", "predictive")
 AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image", "image-paper", "image-paper-weak")
 LOSSES = ("anytime", "last")

@@ -51,8 +51,6 @@ from tactile_rt.sets.splits import trained_objects
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
-__all__ = ["Validation", "initialise", "launched", "train"]
-
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
 VIEWS, FRAMES = 2**32, 2**32 + 1  # epochs that no training reaches: their draws are others

@@ -37,20 +37,6 @@ from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.training.config import TrainingConfig
 
-__all__ = [
-    "Autoencoder",
-    "Objective",
-    "Predictive",
-    "SimCLR",
-    "SimSiam",
-    "Supervised",
-    "anytime_loss",
-    "build_objective",
-    "identity_loss",
-    "last_loss",
-    "nt_xent",
-]
-
 # Sizes of the heads, at width 1.
 CONTRASTED = (2048, 128)  # SimCLR's neck: inside, and what comes out
 LEAST = 32  # the neck's output at any width: fewer directions cannot tell a batch apart

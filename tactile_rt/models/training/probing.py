@@ -23,8 +23,6 @@ from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.updates import log_epoch
 from tactile_rt.sets.splits import check_split, trained_objects
 
-__all__ = ["linear_probe", "probe"]
-
 WINDOWS = 32  # at a time, through the frozen network
 
 

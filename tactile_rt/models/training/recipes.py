@@ -24,8 +24,6 @@ from tactile_rt.core import settings
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.training.config import TrainingConfig
 
-__all__ = ["Recipe", "load_recipe", "read_recipe", "shipped_recipes"]
-
 KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
 
 

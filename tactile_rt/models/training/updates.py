@@ -36,17 +36,6 @@ from tactile_rt.models.training.objectives import Objective
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
-__all__ = [
-    "LARS",
-    "RunState",
-    "batch_loss",
-    "build_optimizer",
-    "build_schedule",
-    "log_epoch",
-    "parameter_groups",
-    "replayed",
-]
-
 MOMENTUM = 0.9
 WARMUP_RATIO = 1e-4  # of "cosine-annealing": the rate begins above it
 TRUST = 1e-3  # LARS's coefficient (You et al. 2017)

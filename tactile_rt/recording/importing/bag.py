@@ -37,8 +37,6 @@ from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2_form import ARRAY
 
-__all__ = ["BagTopic", "bag_topics", "import_bag", "is_recording"]
-
 LOOKED_AT: Final = 1 << 28  # bytes of a topic, before it is known which one is wanted
 MOST: Final = 4096  # fields of a message that are columns
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.

@@ -19,8 +19,6 @@ from tactile_rt.core.files import check_no_pointer, open_regular
 from tactile_rt.core.packages import require_extra
 from tactile_rt.recording.records import MAGIC
 
-__all__ = ["OpenBag", "is_bag", "open_bag"]
-
 SQLITE: Final = b"SQLite format 3\0"
 ROS1: Final = b"#ROSBAG V2.0\n"
 SIZES: Final = 64  # of messages of one topic that are looked at, the largest

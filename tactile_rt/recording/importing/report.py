@@ -16,8 +16,6 @@ from tactile_rt.recording.layout import SAMPLES, encode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
 
-__all__ = ["Import", "clock_of", "measure_samples", "report_lines", "write_chunks"]
-
 BLOCK: Final = 4096  # chunks that are measured together
 CHUNK_S: Final = 0.01  # of a chunk, as live sources have it
 FEWEST: Final = 100_000  # chunks beyond which they are longer

@@ -42,8 +42,6 @@ from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
 
-__all__ = ["BESIDE", "Table", "import_table", "place_columns", "shown_names"]
-
 NS: Final = {"s": NS_PER_S, "iso": NS_PER_S, "ms": 10**6, "us": 1000, "ns": 1}
 GAP: Final = 10  # typical steps: what is longer is no period
 BLOCK: Final = 1024  # rows that are kept as Python's numbers

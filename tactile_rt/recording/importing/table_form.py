@@ -24,8 +24,6 @@ from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 from tactile_rt.drivers.logs import open_log_file
 from tactile_rt.recording.importing.table import Table
 
-__all__ = ["CsvForm", "csv_form", "read_table"]
-
 LOOKED_AT: Final = 200  # lines
 ENOUGH: Final = 0.5  # of the lines that are looked at are rows
 OFTEN: Final = 0.2  # of the rows lack the same cells: they are not cut

@@ -21,8 +21,6 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.table import read_samples, shown_names
 from tactile_rt.recording.importing.table_form import CsvForm, csv_form, read_table
 
-__all__ = ["ProposedColumns", "propose_columns", "propose_fields", "propose_line_columns"]
-
 _DELTA = re.compile(r"Delta_X\W+([\d.,]+(?:E[+-]\d+)?)")  # LabVIEW's step, s
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows

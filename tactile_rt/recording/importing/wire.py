@@ -26,8 +26,6 @@ from tactile_rt.recording.importing.report import Import, clock_of, measure_samp
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
 
-__all__ = ["import_wire"]
-
 PROBED, SHORTEST = 16_384, 8  # bytes
 FEW, UNUSUAL = 10, 1.2  # samples; how far their rate may be from the codec's
 LAST = 4  # packets that are fed byte by byte

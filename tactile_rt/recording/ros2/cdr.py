@@ -12,20 +12,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-__all__ = [
-    "CDR",
-    "PACKAGE",
-    "SIMPLE",
-    "dds_type",
-    "decode",
-    "encode",
-    "fields_of",
-    "header",
-    "header_size",
-    "schema_text",
-    "token",
-]
-
 PACKAGE = Path(__file__).parents[2] / "assets" / "tactile_rt_msgs"
 # Of a definition's words, those that are no other message: how `struct` packs each; not a string.
 SIMPLE = {

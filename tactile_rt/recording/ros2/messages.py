@@ -11,23 +11,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.recording.ros2 import cdr
 
-__all__ = [
-    "ARRAY",
-    "DECISION",
-    "EVENT",
-    "SAMPLES",
-    "WRENCH",
-    "array_message",
-    "array_of",
-    "decision_message",
-    "event_message",
-    "json_of",
-    "stamped",
-    "unstamped",
-    "wrench_message",
-    "wrenches_of",
-]
-
 OURS = "tactile_rt_msgs/msg"
 ARRAY, DECISION, EVENT, SAMPLES = (f"{OURS}/{n}" for n in ("Array", "Decision", "Event", "Samples"))
 WRENCH = "geometry_msgs/msg/WrenchStamped"

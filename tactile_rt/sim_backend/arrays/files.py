@@ -53,16 +53,6 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
 )
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, TURN, Whisker
 
-__all__ = [
-    "ROBOTS",
-    "SPECIES",
-    "load_animals",
-    "load_array",
-    "mouse_whiskers",
-    "read_animals",
-    "robot_text",
-]
-
 # By name: the options of the serial URL that reads the array.
 ROBOTS = MappingProxyType(
     {

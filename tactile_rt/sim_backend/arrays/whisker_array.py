@@ -15,8 +15,6 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
-__all__ = ["MOUNT", "Mount", "WhiskerArray", "both_sides", "centred_mount", "mirrored", "place"]
-
 Point = tuple[float, float, float]
 MOST_GRAVITY = 50.0  # m/s^2; more is a slip of the pen
 

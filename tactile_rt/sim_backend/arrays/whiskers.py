@@ -13,23 +13,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = [
-    "DAMPING_RATIO",
-    "FRICTION",
-    "OPTIONAL",
-    "PLAUSIBLE",
-    "REQUIRED",
-    "SOFTEST_MOUNT",
-    "TURN",
-    "Floats",
-    "Whisker",
-    "joint_stiffness",
-    "keratin_radii",
-    "link_inertia",
-    "link_nodes",
-    "rotation",
-]
-
 Floats = NDArray[np.float64]
 GAUSS = np.polynomial.legendre.leggauss(5)  # nodes, weights: exact to degree 9
 

@@ -19,8 +19,6 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.card_survey import Card, Fit, Separability, survey
 
-__all__ = ["write_card"]
-
 COLUMNS, EXAMPLES = 4, 12
 FAINTEST = 5000  # times below what networks believe is where a picture begins
 PREFIXES = {0: "", -1: "m", -2: "u", -3: "n", -4: "p"}

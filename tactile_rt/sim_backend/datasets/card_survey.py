@@ -22,16 +22,6 @@ from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.sets.manifest import SweepManifest, has_object
 from tactile_rt.sets.objects import read_object, read_skipped
 
-__all__ = [
-    "Card",
-    "Features",
-    "Fit",
-    "Separability",
-    "check_separability",
-    "survey",
-    "window_features",
-]
-
 TOUCH_N = 1e-6  # a whisker is touched when its load exceeds this, and twice the lead's largest
 DECADES = (-7, 1)  # of the histogram of forces, N
 BINS_A_DECADE = 5

@@ -40,8 +40,6 @@ from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, engine_version, stamp_samples
 
-__all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
-
 # Of a sweep's parameters; the others are numbers.
 KINDS: dict[str, type] = {"draw": np.int64, "touches": np.bool_, "unstable": np.bool_}
 # streams of random numbers beside that of the sweep's parameters

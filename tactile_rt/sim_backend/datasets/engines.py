@@ -20,8 +20,6 @@ from typing import Any
 from tactile_rt.core.errors import ConfigError, TactileError
 from tactile_rt.core.packages import require_extra
 
-__all__ = ["ENGINES", "Outcome", "Work", "run_processes", "run_ray"]
-
 ENGINES = ("processes", "ray")
 PATIENCE_S = 10
 TRIES = 3  # of an object whose process died

@@ -14,8 +14,6 @@ from tactile_rt.core.files import write_whole
 from tactile_rt.sets.manifest import MANIFEST, SKIPPED, SweepManifest, has_object, object_path
 from tactile_rt.sets.objects import read_arrays, read_skipped
 
-__all__ = ["SUMS", "Tally", "check_sums", "remove_leftovers", "tally", "write_sums", "written_sum"]
-
 SUMS = "SHA256SUMS"
 COUNTED = ("touches", "unstable", "wedged", "saturated")  # of each sweep
 STALE_S = 60  # no file of a set takes as long to write

@@ -19,8 +19,6 @@ from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = ["DEFAULT_RECIPE", "read_recipe", "recipe_of_set", "shipped_recipes"]
-
 DEFAULT_RECIPE = "wide24"
 
 

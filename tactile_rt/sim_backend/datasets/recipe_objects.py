@@ -19,8 +19,6 @@ from tactile_rt.sim_backend.objects.catalogue import VARIED, TactileObject, load
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.objects.object_sets import ObjectSet
 
-__all__ = ["MeshObjects", "ShapeObjects", "choose_objects"]
-
 PER_WITHHELD = 12
 
 

@@ -43,16 +43,6 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 
-__all__ = [
-    "GENERATED",
-    "VARIED_SHAPES",
-    "Choice",
-    "ObjectChoice",
-    "Range",
-    "SweepChoice",
-    "SweepRecipe",
-]
-
 SHAPES, VARIED_SHAPES = "shapes", "varied-shapes"
 GENERATED = (SHAPES, VARIED_SHAPES)  # sources of objects; any other is a folder
 MOST_OBJECTS = 100_000

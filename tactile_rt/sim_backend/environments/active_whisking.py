@@ -22,8 +22,6 @@ from tactile_rt.sim_backend.sweep import usual_distance, usual_size
 from tactile_rt.sim_backend.whisking_drive import Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec, stamp_samples
 
-__all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking", "picture", "whisker_nodes"]
-
 Floats = NDArray[np.float64]
 
 SIDE, MARGIN_MM = 320, 25.0

@@ -27,8 +27,6 @@ from tactile_rt.sim_backend.trajectories import base_angles
 from tactile_rt.sim_backend.whisking_drive import LAG_S, Drive, Whisking
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile
 
-__all__ = ["Placed", "Stretch", "WhiskingHead", "place_beside"]
-
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 APART_MS = 10  # a whisker that was free for as long touches anew
 LAG_MS = LAG_S * 1e3

@@ -17,20 +17,6 @@ from tactile_rt.core.stream.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.sim_backend.measuring.resting import FORGETS_S, TO_SIGMA, Rest, drift_likelihood
 from tactile_rt.sim_backend.transducer import FASTEST_HZ
 
-__all__ = [
-    "MANY",
-    "MEDIAN",
-    "SIGMAS",
-    "ArrayFinding",
-    "Edit",
-    "Figure",
-    "about",
-    "change",
-    "compare_sensor",
-    "pooled",
-    "spread_of",
-]
-
 MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
 SIGMAS = 1.96  # of an interval's half
 EVEN = 1.2  # how much longer one half of an interval may be than the other to be told as one

@@ -28,8 +28,6 @@ from tactile_rt.sim_backend.measuring.resting import Rest, find_rest
 from tactile_rt.sim_backend.measuring.ringing import Ring, find_swings, fit_ring
 from tactile_rt.sim_backend.transducer import Transducer, device_spec
 
-__all__ = ["Fitted", "edit_text", "fit_array", "read_described"]
-
 MISSING = 0.1  # of a recording's samples, at most
 LEAST = 64  # samples
 LINE = re.compile(r"(\s*[\w-]+\s*=\s*)(?:\{[^}]*\}|[^#{]*?)(\s*)(#.*)?")

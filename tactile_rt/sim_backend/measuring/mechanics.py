@@ -27,8 +27,6 @@ from tactile_rt.sim_backend.measuring.findings import (
 from tactile_rt.sim_backend.measuring.ringing import HEARD, Ring
 from tactile_rt.sim_backend.rods.rod import Rod, make_rod
 
-__all__ = ["compare_whiskers"]
-
 LINKS = 20
 FEWEST = 3  # plucks of a whisker
 HZ_OFF, RATIO_OFF = 0.005, 0.03  # by the modes above the first, and the size of the swing

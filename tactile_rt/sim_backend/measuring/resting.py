@@ -15,8 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FORGETS_S", "TO_SIGMA", "Rest", "drift_likelihood", "find_rest", "rounding_step"]
-
 Floats = NDArray[np.float64]
 
 TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation

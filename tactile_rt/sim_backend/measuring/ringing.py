@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-__all__ = ["HEARD", "Ring", "Swing", "find_swings", "fit_ring"]
-
 Floats = NDArray[np.float64]
 
 HEARD = 0.45  # of the sample rate: a faster swing may be the alias of another one

@@ -29,8 +29,6 @@ from scipy.spatial import ConvexHull, QhullError
 from tactile_rt.sim_backend.objects.deviation import FACES, TILE, shuffled, surface_of, tiles
 from tactile_rt.sim_backend.objects.polygons import Floats, flat
 
-__all__ = ["SheetPieces", "SolidPieces"]
-
 P = TypeVar("P")
 FOLDED = 0.5  # cosine of the angle by which a patch's parts may be turned against it
 ALONG = np.linspace(0, 1, 4, endpoint=False)[:, None, None]  # where an outline is looked at

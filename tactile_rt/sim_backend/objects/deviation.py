@@ -14,19 +14,6 @@ from manifold3d import Manifold
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = [
-    "FACES",
-    "TILE",
-    "TriangleSurface",
-    "bodies_of",
-    "deviation",
-    "outer_solid",
-    "shuffled",
-    "some",
-    "surface_of",
-    "tiles",
-]
-
 Floats = NDArray[np.float64]
 TILE = 1 / 80  # longest edge of a tile, in largest extents: 0.5 mm at 40 mm
 NEAR = 4  # tiles looked at for each point; all that could be nearer, for the farthest points

@@ -4,8 +4,6 @@ from dataclasses import asdict, dataclass
 
 from tactile_rt.core.errors import ConfigError
 
-__all__ = ["SIZE_MM", "STANDARD", "MeshDetail"]
-
 SIZE_MM = 40.0  # largest extent at which distances on meshes are given
 UP = ("y", "z")
 

@@ -28,15 +28,6 @@ from tactile_rt.core.files import check_no_pointer
 from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.mesh_formats import MOST_NODES, check_number, load_meshes
 
-__all__ = [
-    "MESH_SUFFIXES",
-    "UNREAD_SUFFIXES",
-    "check_mesh_file",
-    "mesh_content",
-    "read_parts",
-    "read_triangles",
-]
-
 MOST_UNPACKED: Final = 256 << 20  # bytes of an archive ...
 MOST_RATIO: Final = 100  # ... and times its own size; XML of numbers has 10
 SMALL: Final = 16 << 20  # bytes that an archive may unpack to at any ratio

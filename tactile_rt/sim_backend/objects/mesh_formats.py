@@ -20,17 +20,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.objects.polygons import cut_polygons
 
-__all__ = [
-    "MOST_NODES",
-    "check_number",
-    "load_meshes",
-    "read_dae",
-    "read_obj",
-    "read_off",
-    "read_ply",
-    "read_stl",
-]
-
 Array = NDArray[Any]
 Meshes = list[trimesh.Trimesh]
 PLY_TYPES: Final = {  # the others are called as in NumPy

@@ -48,8 +48,6 @@ from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM, STANDARD, MeshDe
 from tactile_rt.sim_backend.objects.mesh_files import check_mesh_file, mesh_content, read_triangles
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-__all__ = ["load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
-
 SHARES = (0.25, 0.5, 1.0)  # of the most triangles, that are tried
 HASTE = (3.0, 7.0, 10.0)  # how fast the cost of an edge that goes may grow, until few are left
 Floats = NDArray[np.float64]

@@ -47,8 +47,6 @@ from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.objects.object_sets import ObjectRow
 
-__all__ = ["get_objects", "read_list"]
-
 RAW = "https://raw.githubusercontent.com"
 AT_ONCE = 8  # files that are got at one time
 PATIENCE_S = 30.0

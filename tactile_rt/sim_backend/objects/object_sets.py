@@ -29,8 +29,6 @@ from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES, UNREAD_SUFF
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-__all__ = ["FOLDER_TABLE", "ObjectRow", "ObjectSet", "Origin", "open_objects", "read_table"]
-
 SHAPENET_FILE = Path("models") / "model_normalized.obj"
 TAXONOMY = "taxonomy.json"
 FOLDER_TABLE = "objects.csv"

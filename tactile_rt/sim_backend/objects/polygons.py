@@ -4,8 +4,6 @@ import numpy as np
 from manifold3d import triangulate
 from numpy.typing import NDArray
 
-__all__ = ["Floats", "cut_polygons", "flat"]
-
 MOST_CORNERS = 10_000
 SLIVER = 1e-9  # of all extents squared: a triangle of less area shows nowhere
 FOLD = 1e-6  # of a polygon's area: a triangle of a fan that lies so far outside folds back over it

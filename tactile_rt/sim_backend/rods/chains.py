@@ -15,19 +15,6 @@ import numpy as np
 
 from tactile_rt.sim_backend.rods.compiled import compiled
 
-__all__ = [
-    "Chain",
-    "Pose",
-    "factor",
-    "inertial_forces",
-    "mass_matrix",
-    "place",
-    "place_at",
-    "solve_back",
-    "solve_forth",
-    "solve_many_forth",
-]
-
 A = Any  # a contiguous array of float64: what is compiled knows its arguments' types by itself
 
 

@@ -16,8 +16,6 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import caching
 
-__all__ = ["compiled", "is_kept"]
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _caching: Any = caching  # which has no types

@@ -13,8 +13,6 @@ from typing import Any
 
 from tactile_rt.sim_backend.rods.compiled import compiled
 
-__all__ = ["impulses"]
-
 A = Any
 CREEP = 2e-5  # mm/ms: slower slips are held with less than all friction
 MOST_SWEEPS = 20

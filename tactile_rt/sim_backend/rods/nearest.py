@@ -9,8 +9,6 @@ import numpy as np
 
 from tactile_rt.sim_backend.rods.compiled import compiled
 
-__all__ = ["WORK", "nearest"]
-
 A = Any
 MOST_ROUNDS = 40
 OVERLAP_MM = 1e-7  # nearer than that, a direction between the nearest points means nothing

@@ -19,8 +19,6 @@ from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.friction import impulses
 from tactile_rt.sim_backend.rods.touching import MOST_CONTACTS, Contacts
 
-__all__ = ["Scratch", "scratch", "step"]
-
 A = Any
 OUT_SWEEPS = 30
 GIVES_MM = 1e-4  # how far what holds a contact gives way before it slides

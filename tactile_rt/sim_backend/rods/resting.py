@@ -17,8 +17,6 @@ from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.one_step import scratch, step
 from tactile_rt.sim_backend.rods.touching import Contacts
 
-__all__ = ["LITTLE", "linearise", "move_on", "settle"]
-
 A = Any
 SHARES, MOST_TRIES = 4, 20  # of the weight, one after the other, and of Newton's method for each
 SETTLED, NUDGE = 1e-12, 1e-6  # rad

@@ -18,8 +18,6 @@ from tactile_rt.sim_backend.arrays.whiskers import (
 from tactile_rt.sim_backend.rods.chains import Chain, chain_mass
 from tactile_rt.sim_backend.rods.touching import Segments
 
-__all__ = ["Rod", "make_rod", "matched"]
-
 SAG_MM = 7e-4  # how far the chord of a segment may be from the resting curve
 FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should
 SAMPLE_MS = 1.0

@@ -33,8 +33,6 @@ from tactile_rt.sim_backend.rods.touching import (
     forget,
 )
 
-__all__ = ["RodState", "RowBounds", "advance"]
-
 A = Any
 LEAP_MM = 0.1  # further no node moves in one step, or it is divided
 MOST_PARTS = 8

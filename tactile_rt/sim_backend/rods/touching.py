@@ -9,18 +9,6 @@ from tactile_rt.sim_backend.rods.chains import Pose
 from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.nearest import WORK, nearest
 
-__all__ = [
-    "MOST_CONTACTS",
-    "NEAR_MM",
-    "Contacts",
-    "Object",
-    "Seen",
-    "Segments",
-    "find_near",
-    "forget",
-    "unseen",
-]
-
 A = Any
 NEAR_MM = 0.1  # places that are nearer are constraints of a step
 STALE_MM, CLOSE_MM = 0.05, 1.0  # where it is near, a plane found so much way ago is found anew

@@ -20,8 +20,6 @@ from tactile_rt.sim_backend.rods.stepping import RodState, RowBounds, advance
 from tactile_rt.sim_backend.rods.touching import Object, Segments, unseen
 from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 
-__all__ = ["Piece", "RodWorld"]
-
 WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
 FEW_CORNERS = 64  # of so few it costs less to try them all

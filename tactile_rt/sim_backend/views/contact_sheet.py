@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.files import write_whole
 
-__all__ = ["write_contact_sheet"]
-
 ACROSS = 8  # pictures in a row
 
 

@@ -26,8 +26,6 @@ from tactile_rt.sim_backend.views.footage import Camera, Footage, framing
 from tactile_rt.sim_backend.views.sheet import ForceScale, Sheet, scene_size
 from tactile_rt.sim_backend.world import OBJECT_BIT
 
-__all__ = ["IMAGES", "Film", "Stage", "camera_of", "check_suffix", "write_image", "write_video"]
-
 OBJECT, HEAD = (0.62, 0.74, 0.82, 1.0), (0.86, 0.81, 0.76, 1.0)
 FINE = 2  # drawn finer by this factor, then averaged
 GHOST = 0.5  # how much of a whisker shows through what hides it

@@ -14,8 +14,6 @@ from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import Transducer
 from tactile_rt.sim_backend.world import SAMPLE_MS
 
-__all__ = ["VIEWS", "Camera", "Footage", "framing", "record"]
-
 # Azimuth and elevation (degrees) of the named views. `side` and `front` face the array, `top` has
 # its y upward; `oblique` looks outward from behind the bases, whiskers before the object.
 VIEWS: dict[str, tuple[float, float]] = {

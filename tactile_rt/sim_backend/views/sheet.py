@@ -20,18 +20,6 @@ from tactile_rt.core.stream import ArraySpec, rotation_matrices
 from tactile_rt.sim_backend.arrays.files import SPECIES
 from tactile_rt.sim_backend.views.footage import Camera, Footage
 
-__all__ = [
-    "INK",
-    "QUIET",
-    "ForceMap",
-    "ForceScale",
-    "Sheet",
-    "draw_scale",
-    "draw_traces",
-    "rostral_sign",
-    "scene_size",
-]
-
 Place = tuple[float, float, float, float]  # left, bottom, width, height in fractions
 
 WIDE, TALL = 12.8, 7.2  # inches: 16 : 9

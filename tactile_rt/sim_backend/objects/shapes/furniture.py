@@ -6,8 +6,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import bar, box, hull, lathe, ring, rod, slab, wall
 
-__all__ = ["chair", "ladder", "lamp", "stool", "table"]
-
 
 def chair(rng: Generator) -> list[Trimesh]:
     """Four legs, a seat at half height, an open or closed back."""

@@ -11,8 +11,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import hull, moved, normalised, ring, slab, stretched
 
-__all__ = ["assembly", "medley"]
-
 Builder = Callable[[Generator], list[Trimesh]]
 
 

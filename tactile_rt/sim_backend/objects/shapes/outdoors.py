@@ -6,18 +6,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, lathe, ring, rod
 
-__all__ = [
-    "beehive",
-    "cactus",
-    "castle",
-    "grapes",
-    "house",
-    "mushroom",
-    "pagoda",
-    "pumpkin",
-    "snowman",
-]
-
 
 def _ribbed(
     base: tuple[float, float, float], height: float, radius: float, ribs: int

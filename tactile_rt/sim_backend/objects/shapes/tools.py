@@ -8,8 +8,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import ROUND, ball, hull, lathe, rod, tube, wall
 
-__all__ = ["birdcage", "dumbbell", "gear", "hourglass", "jack", "spring"]
-
 
 def birdcage(rng: Generator) -> list[Trimesh]:
     """Upright wires round a floor, bent together over it, with a knob.

@@ -6,8 +6,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import ROUND, box, hull, ring, rod, slab
 
-__all__ = ["car", "plane", "truck"]
-
 
 def car(rng: Generator) -> list[Trimesh]:
     """A low body with a cabin, on four wheels: saloon, estate, van or pickup."""

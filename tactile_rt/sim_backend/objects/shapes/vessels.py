@@ -6,8 +6,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import lathe, rod, tube, wall
 
-__all__ = ["bottle", "bowl", "goblet", "mug", "teapot"]
-
 
 def bottle(rng: Generator) -> list[Trimesh]:
     """A slender body, a shoulder, a neck with a lip."""

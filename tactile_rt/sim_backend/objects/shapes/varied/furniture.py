@@ -19,8 +19,6 @@ from tactile_rt.sim_backend.objects.solids import (
     wall,
 )
 
-__all__ = ["chair", "ladder", "lamp", "table"]
-
 
 def _plate(rng: Generator, x: float, y: float, low: float, high: float) -> Trimesh:
     """A horizontal plate: a rectangle with more or less cut corners, or an oval."""

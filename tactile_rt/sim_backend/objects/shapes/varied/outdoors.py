@@ -17,8 +17,6 @@ from tactile_rt.sim_backend.objects.solids import (
     slab,
 )
 
-__all__ = ["cactus", "castle", "grapes", "house", "mushroom", "pagoda", "pumpkin", "snowman"]
-
 
 def cactus(rng: Generator) -> list[Trimesh]:
     """A column or a barrel, ribbed or smooth, with none to four arms."""

@@ -8,8 +8,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, lathe, rod, tube, wall
 
-__all__ = ["birdcage", "dumbbell", "gear", "hourglass", "spring"]
-
 
 def birdcage(rng: Generator) -> list[Trimesh]:
     """Wires round a floor, few or many, thin or thick, under a dome, a cone or a lid."""

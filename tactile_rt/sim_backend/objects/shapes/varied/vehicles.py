@@ -6,8 +6,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, moved, rod, slab
 
-__all__ = ["car", "plane"]
-
 
 def car(rng: Generator) -> list[Trimesh]:
     """Any body on wheels, hidden or not: racer, saloon, hatchback, van, bus, rover, open car."""

@@ -6,8 +6,6 @@ from trimesh import Trimesh
 
 from tactile_rt.sim_backend.objects.solids import ROUND, hull, lathe, moved, ring, slab, tube, wall
 
-__all__ = ["bottle", "bowl", "mug"]
-
 
 def bottle(rng: Generator) -> list[Trimesh]:
     """A body of any outline and section that draws in to a neck; a cork, a lip, a grip on some."""
