@@ -244,7 +244,12 @@ def readers():
     yield "daemon", load_config, page, ":3: page.port: expected a whole"
     yield "calibration", load_calibration, "version = 1\ndevice = 7", ":2: device: expected text"
     yield "loads", read_loads, "fy,raw_a\n1,x", ":2: raw_a: expected a number, got 'x'"
-    yield "mapping", lambda p: read_mapping(str(p), LineMapping), "columns = 3", ":1: columns: expected a list"
+    yield (
+        "mapping",
+        lambda p: read_mapping(str(p), LineMapping),
+        "columns = 3",
+        ":1: columns: expected a list",
+    )
     yield "faults", read_faults, "seed = 'x'", ":1: seed: expected a whole number, got 'x'"
     yield (
         "combined", lambda p: check_source(f"combined:{p}"), "name = 3", ":1: name: expected text",
