@@ -35,6 +35,7 @@ from tactile_rt.drivers.health import State
 
 NS = 1e9
 MINUTE_S, SECOND_S, LOOK_S = 60.0, 1.0, 0.05
+REPEATED = 0.01  # of the samples of a second: a copy now and then is no harm
 PERIODS = 3  # of a slow sensor, before a sample of it is old
 
 
@@ -147,6 +148,14 @@ def _of_source(
     if device is not None and not device.counts:
         why = "its counter does not go on: what is lost cannot be seen"
         found.append(Diagnostic(name, "no counter", why))
+    if source.clock_off:
+        why = "its clock runs at another speed than the host's: so do the rates that it tells"
+        found.append(Diagnostic(name, "device clock", why))
+    if source.restarts.second and not starved:
+        why = "its counter began anew: what was lost meanwhile is not counted"
+        found.append(Diagnostic(name, "restarted", why))
+    if source.repeats.second > REPEATED * source.rate_hz:
+        found.append(Diagnostic(name, "repeated samples", "more than one in a hundred comes twice"))
     if faults := device.faults if device is not None else ():
         found.append(Diagnostic(name, "device fault", f"it says: {', '.join(faults)}"))
     if source.losses.second:

@@ -17,24 +17,30 @@ SLOW = 0.9  # of the nominal rate: a cheap oscillator is within a twentieth of i
 
 
 class RateMeter:
-    """Measures a rate from a count that grows with what was measured."""
+    """Measures a rate from a count that grows with what was measured.
 
-    def __init__(self) -> None:
+    Args:
+        stretch_ns: Length of a stretch, ns; five of them are judged together.
+    """
+
+    def __init__(self, stretch_ns: int = STRETCH_NS) -> None:
+        self._stretch_ns = stretch_ns
         self._marks: deque[tuple[int, int]] = deque()  # where stretches begin: time, count
         self.hz = self.typical_hz = 0.0  # over all stretches, and their median; 0: unknown
 
     def add(self, count: int, t_ns: int) -> None:
         """Take the count at a time, ns."""
         marks = self._marks
-        if marks and t_ns - marks[-1][0] < STRETCH_NS:
+        if marks and t_ns - marks[-1][0] < self._stretch_ns:
             return
         if marks and t_ns - marks[-1][0] > LONGEST_NS:
             marks.clear()
             self.hz = self.typical_hz = 0.0
         marks.append((t_ns, count))
-        while len(marks) > FEWEST + 1 and t_ns - marks[1][0] >= NS_PER_S:
+        window_ns = FEWEST * self._stretch_ns
+        while len(marks) > FEWEST + 1 and t_ns - marks[1][0] >= window_ns:
             marks.popleft()
-        if len(marks) > FEWEST and t_ns - marks[0][0] >= NS_PER_S:
+        if len(marks) > FEWEST and t_ns - marks[0][0] >= window_ns:
             ends = itertools.pairwise(marks)
             self.typical_hz = median(NS_PER_S * (b[1] - a[1]) / (b[0] - a[0]) for a, b in ends)
             self.hz = NS_PER_S * (count - marks[0][1]) / (t_ns - marks[0][0])

@@ -41,6 +41,7 @@ from tactile_rt.sources.opening import open_source
 
 POLL_S = 0.1  # how soon it notices that it should stop
 LOOK_NS = 50_000_000  # between two looks at a device's health
+CLOCK_NS, CLOCK_OFF = 5 * NS_PER_S, 0.02  # stretches of a device's clock; of its speed
 AWAY_S = 0.3  # how long a source whose device is away may take to end
 
 
@@ -133,7 +134,8 @@ class SourcePart(Part):
         self._samples = self._newest_ns = self._read_ns = self._flowing_ns = self._bad = 0
         self._stuck_at, self._tared_changes = StuckAtDetector(), 0.0
         self._losses, self._bads = LossWindow(), LossWindow()
-        self._rate = RateMeter()
+        self._repeats, self._restarts, self._restarted = LossWindow(), LossWindow(), 0
+        self._rate, self._clock_rate = RateMeter(), RateMeter(CLOCK_NS)
         self.accepted: Identity | None = None  # the array that it began with
         self.another = ""  # why the one that is there now is not that one
         self._offset_ns = 0
@@ -154,6 +156,8 @@ class SourcePart(Part):
             flowing_ns=self._flowing_ns,
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
+            repeats=self._repeats.add(stats.duplicates),
+            restarts=self._restarts.add(self._restarted),
             bad_samples=self._bad, bad=self._bads.add(self._bad), stuck_at_s=self._stuck_at.seconds,
             zeros=self._stuck_at.zeros, another=self.another,
         )  # fmt: skip
@@ -161,11 +165,13 @@ class SourcePart(Part):
             return about
         silent_s = (time.monotonic_ns() - self._read_ns) / NS_PER_S
         measured_hz, slow = self._rate.judge(spec.rate_hz, silent_s)
+        speed = self._clock_rate.typical_hz / NS_PER_S
         return dataclasses.replace(
             about, array=spec.name, frame=spec.frame, rate_hz=spec.rate_hz,
             elements=spec.elements, channels=spec.channels, units=spec.units,
             stuck=tuple(spec.elements[k] for k in self._stuck_at.elements),
             measured_hz=measured_hz, slow=slow and self._device is not None,
+            clock_off=speed > 0 and abs(speed - 1) > CLOCK_OFF,
         )  # fmt: skip
 
     @property
@@ -275,7 +281,9 @@ class SourcePart(Part):
         useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
         self._held.append(good)
-        self._rate.add(*(self._device.measured if self._device else (self._samples, now)))
+        count, t_ns = self._device.measured if self._device else (self._samples, now)
+        self._rate.add(count, t_ns)
+        self._clock_rate.add(t_ns, now)
         spec, accepted = stream.spec, not self.another
         item = SourceChunk(self.config.name, spec, chunk, now, self._offset_ns, accepted)
         self._hub.post(item)
@@ -291,7 +299,7 @@ class SourcePart(Part):
         finally:
             self._before = _sum(self._before, stream.stats)
             self._told = ()
-            self._rate = RateMeter()
+            self._rate, self._clock_rate = RateMeter(), RateMeter(CLOCK_NS)
             self._tell_closed()
 
     def _tell_closed(self) -> None:
@@ -349,6 +357,9 @@ class SourcePart(Part):
         if told == self._told:
             return
         before, self._told = self._told, told
+        # a line that was away may bring a device that was, too: that is no silent restart
+        if before and told[1] == before[1] and now - self._flowing_ns > NS_PER_S:
+            self._restarted += told[3] != before[3]
         well = health.state in (State.STREAMING, State.CONNECTING) and not health.faults
         level = "info" if well else "warning"
         self._report(self.name, f"device:{health.state}", _told(health, before), level)

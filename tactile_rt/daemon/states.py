@@ -103,6 +103,9 @@ class SourceState:
     flowing_ns: int = 0  # since when samples have come without a pause
     live: bool = False  # samples come whether or not anyone reads them, so that they can be too old
     losses: Losses = field(default_factory=Losses)  # corrupt, missing or dropped
+    repeats: Losses = field(default_factory=Losses)  # samples that came again
+    restarts: Losses = field(default_factory=Losses)  # of the device's counter, its line in place
+    clock_off: bool = False  # the device's clock runs at another speed than the host's
     bad_samples: int = 0  # of one element, no number or an absurd one, though not marked invalid
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some

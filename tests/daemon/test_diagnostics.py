@@ -85,6 +85,12 @@ def test_who_does_what_it_should_is_not_named():
          "device fault: source.a: it says: a sensor fails"),
         ({"device": Health(State.STREAMING, 1, counts=False)},
          "no counter: source.a: its counter does not go on: what is lost cannot be seen"),
+        ({"clock_off": True}, "device clock: source.a: its clock runs at another speed than the "
+         "host's: so do the rates that it tells"),
+        ({"restarts": Losses(1, 1)},
+         "restarted: source.a: its counter began anew: what was lost meanwhile is not counted"),
+        ({"repeats": Losses(11, 11)},
+         "repeated samples: source.a: more than one in a hundred comes twice"),
         ({"stuck_at_s": 0.4}, "stuck-at fault: source.a: no value changes: the device hangs"),
         ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),
         ({"part": part("source.a", "failed", "another array")},
@@ -100,6 +106,7 @@ def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
     [
         {"measured_hz": 5000.0, "device": None},  # a recording, replayed quickly
         {"rate_hz": 900.0, "measured_hz": 1000.0},
+        {"repeats": Losses(10, 50_000)},  # a copy now and then
         {"losses": Losses(0, 50_000)},  # lost within the minute, and no longer
         {"part": part("source.a", "ended"), "newest_ns": 1, "read_ns": 1},
         {"part": part("source.a", "stopped"), "newest_ns": 1, "read_ns": 1},
