@@ -100,12 +100,14 @@ def run(
             for chunk, decisions in session:
                 samples += len(chunk)
                 stuck_at.add(chunk)
-                if set(stuck_at.elements) - set(stuck):
-                    names = name_some([opened.spec.elements[k] for k in stuck_at.elements])
+                all_of_them = tuple(range(len(opened.spec.elements)))
+                found = all_of_them if stuck_at.seconds else stuck_at.elements
+                if set(found) - set(stuck):
+                    names = name_some([opened.spec.elements[k] for k in found])
                     typer.echo(
                         f"no value of {names} changes: it hangs, or is out of range", err=True
                     )
-                stuck = stuck_at.elements
+                stuck = found
                 for d in decisions:
                     if final_only and not d.final:
                         continue
