@@ -10,7 +10,8 @@ import numpy as np
 
 from tactile_rt.alignment.layers import PARTS, Layers
 from tactile_rt.alignment.stimuli_input import StimuliInput
-from tactile_rt.classifier.model_file import read_model
+from tactile_rt.classifier.model_file import METADATA_KEY, read_model
+from tactile_rt.classifier.onnx_check import BadModel, read_onnx
 from tactile_rt.core.errors import ConfigError, ModelError, explain_errors
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -72,14 +73,34 @@ def _own_name(path: Path) -> str:
     if path.suffix == CHECKPOINT:
         describe_checkpoint(path)
         return path.stem
-    return read_model(path)[0].name
+    if _is_module(path):
+        return path.name.partition(":")[2]
+    return path.stem if _is_foreign(path) else read_model(path)[0].name
 
 
-def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float, str] | None]:
-    """Layers, and the model's accuracy on its task with what it was measured on, where known.
+def _is_module(path: Path) -> bool:
+    """Return whether a path is the name of a torch module, ``module:function``."""
+    return ":" in path.name and not path.exists()
+
+
+def _is_foreign(path: Path) -> bool:
+    """Return whether a file is ONNX, without the card of a model of ours."""
+    try:
+        return METADATA_KEY not in read_onnx(path.read_bytes()).metadata
+    except (BadModel, OSError):
+        return False  # `read_model` says why
+
+
+def load_layers(
+    path: Path, stimuli: StimuliInput, input_name: str = ""
+) -> tuple[Layers, tuple[float, str] | None]:
+    """Return a model's layers, and its accuracy on its task with what that was measured on.
+
+    Args:
+        input_name: input of a foreign ONNX file that takes the loads, if it has several.
 
     Raises:
-        ConfigError: the stimuli are of another array.
+        ConfigError: the stimuli are of another array, or do not fit a foreign model's input.
     """
     if path.suffix == CHECKPOINT:
         from tactile_rt.alignment.activations import checkpoint_layers
@@ -88,6 +109,14 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
         return layers, _accuracy(saved.get("metrics", {}))
     if path.suffix == RESPONSES:
         return responses_layers(path), None
+    if _is_module(path):
+        from tactile_rt.alignment.other_models import module_layers
+
+        return module_layers(path.name, stimuli), None
+    if _is_foreign(path):
+        from tactile_rt.alignment.other_models import other_onnx_layers
+
+        return other_onnx_layers(path, stimuli, input_name), None
     from tactile_rt.alignment.onnx_activations import onnx_layers
 
     layers, card = onnx_layers(path, stimuli)
@@ -97,13 +126,13 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
 def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
     """Layers of a model's network before training: of the same architecture, with random weights.
 
-    An ONNX file knows its architecture by the card in its metadata. None for responses, and for a
-    card that does not name its network.
+    An ONNX file knows its architecture by the card in its metadata. None for responses, for models
+    made elsewhere, and for a card that does not name its network.
 
     Raises:
         ConfigError: a seed below 0.
     """
-    if path.suffix == RESPONSES:
+    if path.suffix == RESPONSES or _is_module(path) or _is_foreign(path):
         return None
     if seed < 0:
         raise ConfigError(f"a seed is at least 0, not {seed}")

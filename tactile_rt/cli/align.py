@@ -28,7 +28,7 @@ Sessions = Annotated[
     option("Only sessions with this in their name; wildcards * and ?.", "--session"),
 ]
 Models = Annotated[
-    list[Path], argument("Checkpoints (best.pt), .onnx files, and responses (.npz).")
+    list[Path], argument("Checkpoints, any .onnx, torch as module:function, or responses (.npz).")
 ]
 Benchmark = Annotated[Path, option("Benchmark of `align build`.")]
 
@@ -104,6 +104,9 @@ def score_models(
     json: Json = None,
     page: Page = None,
     stimuli: Stimuli = None,
+    input_name: Annotated[
+        str, option("Input that takes the loads, of an ONNX file with several.", "--input")
+    ] = "",
     seed: Seed = 0,
 ) -> None:
     """Score every layer of models against a benchmark."""
@@ -122,7 +125,7 @@ def score_models(
         with progress_bar("scoring", len(models)) as update:
             for path, name in zip(models, names, strict=True):
                 update(description=name)
-                layers, own = load_layers(path, felt)
+                layers, own = load_layers(path, felt, input_name)
                 layers = replace(layers, name=name)
                 before = load_untrained(path, felt, seed)
                 done.append(model_result(frozen, layers, before, own))
