@@ -1,8 +1,8 @@
 """A frozen benchmark: what scoring a model needs, without any animal's raw data.
 
 A deterministic model's score against an animal is r_xy times a factor that depends on the animal
-alone, so 15 numbers and that factor per animal are enough. Its file is JSON with a hash of the
-content: one of another version, or changed by hand, is refused.
+alone, so an RDM (15 numbers of six stimuli) and that factor per animal are enough. Its file is
+JSON with a hash of the content: one of another version, or changed by hand, is refused.
 """
 
 import hashlib
@@ -14,19 +14,20 @@ import msgspec
 import numpy as np
 
 from tactile_rt.alignment.json_file import Number, encode, read_json, write_json
-from tactile_rt.alignment.rdm import PAIRS, Floats
+from tactile_rt.alignment.rdm import Floats, upper
 from tactile_rt.alignment.statistics import standard_error
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
 PROTOCOLS = ("strict", "paper-code")
+FEWEST, MOST = 3, 50  # stimuli
 
 
 class Frozen(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
     """An RDM and how far it can be relied on.
 
     Attributes:
-        rdm: (15,) The dissimilarities of the 15 pairs of stimuli: for paper-code, from the mean
+        rdm: (pair,) The dissimilarities of the pairs of stimuli: for paper-code, from the mean
             over trials; for strict, the mean over divisions of the trials.
         reliability: The mean split-half correlation of the RDM, corrected by Spearman-Brown; for
             strict, that of the RDM of one half of a division.
@@ -171,14 +172,16 @@ def check_benchmark(benchmark: Benchmark, path: Path) -> None:
     """
     if benchmark.protocol not in PROTOCOLS:
         raise ConfigError(f"{path}: no protocol {benchmark.protocol!r}: {', '.join(PROTOCOLS)}")
-    if benchmark.stimuli != STIMULI:
-        raise ConfigError(f"{path}: stimuli {benchmark.stimuli}, not {STIMULI}")
+    number = len(benchmark.stimuli)
+    if not FEWEST <= number == len(set(benchmark.stimuli)) <= MOST:
+        raise ConfigError(f"{path}: stimuli need {FEWEST} to {MOST} names, each another")
+    pairs = len(upper(number)[0])
     for target in benchmark.all_targets:
-        if not target.chosen.rdm.shape == target.unfiltered.rdm.shape == (len(PAIRS),):
-            raise ConfigError(f"{path}: target {target.name}: an RDM has {len(PAIRS)} entries")
+        if not target.chosen.rdm.shape == target.unfiltered.rdm.shape == (pairs,):
+            raise ConfigError(f"{path}: target {target.name}: an RDM has {pairs} entries")
     a2a = benchmark.a2a
-    number = len(a2a.animals)
+    animals = len(a2a.animals)
     if a2a.animals != tuple(t.name for t in benchmark.targets) or not (
-        a2a.pooled.shape == (number,) and a2a.pairwise.shape == (number, number)
+        a2a.pooled.shape == (animals,) and a2a.pairwise.shape == (animals, animals)
     ):
         raise ConfigError(f"{path}: a2a and the targets are not of the same animals")

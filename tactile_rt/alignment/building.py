@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.alignment.clock import CLOCKS, WARNING, said_of
+from tactile_rt.alignment.named_recordings import (
+    has_named_stimuli,
+    read_named_npz,
+    read_spike_tables,
+)
 from tactile_rt.alignment.neural import NeuralSession, by_animal, published_layout, read_published
 from tactile_rt.alignment.nwb import Reading, find_nwb, read_nwb
 from tactile_rt.alignment.paper_code import freeze_paper_code
@@ -35,10 +40,11 @@ def build(
     selection: Selection | None = None,
     clock: str | None = None,
 ) -> Benchmark:
-    """Freeze a benchmark from NWB files or from rates in the published layout.
+    """Freeze a benchmark from recordings.
 
     Args:
-        inputs: NWB files and folders of them; or, for paper-code, one published ``.npz``.
+        inputs: NWB files and folders of them; sessions of any named stimuli, an ``.npz`` or two
+            tables (`named_recordings`); or, for paper-code, one published ``.npz``.
         progress: called with the share done, 0 to 1.
         selection: which sessions and units of NWB files are kept; None for all.
         clock: spike times are on the ``session``'s clock, as NWB has it and strict by default, or
@@ -61,15 +67,19 @@ def build(
     if bootstraps < 1:
         raise ConfigError(f"{bootstraps} bootstraps: at least one")
     strict = protocol == "strict"
+    tables = [path for path in inputs if path.suffix == ".csv"]
     archives = [path for path in inputs if path.suffix == ".npz"]
+    named = bool(tables) or any(map(has_named_stimuli, archives))
     if archives and len(inputs) > 1:
         raise ConfigError(f"{archives[0]}: an .npz holds all animals: name nothing beside it")
-    if archives and strict:
+    if named and (not strict or clock):
+        raise ConfigError(f"{inputs[0]}: named stimuli are for protocol strict, without a --clock")
+    if archives and strict and not named:
         raise ConfigError(
             f"{archives[0]}: its stimuli have no names, and trials that did not show a stimulus "
             "count as zero: build with protocol paper-code, or strict from the NWB files"
         )
-    if archives and (clock or str(selection or "")):
+    if archives and not named and (clock or str(selection or "")):
         raise ConfigError(
             f"{archives[0]}: holds rates, not spikes: neither a clock nor a selection of sessions "
             "or units applies to it"
@@ -78,7 +88,14 @@ def build(
     def splitting(share: float) -> None:
         progress(READING + (1 - READING) * share)
 
-    if archives:
+    if named:
+        files, notes = list(inputs), []
+        if tables:
+            sessions = read_spike_tables(inputs, selection)
+        else:
+            sessions = read_named_npz(archives[0], selection)
+        refuse_copies(sessions)
+    elif archives:
         files, rates = archives, read_published(archives[0])
         units = sum(array.shape[2] for array in rates.values())
         notes = [f"{archives[0].name}: {len(rates)} animals, {units} units"]

@@ -28,15 +28,15 @@ another mouse, the stimuli relabelled and the features turned at random.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark
-from tactile_rt.alignment.rdm import PAIRS, UPPER, Floats, relabellings, square
+from tactile_rt.alignment.rdm import Floats, count_stimuli, relabellings, square, upper
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
-from tactile_rt.core.stream.stimuli import STIMULI
 
 MARGIN = 0.65  # of the noise ceiling
 WORSE, SURE = 10, 8  # a mouse is called worse in one of so many cases, a floor is too high in one
@@ -47,13 +47,19 @@ DRAWS = 20  # of damage, for every mouse and share
 OWN = 0.5
 NO_FIT = -9.0  # of a layer that has none, lower than any
 
-N = len(STIMULI)
-CENTRE = np.eye(N) - 1 / N
-CONTRASTS = np.eye(N)[UPPER[0]] - np.eye(N)[UPPER[1]]  # (15, 6): a pair's first less its second
-# Entries that take part: all, and those without each of the stimuli.
-PARTS = np.array(
-    [[True] * len(PAIRS), *([s not in pair for pair in PAIRS] for s in range(N))], dtype=np.bool_
-)
+
+@cache
+def _contrasts(stimuli: int) -> Floats:
+    """(pair, stimulus): each pair's first stimulus less its second."""
+    i, j = upper(stimuli)
+    return np.eye(stimuli)[i] - np.eye(stimuli)[j]
+
+
+@cache
+def _parts(stimuli: int) -> NDArray[np.bool_]:
+    """(part, pair): entries that take part: all, and those without each of the stimuli."""
+    there = _contrasts(stimuli).T == 0
+    return np.concatenate([np.ones((1, there.shape[1]), np.bool_), there])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +96,14 @@ class Mice:
     """The mice that models are compared to.
 
     Args:
-        rdms: (mouse, 15), finite, of three mice or more.
+        rdms: (mouse, pair), finite, of three mice or more.
         factors: (mouse,) that correct a mouse's correlations for its noise.
     """
 
     def __init__(self, rdms: Floats, factors: Floats) -> None:
         self.rdms, self.factors = rdms, factors
         self._maps = _weights(rdms.mean(axis=0))
-        self._targets = self._vectors(rdms) * factors[:, None]  # (part, mouse, 15)
+        self._targets = self._vectors(rdms) * factors[:, None]  # (part, mouse, pair)
         number = len(rdms)
         pairs = self._targets @ self._targets.swapaxes(-1, -2)
         pairs[:, np.arange(number), np.arange(number)] = 0
@@ -110,7 +116,7 @@ class Mice:
         self.bound = self.ceiling - student(number - 1, WORSE) * math.sqrt(1 + 1 / number) * spread
 
     def compare(self, models: ArrayLike) -> BesideMice:
-        """Compare models, given as RDMs (model, layer, 15); a layer with a NaN takes no part."""
+        """Compare models, given as RDMs (model, layer, pair); a layer with a NaN takes no part."""
         vectors = self._vectors(np.asarray(models, dtype=np.float64))
         fits = np.einsum("pmlk,pnk->pmln", vectors, self._targets)
         there = np.isfinite(fits).all(axis=(0, 3))[..., None]
@@ -121,12 +127,13 @@ class Mice:
         # Jackknives: the difference from the ceiling, without each mouse and without each stimulus.
         less = (fits[0].sum(axis=-1, keepdims=True) - fits[0]) / (number - 1) - self._without
         parts = fits[1:].mean(axis=-1) - self._ceilings[1:, None]
-        error = np.sqrt((number - 1) * less.var(axis=-1) + (N - 1) * parts.var(axis=0))
+        stimuli = len(parts)
+        error = np.sqrt((number - 1) * less.var(axis=-1) + (stimuli - 1) * parts.var(axis=0))
         return BesideMice(
             fits=fits[0],
             fit=fit,
             error=error,
-            floor=fit - student(min(number, N) - 1, SURE) * error,
+            floor=fit - student(min(number, stimuli) - 1, SURE) * error,
             ceiling=self.ceiling,
             bound=self.bound,
         )
@@ -149,8 +156,8 @@ class Mice:
         return Power(passes / number, dict(zip(LOST, shares.tolist(), strict=True)))
 
     def _vectors(self, rdms: Floats) -> Floats:
-        """Weighted, centred and of length one, for each part: (part, ..., 15); NaN if constant."""
-        values = np.tensordot(rdms, self._maps, axes=(-1, 1))  # (..., part, 15)
+        """Weighted, centred, of length one, for each part: (part, ..., pair); NaN if constant."""
+        values = np.tensordot(rdms, self._maps, axes=(-1, 1))  # (..., part, pair)
         length = np.sqrt((values**2).sum(axis=-1, keepdims=True))
         size = np.sqrt((rdms**2).sum(axis=-1))[..., None, None]
         unit = values / np.where(length > 1e-12 * size, length, np.nan)
@@ -158,12 +165,14 @@ class Mice:
 
 
 def _weights(rdm: Floats) -> Floats:
-    """Maps (part, 15, 15) of RDMs to vectors whose product is the weighted covariance."""
-    shared = CONTRASTS @ _gram(rdm) @ CONTRASTS.T
-    own = CONTRASTS @ CONTRASTS.T
+    """Maps (part, pair, pair) of RDMs to vectors whose product is the weighted covariance."""
+    stimuli = count_stimuli(len(rdm))
+    contrasts, parts = _contrasts(stimuli), _parts(stimuli)
+    shared = contrasts @ _gram(rdm) @ contrasts.T
+    own = contrasts @ contrasts.T
     covariance = shared * own / np.trace(shared * own) + OWN * own**2 / np.trace(own**2)
-    maps = np.zeros((len(PARTS), len(PAIRS), len(PAIRS)))
-    for part, entries in zip(maps, PARTS, strict=True):
+    maps = np.zeros((len(parts), len(rdm), len(rdm)))
+    for part, entries in zip(maps, parts, strict=True):
         values, vectors = np.linalg.eigh(covariance[np.ix_(entries, entries)])
         root = (vectors / np.sqrt(values)) @ vectors.T
         constant = root.sum(axis=0)
@@ -173,12 +182,14 @@ def _weights(rdm: Floats) -> Floats:
 
 
 def _gram(rdm: Floats) -> Floats:
-    """Products (6, 6) of the centred features that an RDM is the squared distances of.
+    """Products of the centred features, (stimulus, stimulus), of an RDM of squared distances.
 
     What all distances have in common, the noise of the units included, is taken away as far as the
     others allow: no weighted correlation sees it.
     """
-    products = -0.5 * CENTRE @ square(rdm) @ CENTRE
+    stimuli = count_stimuli(len(rdm))
+    centre = np.eye(stimuli) - 1 / stimuli
+    products = -0.5 * centre @ square(rdm) @ centre
     values, vectors = np.linalg.eigh(products)
     order = np.argsort(np.abs(vectors.sum(axis=0)))  # the constant one is last
     values, vectors = values[order[:-1]], vectors[:, order[:-1]]
@@ -186,19 +197,21 @@ def _gram(rdm: Floats) -> Floats:
 
 
 def _damaged(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
-    """RDMs (draw, 15) of a geometry that lost a share to strangers (draw, 15)."""
+    """RDMs (draw, pair) of a geometry that lost a share to strangers (draw, pair)."""
     made = np.empty_like(strangers)
     own = _features(rdm)
+    stimuli = len(own)
+    ways = relabellings(stimuli)
     for k, other in enumerate(strangers):
-        other = _features(other[relabellings()[rng.integers(len(relabellings()))]])
-        turned, _ = np.linalg.qr(rng.normal(size=(N, N)))
+        other = _features(other[ways[rng.integers(len(ways))]])
+        turned, _ = np.linalg.qr(rng.normal(size=(stimuli, stimuli)))
         features = math.sqrt(1 - lost) * own + math.sqrt(lost) * other @ turned
-        made[k] = ((CONTRASTS @ features) ** 2).sum(axis=-1)
+        made[k] = ((_contrasts(stimuli) @ features) ** 2).sum(axis=-1)
     return made
 
 
 def _features(rdm: Floats) -> Floats:
-    """Features (6, 6) of an RDM, of mean square one."""
+    """Features (stimulus, feature) of an RDM, of mean square one."""
     values, vectors = np.linalg.eigh(_gram(rdm))
     features = vectors * np.sqrt(np.maximum(values, 0))
     return np.asarray(features / np.sqrt((features**2).mean()))
@@ -236,7 +249,7 @@ def neural_checks(
     """Tests 1 to 3. Without a valid benchmark the others are inconclusive.
 
     Args:
-        baseline: (layer, 15) RDMs of the stored model's layers.
+        baseline: (layer, pair) RDMs of the stored model's layers.
     """
     valid = validity(benchmark)
     if valid.code != PASS:
@@ -298,7 +311,7 @@ def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
     ceiling. Sure is by one-sided tests over the mice, on these stimuli.
 
     Args:
-        baseline: (layer, 15) RDMs of the stored model's layers.
+        baseline: (layer, pair) RDMs of the stored model's layers.
     """
     before = mice.compare(np.asarray(baseline, dtype=np.float64)[None]).fits[0]
     drops = (before - mice.compare(score.rdms[None]).fits[0]) / mice.ceiling

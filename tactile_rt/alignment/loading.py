@@ -2,17 +2,19 @@
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_rt.alignment.layers import PARTS, Layers
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import METADATA_KEY, read_model
 from tactile_rt.classifier.onnx_check import BadModel, read_onnx
-from tactile_rt.core.errors import ConfigError, ModelError, explain_errors
+from tactile_rt.core.errors import ConfigError, ModelError, explain_errors, name_some
 from tactile_rt.core.files import check_no_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoints import describe_checkpoint
@@ -67,7 +69,7 @@ def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
 
 def _own_name(path: Path) -> str:
     if path.suffix == RESPONSES:
-        return responses_layers(path).name
+        return path.stem
     if path.suffix == ".npy":
         raise ModelError(f"{path}: name responses by layer, in an .npz: numpy.savez")
     if path.suffix == CHECKPOINT:
@@ -92,23 +94,32 @@ def _is_foreign(path: Path) -> bool:
 
 
 def load_layers(
-    path: Path, stimuli: StimuliInput, input_name: str = ""
+    path: Path,
+    stimuli: StimuliInput,
+    input_name: str = "",
+    names: tuple[str, ...] = STIMULI,
 ) -> tuple[Layers, tuple[float, str] | None]:
     """Return a model's layers, and its accuracy on its task with what that was measured on.
 
     Args:
+        names: those of the stimuli. Of others than `STIMULI` responses alone can be read.
         input_name: input of a foreign ONNX file that takes the loads, if it has several.
 
     Raises:
         ConfigError: the stimuli are of another array, or do not fit a foreign model's input.
     """
+    if path.suffix == RESPONSES:
+        return responses_layers(path, names), None
+    if names != STIMULI:
+        raise ConfigError(
+            f"{path}: the benchmark's {len(names)} stimuli cannot be whisked: give its responses, "
+            f"an .npz of ({len(names)}, unit) by layer"
+        )
     if path.suffix == CHECKPOINT:
         from tactile_rt.alignment.activations import checkpoint_layers
 
         layers, saved = checkpoint_layers(path, stimuli)
         return layers, _accuracy(saved.get("metrics", {}))
-    if path.suffix == RESPONSES:
-        return responses_layers(path), None
     if _is_module(path):
         from tactile_rt.alignment.other_models import module_layers
 
@@ -156,17 +167,18 @@ def _accuracy(figures: object) -> tuple[float, str] | None:
 
 
 RESPONSES = ".npz"
+ORDER = "stimuli"  # array that names the stimuli of the others
 NUMBERS = "fiu"
 LARGEST = np.finfo(np.float32).max
 
 
-def responses_layers(path: Path) -> Layers:
+def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
     """Layers of a file of responses.
 
     Args:
-        path: ``.npz``; each array is a layer, (6, unit) or (6, step, unit), its stimuli in the
-            order of `STIMULI`. A layer whose name does not begin with ``encoder.``, ``attender.``
-            or ``decoder.`` is one of the encoder's.
+        path: ``.npz``; each array is a layer, (stimulus, unit) or (stimulus, step, unit), in the
+            order of `names`, or of an array ``stimuli`` of names beside them. A layer whose name
+            does not begin with ``encoder.``, ``attender.`` or ``decoder.`` is one of the encoder's.
 
     Raises:
         ConfigError: no such file, an array that is no layer, by name, or two that are one layer.
@@ -179,25 +191,29 @@ def responses_layers(path: Path) -> Layers:
     traces = {}
     with explain_errors(ConfigError, f"{path}: no archive of arrays ("):
         with np.load(path, allow_pickle=False) as archive:
+            order = _order_of(path, archive, names)
             for name in archive.files:
+                if name == ORDER:
+                    continue
                 array = archive[name]
                 if (
                     array.dtype.kind not in NUMBERS
                     or array.ndim not in (2, 3)
-                    or array.shape[0] != len(STIMULI)
+                    or array.shape[0] != len(names)
                     or 0 in array.shape
                     or array.shape[-1] < 2
                     or not (np.abs(array) <= LARGEST).all()
                 ):
                     raise ConfigError(
                         f"{path}: array {name} ({array.dtype}, {array.shape}) is no layer: finite "
-                        f"numbers ({len(STIMULI)} stimuli, 2 or more units)"
+                        f"numbers ({len(names)} stimuli, 2 or more units)"
                     )
                 part, dot, _ = name.partition(".")
                 full = name if dot and part in PARTS else f"encoder.{name}"
                 if full in traces:
                     short = full.removeprefix("encoder.")
                     raise ConfigError(f"{path}: arrays {short} and {full} are one layer: name one")
+                array = array[order]
                 traces[full] = (array if array.ndim == 3 else array[:, None]).astype(np.float32)
     if not traces:
         raise ConfigError(f"{path}: has no array, so no layer")
@@ -205,8 +221,21 @@ def responses_layers(path: Path) -> Layers:
         name=path.stem,
         traces=traces,
         first=dict.fromkeys(traces, 0),
-        logits=np.zeros((len(STIMULI), 1, 0), dtype=np.float32),
+        logits=np.zeros((len(names), 1, 0), dtype=np.float32),
         parameters=0,
         sha256=hashlib.sha256(content).hexdigest(),
         notes=("responses computed elsewhere",),
     )
+
+
+def _order_of(
+    path: Path, archive: Mapping[str, NDArray[Any]], names: tuple[str, ...]
+) -> NDArray[np.intp]:
+    """Return where each of the named stimuli stands in a file."""
+    if ORDER not in archive:
+        return np.arange(len(names))
+    own = archive[ORDER].astype(str).ravel().tolist()
+    if sorted(own) != sorted(names):
+        differ = name_some(sorted({*own} ^ {*names})) or "some are named twice"
+        raise ConfigError(f"{path}: its stimuli are not those of the benchmark: {differ}")
+    return np.array([own.index(name) for name in names])

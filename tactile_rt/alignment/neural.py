@@ -21,7 +21,7 @@ class NeuralSession:
 
     Attributes:
         rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
-        stimulus: (trial,) The stimulus of each trial, as an index into `STIMULI`.
+        stimulus: (trial,) The stimulus of each trial, as an index into `stimuli`.
         course: (trial, bin, unit) Firing rates in spikes per second in bins of 45 ms from the
             beginning of the window on, NaN from the choice on; None if it is not known. A bin that
             the choice falls into is NaN, and there are as many bins as a model has steps, 22.
@@ -31,6 +31,7 @@ class NeuralSession:
             known.
         begin: (trial,) The time when each trial began on the session's clock in s, by which two
             sortings of one recording are recognised; None if it is not known.
+        stimuli: The names of the stimuli.
     """
 
     animal: str
@@ -41,6 +42,7 @@ class NeuralSession:
     depth: Floats | None = None
     inhibitory: NDArray[np.bool_] | None = None
     begin: Floats | None = None
+    stimuli: tuple[str, ...] = STIMULI
 
     def __post_init__(self) -> None:
         rates, stimulus = self.rates, self.stimulus
@@ -50,9 +52,9 @@ class NeuralSession:
             )
         if not np.isfinite(rates).all():
             raise ConfigError(f"session {self.name}: a rate is not finite")
-        if stimulus.dtype.kind not in "iu" or not np.isin(stimulus, range(len(STIMULI))).all():
+        if stimulus.dtype.kind not in "iu" or not np.isin(stimulus, range(len(self.stimuli))).all():
             raise ConfigError(
-                f"session {self.name}: a stimulus is a number from 0 to {len(STIMULI) - 1}"
+                f"session {self.name}: a stimulus is a number from 0 to {len(self.stimuli) - 1}"
             )
         trials, units = rates.shape
         for what, shape in (("depth", (units,)), ("inhibitory", (units,)), ("begin", (trials,))):
@@ -66,8 +68,8 @@ class NeuralSession:
 
     @property
     def trials(self) -> NDArray[np.int64]:
-        """(6,), trials of every stimulus."""
-        return np.bincount(self.stimulus, minlength=len(STIMULI))
+        """Number of trials (stimulus,) of every stimulus."""
+        return np.bincount(self.stimulus, minlength=len(self.stimuli))
 
 
 @dataclass(frozen=True)

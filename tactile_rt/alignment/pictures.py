@@ -122,7 +122,7 @@ def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool 
 
 
 def draw_profiles(series: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
-    """Draw RDMs (15,) as lines over the pairs of stimuli, scaled to spread 1.
+    """Draw RDMs (pair,) as lines over the pairs of stimuli, scaled to spread 1.
 
     Their correlation, which is what is compared, is that of the lines as they are drawn. An RDM
     with a NaN, or of equals, has none. The first is what the others are compared with.
@@ -142,7 +142,7 @@ def draw_profiles(series: Sequence[tuple[str, Floats]], names: Sequence[str]) ->
 
 
 def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
-    """Draw RDMs (15,), each darkest where it is largest; grey with a NaN."""
+    """Draw RDMs (pair,), each darkest where it is largest; grey with a NaN."""
     rows = ceil(len(maps) / MAPS_A_ROW)
     figure = Figure(figsize=(9.5, 2.2 * rows + 0.9), layout="constrained")
     panels = figure.subplots(rows, MAPS_A_ROW, squeeze=False)
@@ -159,7 +159,9 @@ def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> 
         left, below = k % MAPS_A_ROW == 0, k + MAPS_A_ROW >= len(maps)
         at = np.arange(len(names)) + 0.5
         panel.set_yticks(at if left else [], names if left else [], fontsize=6)
-        panel.set_xticks(at, names if below else [""] * 6, fontsize=6, rotation=45, ha="right")
+        panel.set_xticks(
+            at, names if below else [""] * len(names), fontsize=6, rotation=45, ha="right"
+        )
     return _finish(figure)
 
 

@@ -1,28 +1,28 @@
-"""Representational dissimilarity matrices of the six stimuli, and their comparison.
+"""Representational dissimilarity matrices (RDMs) of stimuli, and their comparison.
 
-An RDM here is its 15 entries above the diagonal, row by row: 1 - Pearson's r over units between the
-mean responses to two stimuli. RSA is Pearson's r between two RDMs (Chung et al. 2025, section
-Neural Evaluation; Kriegeskorte 2008).
+An RDM of n stimuli is its n (n - 1) / 2 entries above the diagonal, row by row, 15 of the six
+stimuli: 1 - Pearson's r over units between the mean responses to two stimuli. RSA is Pearson's r
+between two RDMs (Chung et al. 2025, section Neural Evaluation; Kriegeskorte 2008).
 """
 
+import math
 from functools import cache
-from itertools import combinations, permutations
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
+from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
 Floats = NDArray[np.float64]
 
-PAIRS = tuple(combinations(range(len(STIMULI)), 2))
 # The paper says near where the recordings say close.
 SYNONYMS = {"near": "close"}
 # Centred values below this share of the values themselves are rounding: the vector is constant.
 CONSTANT = 1e-13
-
-UPPER = np.triu_indices(len(STIMULI), k=1)
+EXACT = 7  # stimuli: of so many all relabellings are taken, of more so many are drawn
+DRAWN = 5000
 
 
 def stimulus_index(shape: str, distance: str) -> int:
@@ -35,18 +35,30 @@ def stimulus_index(shape: str, distance: str) -> int:
     return SHAPES.index(shape) * len(DISTANCES) + DISTANCES.index(distance)
 
 
+@cache
+def upper(stimuli: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns of the entries above the diagonal, for a number of stimuli."""
+    return np.triu_indices(stimuli, k=1)
+
+
+def count_stimuli(entries: int) -> int:
+    """Return of how many stimuli an RDM of so many entries is."""
+    return (1 + math.isqrt(1 + 8 * entries)) // 2
+
+
 def rdm(patterns: ArrayLike) -> Floats:
     """RDM of responses.
 
     Args:
-        patterns: (..., 6, unit), any finite scale; at least two units.
+        patterns: (..., stimulus, unit), any finite scale; at least two units.
 
     Returns:
-        (..., 15). NaN where one of the two responses is not finite or the same in all units.
+        (..., pair). NaN where one of the two responses is not finite or the same in all units.
     """
     unit_length = normalised(patterns)
     correlation = np.matmul(unit_length, np.swapaxes(unit_length, -1, -2))
-    return np.asarray(1 - correlation[..., UPPER[0], UPPER[1]])
+    i, j = upper(unit_length.shape[-2])
+    return np.asarray(1 - correlation[..., i, j])
 
 
 def pearson(a: ArrayLike, b: ArrayLike) -> Floats:
@@ -59,30 +71,39 @@ def pearson(a: ArrayLike, b: ArrayLike) -> Floats:
 
 
 def rsa(a: ArrayLike, b: ArrayLike) -> float:
-    """RSA of two sets of responses (6, unit), with numbers of units of their own."""
+    """RSA of two sets of responses (stimulus, unit), with numbers of units of their own."""
     return float(pearson(rdm(a), rdm(b)))
 
 
 def square(rdms: ArrayLike) -> Floats:
-    """RDMs (..., 15) as symmetric matrices (..., 6, 6) with a diagonal of zeros."""
+    """Arrange RDMs (..., pair) as symmetric matrices, their diagonal zero."""
     entries = np.asarray(rdms, dtype=np.float64)
-    matrix = np.zeros((*entries.shape[:-1], len(STIMULI), len(STIMULI)))
-    matrix[..., UPPER[0], UPPER[1]] = entries
-    matrix[..., UPPER[1], UPPER[0]] = entries
+    stimuli = count_stimuli(entries.shape[-1])
+    i, j = upper(stimuli)
+    matrix = np.zeros((*entries.shape[:-1], stimuli, stimuli))
+    matrix[..., i, j] = matrix[..., j, i] = entries
     return matrix
 
 
 @cache
-def relabellings() -> NDArray[np.intp]:
-    """Every relabelling of the six stimuli as a reordering of an RDM's entries.
+def relabellings(stimuli: int) -> NDArray[np.intp]:
+    """Relabel stimuli in every way, as reorderings of an RDM's entries.
+
+    Of more than `EXACT` stimuli, `DRAWN` ways are drawn, always the same ones.
 
     Returns:
-        (720, 15): ``rdms[..., relabellings()[k]]`` are the RDMs after the k-th; the first changes
-        nothing.
+        (way, pair), 720 ways of six stimuli: ``rdms[..., relabellings(6)[k]]`` are the RDMs after
+        the k-th; the first changes nothing.
     """
-    place = square(np.arange(len(PAIRS), dtype=np.float64)).astype(np.intp)
-    orders = np.array(list(permutations(range(len(STIMULI)))), dtype=np.intp)
-    entries: NDArray[np.intp] = place[orders[:, UPPER[0]], orders[:, UPPER[1]]]
+    i, j = upper(stimuli)
+    place = square(np.arange(len(i), dtype=np.float64)).astype(np.intp)
+    if stimuli <= EXACT:
+        orders = np.array(list(permutations(range(stimuli))), dtype=np.intp)
+    else:
+        same = np.tile(np.arange(stimuli), (DRAWN, 1))
+        orders = np.random.default_rng(0).permuted(same, axis=1)
+        orders[0] = same[0]
+    entries: NDArray[np.intp] = place[orders[:, i], orders[:, j]]
     entries.flags.writeable = False
     return entries
 

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import Floats, pearson, rdm
+from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
 from tactile_rt.core.errors import ConfigError
 
 BOOTSTRAPS = 1000
@@ -78,7 +78,7 @@ def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
         first: (bootstrap, row), whether a row is in the first half.
 
     Returns:
-        (bootstrap, 2, 15). A bootstrap with a half-mean that is not finite is NaN throughout.
+        (bootstrap, 2, pair). A bootstrap with a half-mean that is not finite is NaN throughout.
     """
     rates = np.asarray(rates, dtype=np.float64)
     if rates.ndim != 3 or first.ndim != 2 or rates.shape[0] != first.shape[1]:
@@ -89,7 +89,7 @@ def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
     values = np.where(there, flat, 0)
     # Sessions are padded to one length, so few columns differ in where they have values.
     patterns, column = _distinct_columns(there)
-    result = np.empty((first.shape[0], 2, 15))
+    result = np.empty((first.shape[0], 2, len(upper(rates.shape[1])[0])))
     for begin in range(0, first.shape[0], AT_ONCE):
         part = first[begin : begin + AT_ONCE]
         # Both halves are summed: a difference from the total would turn zeros into rounding.

@@ -8,9 +8,9 @@ import numpy as np
 
 from tactile_rt.alignment import pictures
 from tactile_rt.alignment.html_page import format_number, join_notes, make_page, make_table
+from tactile_rt.alignment.rdm import relabellings
 from tactile_rt.alignment.results import ModelResult, Results
 from tactile_rt.alignment.scoring import Score
-from tactile_rt.core.stream.stimuli import STIMULI
 
 VERDICTS = {
     "pass": '<span class="good">passes</span>',
@@ -27,11 +27,17 @@ PAPER = (
     "of such a maximum too, so compare it with the dashed line, not with 0."
 )
 LIMITS = (
-    "<p>Six stimuli give 15 dissimilarities, so many models that differ a lot fit alike, and the "
-    "smallest p that can be had is 1/720. The highest of 20 layers on 12 targets has, for "
-    "<em>random</em> dissimilarities, a median of 0.68 before and 0.79 after the noise "
-    "correction: a high maximum alone is weak evidence. The stimuli were whisked in "
-    "simulation, the animals' choices, licks and movements were not.</p>"
+    "<p>{} stimuli give {} dissimilarities, and few of them let many models that differ a lot fit "
+    "alike; the smallest p that can be had is 1/{}.{}</p>"
+)
+LIMITS_OF_SIX = (
+    " The highest of 20 layers on 12 targets has, for <em>random</em> dissimilarities, a median of "
+    "0.68 before and 0.79 after the noise correction: a high maximum alone is weak evidence. The "
+    "stimuli were whisked in simulation, the animals' choices, licks and movements were not."
+)
+WHISKED = (
+    "An array of whiskers whisks six objects: convex or concave, close, at a medium distance or "
+    "far. "
 )
 KEY = (
     "<p>Bars: mean over reliable animals; dots: animals; framed: layers that count in the score; "
@@ -45,8 +51,13 @@ PERFORMANCE, SIZE, SCORE = "task performance", "parameters", "score ± s.e.m."
 
 def report_page(results: Results) -> str:
     """Show scores as HTML."""
+    stimuli = len(results.benchmark.stimuli)
+    ways = relabellings(stimuli)
+    limits = LIMITS.format(stimuli, ways.shape[1], len(ways), LIMITS_OF_SIX if results.raw else "")
     used = [f"benchmark of {', '.join(results.benchmark.sources) or 'no named files'}"]
-    used.append("input {} {:.12}".format(*(results.input.get(k, "") for k in ("file", "sha256"))))
+    if results.raw:
+        named = (results.input.get(key, "") for key in ("file", "sha256"))
+        used.append("input {} {:.12}".format(*named))
     used += [f"{m.name} {m.sha256[:12]} ({m.precision})" for m in results.models]
     return make_page(
         "Alignment with barrel cortex",
@@ -55,18 +66,18 @@ def report_page(results: Results) -> str:
         f"<h2>Fit of every layer</h2>{KEY}"
         + "".join(_show_layers(results, model) for model in results.models)
         + (_compare(results) if len(results.models) > 1 else "")
-        + f"<h2>What is compared: dissimilarities between the six stimuli</h2>{_show_rdms(results)}"
+        + f"<h2>What is compared: dissimilarities between the stimuli</h2>{_show_rdms(results)}"
         f"<h2>Every animal</h2>{_show_animals(results)}"
-        f"<h2>What this cannot say</h2>{LIMITS}{join_notes(['; '.join(used)])}",
+        f"<h2>What this cannot say</h2>{limits}{join_notes(['; '.join(used)])}",
     )
 
 
 def _introduce(results: Results) -> str:
     benchmark = results.benchmark
     return (
-        "An array of whiskers whisks six objects: convex or concave, close, at a medium distance "
-        "or far. For a model's layer and for an animal's neurons alike, every two objects are more "
-        "or less <em>dissimilar</em>. How well these 15 dissimilarities agree, corrected for the "
+        f"{WHISKED if results.raw else ''}For a model's layer and for an animal's neurons alike, "
+        "every two stimuli are more or less <em>dissimilar</em>. How well these dissimilarities "
+        "agree, corrected for the "
         "noise of the recordings, is the <em>fit</em>: 0 is none, 1 is all that noise permits. "
         f"Protocol <b>{escape(benchmark.protocol)}</b>, {len(benchmark.reliable)} reliable animals "
         f"of {len(benchmark.targets)}. {STRICT if benchmark.protocol == 'strict' else PAPER}"
@@ -88,13 +99,14 @@ def _summarise(results: Results) -> str:
         f"{format_number(a2a.mean)} ± {format_number(a2a.sem)}"
         f"<br><small>highest {format_number(a2a.highest)}</small>"
     )
-    rows.append([RAW, _with_error(results.raw), format_number(results.raw.p, 4), *[""] * 4])
+    if results.raw:
+        rows.append([RAW, _with_error(results.raw), format_number(results.raw.p, 4), *[""] * 4])
     rows.append(["an animal, from the others", between, *[""] * 5])
     head = ["model", SCORE, "p", "chance, 95th percentile", "untrained", SIZE]
     why = [f"{model.name}: {model.turing_why}" for model in results.models if model.turing_why]
     return (
         make_table([*head, "NeuroAI Turing test"], rows)
-        + '<p class="soft">p: share of the 720 relabellings of the stimuli that score as high, the '
+        + '<p class="soft">p: share of the relabellings of the stimuli that score as high, the '
         "layer chosen anew each time. Where the raw input or the untrained network scores as high, "
         "it is not training that made it fit. The Turing test asks whether a model fits single "
         "animals as another animal would: it fails what is worse, and passes what is shown to be "
@@ -106,7 +118,7 @@ def _summarise(results: Results) -> str:
 def _show_layers(results: Results, model: ModelResult) -> str:
     untrained = model.untrained
     control = dict(zip(untrained.layers, _mean_fits(untrained), strict=True)) if untrained else {}
-    columns = [_raw_bar(results)]
+    columns = _raw_bars(results)
     for layer, fit, row in zip(model.layers, _mean_fits(model), model.corrected, strict=True):
         part, _, name = layer.partition(".")
         columns.append(
@@ -122,7 +134,7 @@ def _show_layers(results: Results, model: ModelResult) -> str:
 
 
 def _compare(results: Results) -> str:
-    columns = [_raw_bar(results)]
+    columns = _raw_bars(results)
     for model in results.models:
         mark = model.untrained.score if model.untrained else math.nan
         columns.append(pictures.Bar(model.name, model.score, "decoder", model.per_target, mark))
@@ -187,8 +199,8 @@ def _compare_masking(results: Results) -> str:
 
 
 def _show_rdms(results: Results) -> str:
-    targets = results.benchmark.all_targets
-    maps, rest = [(RAW, results.raw.rdms[0])], []
+    targets, stimuli = results.benchmark.all_targets, results.benchmark.stimuli
+    maps, rest = [(RAW, results.raw.rdms[0])] if results.raw else [], []
     for model in results.models:
         counted = [name for name in model.chosen if name]
         best = max(set(counted), key=counted.count) if counted else ""
@@ -209,13 +221,13 @@ def _show_rdms(results: Results) -> str:
         "<p>1 - correlation over units of the responses to two stimuli. Each map has its own "
         "scale, for fits do not depend on it: the darker, the more dissimilar. Shown are the mean "
         "of the reliable animals, the input, and the layer of each model that is chosen most "
-        f"often.</p>{pictures.draw_heat_maps(lines, STIMULI)}"
+        f"often.</p>{pictures.draw_heat_maps(lines, stimuli)}"
         "<h3>The same as lines</h3><p>Each line moved and scaled, for a fit depends on neither: "
-        f"lines that rise and fall together fit.</p>{pictures.draw_profiles(lines, STIMULI)}"
+        f"lines that rise and fall together fit.</p>{pictures.draw_profiles(lines, stimuli)}"
         f"<details><summary>every animal ({len(animals)})</summary>"
-        f"{pictures.draw_heat_maps(animals, STIMULI)}</details>"
+        f"{pictures.draw_heat_maps(animals, stimuli)}</details>"
         f"<details><summary>every other layer ({len(rest)})</summary>"
-        f"{pictures.draw_heat_maps(rest, STIMULI) if rest else ''}</details>"
+        f"{pictures.draw_heat_maps(rest, stimuli) if rest else ''}</details>"
     )
 
 
@@ -248,10 +260,12 @@ def _levels(results: Results) -> list[pictures.Level]:
     ]
 
 
-def _raw_bar(results: Results) -> pictures.Bar:
-    raw = results.raw
+def _raw_bars(results: Results) -> list[pictures.Bar]:
+    """The bar of the loads themselves, where there are any."""
+    if (raw := results.raw) is None:
+        return []
     fits = raw.corrected[0][list(raw.reliable)]
-    return pictures.Bar("raw input", _mean_fits(raw)[0], "raw", fits)
+    return [pictures.Bar("raw input", _mean_fits(raw)[0], "raw", fits)]
 
 
 def _mean_fits(made: Score) -> list[float]:

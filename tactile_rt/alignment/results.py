@@ -12,7 +12,7 @@ from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_be
 from tactile_rt.alignment.gate import neural_checks
 from tactile_rt.alignment.json_file import Number, read_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.rdm import PAIRS, Floats, normalised
+from tactile_rt.alignment.rdm import Floats, normalised, upper
 from tactile_rt.alignment.scoring import Score, score
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
@@ -47,7 +47,7 @@ class Results(
 
     benchmark: Benchmark
     models: tuple[ModelResult, ...]
-    raw: Score
+    raw: Score | None  # of the loads; None where the stimuli are not the six that are whisked
     input: dict[str, str]
 
 
@@ -55,6 +55,8 @@ def results_of(
     benchmark: Benchmark, stimuli: StimuliInput, models: Sequence[ModelResult]
 ) -> Results:
     """Scores of models on one benchmark, the sensors themselves beside them."""
+    if benchmark.stimuli != STIMULI:
+        return Results(benchmark, tuple(models), None, {})
     raw = score(benchmark, {"raw": stimuli.raw()})
     return Results(benchmark, tuple(models), raw, {"file": stimuli.name, "sha256": stimuli.sha256})
 
@@ -83,23 +85,25 @@ def model_result(
         performance=accuracy,
         performance_of=measured_on,
         untrained=score(benchmark, untrained.patterns) if untrained else None,
-        notes=(*layers.notes, *_without_rdm(patterns)),
+        notes=(*layers.notes, *_without_rdm(patterns, benchmark.stimuli)),
         groups=_groups(layers),
         turing=test.verdict if test else "",
         turing_why=test.why if test else "",
     )
 
 
-def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
+def _without_rdm(
+    patterns: Mapping[str, NDArray[np.float64]], names: Sequence[str]
+) -> Iterator[str]:
     """What takes no part in a score, and why: a line for all layers of one reason."""
     found: dict[tuple[str, ...], list[str]] = {}
     for layer, responses in patterns.items():
         there = np.asarray(np.isfinite(normalised(responses)).all(axis=1))
         if not there.all():
-            alike = tuple(s for s, one in zip(STIMULI, there, strict=True) if not one)
+            alike = tuple(s for s, one in zip(names, there, strict=True) if not one)
             found.setdefault(alike, []).append(layer)
     for alike, layers in found.items():
-        stimuli = "every stimulus" if len(alike) == len(STIMULI) else ", ".join(alike)
+        stimuli = "every stimulus" if len(alike) == len(names) else ", ".join(alike)
         yield (
             f"{len(layers)} of {len(patterns)} layers have no RDM and take no part, for all units "
             f"of each answer {stimuli} alike: {', '.join(layers)}"
@@ -111,25 +115,27 @@ def read_results(path: Path) -> Results:
     results = read_json(path, Results, "tactile-rt align score --json")
     check_benchmark(results.benchmark, path)
     targets = tuple(t.name for t in results.benchmark.all_targets)
-    _check_score(results.raw, targets, ("raw",), f"{path} is damaged: raw sensor input")
+    pairs = len(upper(len(results.benchmark.stimuli))[0])
+    if results.raw is not None:
+        _check_score(results.raw, targets, ("raw",), pairs, f"{path} is damaged: raw sensor input")
     for model in results.models:
         where = f"{path} is damaged: {model.name}"
-        _check_score(model, targets, model.layers, where)
+        _check_score(model, targets, model.layers, pairs, where)
         if not len(model.units) == len(model.first) == len(model.layers):
             raise ConfigError(f"{where}: units and layers do not fit")
         if model.untrained is not None:
-            _check_score(model.untrained, targets, model.untrained.layers, where)
+            _check_score(model.untrained, targets, model.untrained.layers, pairs, where)
     return results
 
 
 def _check_score(
-    made: Score, targets: tuple[str, ...], layers: tuple[str, ...], where: str
+    made: Score, targets: tuple[str, ...], layers: tuple[str, ...], pairs: int, where: str
 ) -> None:
     shape = (len(layers), len(targets))
     if not (
         made.layers == layers
         and made.targets == targets
-        and made.rdms.shape == (len(layers), len(PAIRS))
+        and made.rdms.shape == (len(layers), pairs)
         and made.r.shape == made.corrected.shape == made.unfiltered.shape == shape
         and made.per_target.shape == (len(targets),)
         and len(made.chosen) == len(made.reliable) == len(targets)
@@ -138,7 +144,7 @@ def _check_score(
 
 
 def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floats:
-    """RDMs (layer, 15) of the one model in a file of scores on this benchmark and these stimuli.
+    """RDMs (layer, pair) of the one model in a file of scores on this benchmark and these stimuli.
 
     Raises:
         ConfigError: unreadable, of several models, or of another benchmark or other stimuli.
@@ -148,7 +154,7 @@ def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floa
         raise ConfigError(f"{path} has {len(results.models)} models; a baseline is one")
     if benchmark_sha256(results.benchmark) != benchmark_sha256(benchmark):
         raise ConfigError(f"{path} was scored on another benchmark: score the baseline on this one")
-    if results.input.get("sha256") != stimuli.sha256:
+    if results.raw and results.input.get("sha256") != stimuli.sha256:
         raise ConfigError(
             f"{path} was scored on other stimuli ({results.input.get('file', 'not named')}) than "
             f"{stimuli.name}: score the baseline on these"

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from tactile_rt.alignment import statistics
 from tactile_rt.alignment.benchmark import Benchmark
 from tactile_rt.alignment.json_file import Number
-from tactile_rt.alignment.rdm import PAIRS, Floats, pearson, rdm
+from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
@@ -19,7 +19,7 @@ class Score(msgspec.Struct, frozen=True, eq=False):
 
     Attributes:
         targets: The names of the targets; for paper-code the pooled animals are the last.
-        rdms: (layer, 15) The RDM of each layer.
+        rdms: (layer, pair) The RDM of each layer.
         r: (layer, target) Correlations before the correction for noise.
         corrected: (layer, target) Correlations after the correction for noise; NaN where a layer
             has no RDM or a target is too noisy.
@@ -30,8 +30,8 @@ class Score(msgspec.Struct, frozen=True, eq=False):
         per_target: (target,) The chosen layer's corrected correlation; NaN for unreliable targets.
         score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
             `corrected`.
-        p: The share of the 720 relabellings of the stimuli, layers chosen anew, that reach the
-            score, at least 1/720.
+        p: The share of relabellings of the stimuli, layers chosen anew, that reach the score: of
+            six stimuli at least 1/720.
     """
 
     protocol: str
@@ -50,28 +50,28 @@ class Score(msgspec.Struct, frozen=True, eq=False):
     null_95: Number
 
 
-def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
-    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`; NaN of a single unit's."""
-    rdms = np.empty((len(layers), len(PAIRS)))
+def layer_rdms(layers: Mapping[str, ArrayLike], stimuli: int = len(STIMULI)) -> Floats:
+    """Compute RDMs (layer, pair) of responses (stimulus, unit); NaN of a single unit's."""
+    rdms = np.empty((len(layers), len(upper(stimuli)[0])))
     for i, (name, values) in enumerate(layers.items()):
         patterns = np.asarray(values, dtype=np.float64)
-        if patterns.ndim != 2 or patterns.shape[0] != len(STIMULI) or patterns.shape[1] < 1:
+        if patterns.ndim != 2 or patterns.shape[0] != stimuli or patterns.shape[1] < 1:
             raise ConfigError(
-                f"layer {name}: responses {patterns.shape}, not ({len(STIMULI)} stimuli, units)"
+                f"layer {name}: responses {patterns.shape}, not ({stimuli} stimuli, units)"
             )
         rdms[i] = rdm(patterns)
     return rdms
 
 
 def score(benchmark: Benchmark, layers: Mapping[str, ArrayLike]) -> Score:
-    """Score layers, given as responses (6, unit) in the order of `STIMULI`."""
-    return score_rdms(benchmark, tuple(layers), layer_rdms(layers))
+    """Score layers, given as responses (stimulus, unit) in the order of the benchmark's stimuli."""
+    return score_rdms(benchmark, tuple(layers), layer_rdms(layers, len(benchmark.stimuli)))
 
 
 def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> Score:
-    """Score layers, given as RDMs (layer, 15); a layer with a NaN scores NaN."""
+    """Score layers, given as RDMs (layer, pair); a layer with a NaN scores NaN."""
     rdms = np.asarray(rdms, dtype=np.float64)
-    if not names or rdms.shape != (len(names), len(PAIRS)):
+    if not names or rdms.shape != (len(names), len(upper(len(benchmark.stimuli))[0])):
         raise ConfigError(f"{len(names)} layers and RDMs {rdms.shape} do not fit")
     targets = benchmark.all_targets
     goal = np.array([t.chosen.rdm for t in targets])

@@ -1,7 +1,8 @@
 """Choosing a layer without looking at the animal it is scored on, and what chance would give.
 
-With six stimuli there are 720 ways to relabel them, so the null distribution is exact: every step
-that looks at the neural data, the choice of a layer included, is done again for each.
+Six stimuli can be relabelled in 720 ways, so the null distribution is exact; of more than seven
+it is drawn (`rdm.relabellings`). Every step that looks at the neural data, the choice of a layer
+included, is done again for each.
 """
 
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import Floats, normalised, relabellings
+from tactile_rt.alignment.rdm import Floats, count_stimuli, normalised, relabellings
 
 # Points of Student's t that it exceeds in one of so many cases, for 1, 2, ... degrees of freedom;
 # and the normal's beyond.
@@ -26,6 +27,7 @@ Statistic = Callable[[Floats], Floats]
 
 # Relabellings that leave an RDM as it is give its statistic again, but for rounding.
 TIE = 1e-12
+AT_ONCE = 1 << 24  # numbers: of fifty stimuli and many layers, all relabellings take gigabytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,8 @@ class Permutations:
     """A statistic among those of all relabelled stimuli."""
 
     statistic: float  # statistic of the stimuli as they are; NaN if there is none
-    null: Floats  # (720,) statistics of all relabellings, the identity first
-    p: float  # share of relabellings that reach the statistic, at least 1/720
+    null: Floats  # (way,) statistics of all relabellings, the identity first: 720 of six stimuli
+    p: float  # share of relabellings that reach the statistic, at least one of them
     percentile_95: float
 
 
@@ -74,22 +76,25 @@ def highest(values: Floats) -> Floats:
 def max_statistic(
     rdms: ArrayLike, targets: ArrayLike, factors: ArrayLike, statistic: Statistic = mean_held_out
 ) -> Permutations:
-    """Exact permutation test of a statistic that chooses among layers.
+    """Test a statistic that chooses among layers by relabelling the stimuli.
 
     Args:
-        rdms: (layer, 15) of a model; a layer with a NaN takes no part.
-        targets: (target, 15), finite.
+        rdms: (layer, pair) of a model; a layer with a NaN takes no part.
+        targets: (target, pair), finite.
         factors: (target,) that correct a target's correlations for its noise, finite.
         statistic: of corrected correlations (..., layer, target).
     """
-    unit = normalised(rdms)  # (layer, 15): relabelling keeps mean and length
+    unit = normalised(rdms)  # (layer, pair): relabelling keeps mean and length
     unit = unit[np.isfinite(unit).all(axis=-1)]
     goal = normalised(targets) * np.asarray(factors, dtype=np.float64)[:, None]
+    ways = relabellings(count_stimuli(unit.shape[-1]))
     if unit.size and goal.size:
-        relabelled = unit[:, relabellings()].swapaxes(0, 1)  # (720, layer, 15)
-        null = statistic(np.matmul(relabelled, goal.T))
+        together = max(1, AT_ONCE // unit.size)
+        parts = (ways[at : at + together] for at in range(0, len(ways), together))
+        # (way, layer, pair) by (pair, target)
+        null = np.concatenate([statistic(unit[:, p].swapaxes(0, 1) @ goal.T) for p in parts])
     else:
-        null = np.full(len(relabellings()), np.nan)
+        null = np.full(len(ways), np.nan)
     if np.isnan(null).any():
         nan = float("nan")
         return Permutations(nan, null, nan, nan)

@@ -31,10 +31,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import Animal, NeuralSession, rates_sha256
-from tactile_rt.alignment.rdm import CONSTANT, UPPER, Floats, normalised, pearson
+from tactile_rt.alignment.rdm import CONSTANT, Floats, normalised, pearson, upper
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
-from tactile_rt.core.stream.stimuli import STIMULI
 
 MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves
@@ -44,11 +43,12 @@ MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over units of responses to six stimuli."""
+    """Sums over units of responses to stimuli."""
 
     units: Floats  # (...) number of units that the sums run over
-    sums: Floats  # (..., 6) sum over units of the response to each stimulus
-    products: Floats  # (..., 6, 6) sum over units of the products of the responses to two stimuli
+    sums: Floats  # (..., stimulus) sum over units of the response to each stimulus
+    # (..., stimulus, stimulus) sum over units of the products of the responses to two stimuli
+    products: Floats
 
     def __add__(self, other: "Moments") -> "Moments":
         return Moments(
@@ -56,7 +56,7 @@ class Moments:
         )
 
     def rdm(self) -> Floats:
-        """RDMs (..., 15); NaN where a stimulus's response is the same in all units."""
+        """RDMs (..., pair); NaN where a stimulus's response is the same in all units."""
         units = np.maximum(self.units, 1)[..., None]
         mean = self.sums / units
         covariance = self.products - units[..., None] * mean[..., :, None] * mean[..., None, :]
@@ -64,7 +64,8 @@ class Moments:
         scale = np.diagonal(self.products, axis1=-2, axis2=-1)
         deviation = np.sqrt(np.where(variance > np.sqrt(CONSTANT) * scale, variance, np.nan))
         correlation = covariance / (deviation[..., :, None] * deviation[..., None, :])
-        return np.asarray(1 - correlation[..., UPPER[0], UPPER[1]])
+        i, j = upper(correlation.shape[-1])
+        return np.asarray(1 - correlation[..., i, j])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ def freeze_strict(
     for done, animal in enumerate(sorted(animals, key=lambda a: a.name), start=1):
         sessions = []
         for session in sorted(animal.sessions, key=lambda s: s.name):
-            few = [f"{n} of {s}" for s, n in zip(STIMULI, session.trials, strict=True)
+            few = [f"{n} of {s}" for s, n in zip(session.stimuli, session.trials, strict=True)
                    if n < MINIMUM_TRIALS]  # fmt: skip
             if few:
                 notes.append(
@@ -164,6 +165,7 @@ def freeze_strict(
         bootstraps=bootstraps,
         seed=seed,
         notes=tuple(notes),
+        stimuli=animals[0].sessions[0].stimuli,
     )
 
 
@@ -186,8 +188,8 @@ def _pools(
 class Divided:
     """Random divisions of a session's trials in two, and of each half in two."""
 
-    halves: Floats  # (division, 2, 6, unit) mean responses over each half of the trials
-    quarters: Floats  # (division, 2, 2, 6, unit) mean responses over each half of each half
+    halves: Floats  # (division, 2, stimulus, unit) mean responses over each half of the trials
+    quarters: Floats  # (division, 2, 2, stimulus, unit) those over each half of each half
     # (division, 2, unit) whether the tuning of a unit over that half of the trials has a
     # reliability above `MINIMUM_RELIABILITY`
     reliable: NDArray[np.bool_]
@@ -201,10 +203,11 @@ def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) ->
     is what Spearman-Brown makes of the correlation of two halves, without drawing any.
     """
     units = session.rates.shape[1]
-    quarters = np.empty((divisions, 4, len(STIMULI), units))
-    halves = np.empty((divisions, 2, len(STIMULI), units))
+    stimuli = len(session.stimuli)
+    quarters = np.empty((divisions, 4, stimuli, units))
+    halves = np.empty((divisions, 2, stimuli, units))
     noise = np.zeros((divisions, 2, units))  # variance of a mean response, mean over stimuli
-    for stimulus in range(len(STIMULI)):
+    for stimulus in range(stimuli):
         rates = session.rates[session.stimulus == stimulus]
         n = len(rates)
         # Sizes of the quarters differ by one at most, and so do those of the halves.
@@ -219,12 +222,12 @@ def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) ->
         mean = (sums[:, 0::2] + sums[:, 1::2]) / sizes
         spread = np.maximum((squares[:, 0::2] + squares[:, 1::2]) / sizes - mean**2, 0)
         halves[:, :, stimulus] = mean
-        noise += spread / (sizes - 1) / len(STIMULI)
+        noise += spread / (sizes - 1) / stimuli
     signal = halves.var(axis=2, ddof=1)
     varies = signal > CONSTANT * (halves**2).mean(axis=2)
     # Counts of spikes are whole, so that a unit may be just at the limit: rounding must not decide.
     reliable = varies & (noise < (1 - MINIMUM_RELIABILITY - TIE) * signal)
-    return Divided(halves, quarters.reshape(divisions, 2, 2, len(STIMULI), units), reliable)
+    return Divided(halves, quarters.reshape(divisions, 2, 2, stimuli, units), reliable)
 
 
 def _consistency(
@@ -248,7 +251,7 @@ def _consistency(
 
 
 def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:
-    """Sum responses (..., 6, unit) over the units, or those `counted` (..., unit)."""
+    """Sum responses (..., stimulus, unit) over the units, or those `counted` (..., unit)."""
     if counted is None:
         units = np.full(patterns.shape[:-2], float(patterns.shape[-1]))
     else:
@@ -284,8 +287,9 @@ def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
         trial, unit = _refined(ranks, trial)
     rows, columns = np.lexsort((trial, session.stimulus)), np.argsort(unit)
     ordered = NeuralSession(
-        session.animal, session.name, session.rates[np.ix_(rows, columns)], session.stimulus[rows]
-    )
+        session.animal, session.name, session.rates[np.ix_(rows, columns)],
+        session.stimulus[rows], stimuli=session.stimuli,
+    )  # fmt: skip
     return ordered, key
 
 

@@ -13,6 +13,7 @@ from tactile_rt.cli.options import Json, Seed, argument, option, set_option
 from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
+from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
     from tactile_rt.alignment.results import Results
@@ -56,7 +57,7 @@ def write_brain(
 @align.command("build", epilog="tactile-rt align build brain/recordings --out benchmark.json")
 def build_benchmark(
     recordings: Annotated[
-        list[Path], argument("NWB files, folders of them, or one published .npz.")
+        list[Path], argument("NWB files, folders of them, one .npz, or two .csv (see the docs).")
     ],
     out: Annotated[Path, option("Benchmark to write, .json.")],
     protocol: Annotated[str, option("Protocol: strict or paper-code.")] = "strict",
@@ -125,7 +126,7 @@ def score_models(
         with progress_bar("scoring", len(models)) as update:
             for path, name in zip(models, names, strict=True):
                 update(description=name)
-                layers, own = load_layers(path, felt, input_name)
+                layers, own = load_layers(path, felt, input_name, frozen.stimuli)
                 layers = replace(layers, name=name)
                 before = load_untrained(path, felt, seed)
                 done.append(model_result(frozen, layers, before, own))
@@ -197,7 +198,10 @@ def decode_stimuli(
         from tactile_rt.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
-        targets = load_strict(benchmark).targets if benchmark else ()
+        frozen = load_strict(benchmark) if benchmark else None
+        if frozen and frozen.stimuli != STIMULI:
+            raise ConfigError(f"{benchmark}: shape and distance are those of the six stimuli alone")
+        targets = frozen.targets if frozen else ()
         recorded, notes = animal_means(animals) if animals else ({}, [])
         names = check_models(models)
         rows: list[tuple[str, str, Any]] = []
@@ -262,7 +266,8 @@ def _show_scores(results: Any) -> None:
             max(set(chosen), key=chosen.count) if chosen else "-",
         )
     raw, a2a = results.raw, results.benchmark.a2a
-    table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
+    if raw:
+        table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
     table.add_row("animal to animal", f"{_said(a2a.mean)} ± {_said(a2a.sem)}")
     table.add_row("its highest", _said(a2a.highest))
     print_table(table)

@@ -97,7 +97,7 @@ def _gate(
             checks.append(check)
             rows += found
         if frozen is not None:
-            patterns = load_layers(model, felt)[0].patterns
+            patterns = load_layers(model, felt, names=frozen.stimuli)[0].patterns
             checks = [*neural_checks(score(frozen, patterns), frozen, before), *checks]
     code = exit_code(checks)
     colours = {"pass": "green", "fail": "bold red", "inconclusive": "yellow"}

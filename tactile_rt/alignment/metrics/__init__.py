@@ -35,7 +35,7 @@ class Measure:
     Attributes:
         ceiling: The value that a perfect model is expected to reach on these trials; NaN if the
             animal cannot be measured on.
-        fit: The function that measures a layer, given as responses (6 stimuli, step, unit) with
+        fit: The function that measures a layer, given as responses (stimulus, step, unit) with
             NaN in the steps that input cannot reach. NaN for a layer that tells nothing apart.
         minimum: The lowest ceiling that is corrected for; for a share of variance the square of
             that for a correlation.

@@ -16,8 +16,7 @@ from tactile_rt.alignment.metrics import Measure
 from tactile_rt.alignment.metrics.noise_ceiling import ceiling_of, divisions, sessions_of
 from tactile_rt.alignment.metrics.rsa_cka import NOTHING, mean_pattern
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import UPPER, Floats, pearson
-from tactile_rt.core.stream.stimuli import STIMULI
+from tactile_rt.alignment.rdm import Floats, pearson, upper
 
 
 def crossnobis(animal: Animal) -> Measure:
@@ -26,14 +25,15 @@ def crossnobis(animal: Animal) -> Measure:
     if not sessions:
         return NOTHING
     units = sum(s.rates.shape[1] for s in sessions)
-    whole, halves = np.zeros(15), np.zeros((2, 1, 15))
+    pairs = len(upper(len(sessions[0].stimuli))[0])
+    whole, halves = np.zeros(pairs), np.zeros((2, 1, pairs))
     for session in sessions:
         white = session.rates @ _whitening(session)
         every = np.ones((1, len(white)), dtype=np.bool_)
         first = divisions(session)
-        whole = whole + distances(white, session.stimulus, every)[0] / units
+        whole = whole + distances(white, session, every)[0] / units
         halves = halves + np.stack(
-            [distances(white, session.stimulus, half) / units for half in (first, ~first)]
+            [distances(white, session, half) / units for half in (first, ~first)]
         )
     goal = whole
     return Measure(
@@ -42,7 +42,7 @@ def crossnobis(animal: Animal) -> Measure:
     )
 
 
-def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
+def distances(white: Floats, session: NeuralSession, chosen: NDArray[np.bool_]) -> Floats:
     """Cross-validated squared distances, summed over units.
 
     Args:
@@ -50,17 +50,17 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
         chosen: (division, trial), which trials count; at least two of every stimulus.
 
     Returns:
-        (division, 15).
+        (division, pair).
     """
-    of_each = [chosen * (stimulus == k) for k in range(len(STIMULI))]
-    weights = np.stack(of_each, axis=1).astype(np.float64)  # (division, 6, trial)
+    of_each = [chosen * (session.stimulus == k) for k in range(len(session.stimuli))]
+    weights = np.stack(of_each, axis=1).astype(np.float64)  # (division, stimulus, trial)
     number = weights.sum(axis=-1)
     total = weights @ white
     alone = weights @ (white**2).sum(axis=-1)
     own = ((total**2).sum(axis=-1) - alone) / (number * (number - 1))
     mean = total / number[..., None]
     between = np.matmul(mean, mean.swapaxes(-1, -2))
-    i, j = UPPER
+    i, j = upper(len(session.stimuli))
     return np.asarray(own[:, i] + own[:, j] - 2 * between[:, i, j])
 
 
@@ -83,12 +83,12 @@ def _whitening(session: NeuralSession) -> Floats:
     """(unit, unit) whose product with its transpose is the inverse covariance of the noise."""
     rates, stimulus = session.rates, session.stimulus
     residuals = rates.copy()
-    for k in range(len(STIMULI)):
+    for k in range(len(session.stimuli)):
         residuals[stimulus == k] -= rates[stimulus == k].mean(axis=0)
     live = (residuals**2).sum(axis=0) > 0  # a unit that never varies has no noise to measure by
     out = np.zeros((len(live), len(live)))
     if live.any():
-        freedom = len(rates) - len(STIMULI)
+        freedom = len(rates) - len(session.stimuli)
         covariance = shrunk_covariance(residuals[:, live], freedom)
         # With few trials it may be short of positive: such directions are left out.
         values, vectors = np.linalg.eigh(covariance)
@@ -99,5 +99,5 @@ def _whitening(session: NeuralSession) -> Floats:
 
 
 def _euclidean(patterns: Floats) -> Floats:
-    i, j = UPPER
+    i, j = upper(len(patterns))
     return np.asarray(((patterns[i] - patterns[j]) ** 2).sum(axis=-1))

@@ -1,7 +1,7 @@
 """How much of each unit's response to a stimulus a linear readout of a layer predicts unseen.
 
-One of six stimuli is held out at a time. A ridge regression from the layer's steps to the units'
-bins of 45 ms (without a time course: from means to means) learns from the other five, its penalty
+One stimulus is held out at a time. A ridge regression from the layer's steps to the units'
+bins of 45 ms (without a time course: from means to means) learns from the others, its penalty
 chosen by holding out each of these in turn. Both sides are taken about the mean of the learning
 stimuli in each bin, so that a course which all stimuli share, such as the onset of touch, earns
 nothing, and a regression that knows nothing scores 0 (a correlation would be negative: the mean of
@@ -20,7 +20,6 @@ from tactile_rt.alignment.metrics.noise_ceiling import bins_of, means_of, sessio
 from tactile_rt.alignment.metrics.rsa_cka import NOTHING, mean_pattern
 from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.rdm import Floats
-from tactile_rt.core.stream.stimuli import STIMULI
 
 PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel's diagonal
 
@@ -62,7 +61,7 @@ def linear(animal: Animal) -> Measure:
 def predicted(layer: Floats, goal: Floats) -> Floats:
     """Predict the goal's responses to every stimulus from those to the others.
 
-    From a layer (6, bin, feature) and a goal (6, bin, unit) to (6, bin, unit).
+    From a layer (stimulus, bin, feature) and a goal (stimulus, bin, unit) to the goal's shape.
     """
     out = np.empty_like(goal)
     for i in range(len(goal)):
@@ -95,10 +94,10 @@ def _ridge(
 
 
 def _noise(session: NeuralSession, bins: int) -> Floats:
-    """Variance of the mean over trials: (6, bin, unit)."""
+    """Variance of the mean over trials: (stimulus, bin, unit)."""
     values = values_of(session, bins)
-    out = np.empty((len(STIMULI), *values.shape[1:]))
-    for k in range(len(STIMULI)):
+    out = np.empty((len(session.stimuli), *values.shape[1:]))
+    for k in range(len(session.stimuli)):
         trials = values[session.stimulus == k]
         number = np.isfinite(trials).sum(axis=0)
         out[k] = np.nanvar(trials, axis=0, ddof=1) / number

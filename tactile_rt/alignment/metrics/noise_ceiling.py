@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from tactile_rt.alignment.neural import Animal, NeuralSession
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.alignment.reliability import spearman_brown
-from tactile_rt.core.stream.stimuli import STIMULI
 
 DIVISIONS = 100
 SEED = 1234
@@ -32,7 +31,7 @@ def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
         if session.course is None:
             return 0
         there = np.asarray(np.isfinite(session.course).all(axis=2))  # (trial, bin)
-        trials = [there[session.stimulus == k].sum(axis=0) for k in range(len(STIMULI))]
+        trials = [there[session.stimulus == k].sum(axis=0) for k in range(len(session.stimuli))]
         enough = np.min(trials, axis=0) >= MINIMUM_TRIALS
         reached.append(int(enough.size if enough.all() else enough.argmin()))
     return min(reached)
@@ -49,7 +48,7 @@ def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.boo
     """Random divisions of a session's trials: (division, trial), whether it is in half 1."""
     rng = np.random.default_rng([SEED, len(session.stimulus)])
     first = np.zeros((number, len(session.stimulus)), dtype=np.bool_)
-    for stimulus in range(len(STIMULI)):
+    for stimulus in range(len(session.stimuli)):
         rows = np.flatnonzero(session.stimulus == stimulus)
         places = rng.permuted(np.tile(np.arange(len(rows)), (number, 1)), axis=1)
         first[:, rows] = places < len(rows) // 2
@@ -57,17 +56,17 @@ def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.boo
 
 
 def half_means(session: NeuralSession, bins: int, number: int = DIVISIONS) -> Floats:
-    """Means of both halves of every division: (division, 2, 6, bin, unit)."""
+    """Means of both halves of every division: (division, 2, stimulus, bin, unit)."""
     values = values_of(session, bins)
     first = divisions(session, number)
-    return np.stack([_means(values, session.stimulus, half) for half in (first, ~first)], axis=1)
+    return np.stack([_means(values, session, half) for half in (first, ~first)], axis=1)
 
 
 def means_of(sessions: tuple[NeuralSession, ...], bins: int) -> Floats:
-    """Means over all trials of the units of all sessions: (6, bin, unit)."""
+    """Means over all trials of the units of all sessions: (stimulus, bin, unit)."""
     return np.concatenate(
         [
-            _means(values_of(s, bins), s.stimulus, np.ones((1, len(s.stimulus)), np.bool_))[0]
+            _means(values_of(s, bins), s, np.ones((1, len(s.stimulus)), np.bool_))[0]
             for s in sessions
         ],
         axis=-1,
@@ -84,14 +83,14 @@ def ceiling_of(agreements: Floats) -> float:
     return float(np.sqrt(reliability)) if reliability > 0 else float("nan")
 
 
-def _means(values: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
-    """Means over chosen trials (division, trial) of every stimulus: (division, 6, bin, unit)."""
+def _means(values: Floats, session: NeuralSession, chosen: NDArray[np.bool_]) -> Floats:
+    """Average chosen trials (division, trial) by stimulus: (division, stimulus, bin, unit)."""
     trials, bins, units = values.shape
     there = np.asarray(np.isfinite(values).all(axis=2), dtype=np.float64)  # (trial, bin)
     flat = np.nan_to_num(values).reshape(trials, -1)
-    out = np.empty((len(chosen), len(STIMULI), bins, units))
-    for k in range(len(STIMULI)):
-        rows = np.flatnonzero(stimulus == k)
+    out = np.empty((len(chosen), len(session.stimuli), bins, units))
+    for k in range(len(session.stimuli)):
+        rows = np.flatnonzero(session.stimulus == k)
         weights = chosen[:, rows].astype(np.float64)
         number = weights @ there[rows]
         total = (weights @ flat[rows]).reshape(-1, bins, units)

@@ -1,12 +1,12 @@
-"""Similarity of two geometries: of a layer's responses to six stimuli and of an animal's.
+"""Similarity of two geometries: of a layer's responses to stimuli and of an animal's.
 
-- `rsa`: Pearson's r of the 15 dissimilarities 1 - r (Kriegeskorte 2008), mean over time.
+- `rsa`: Pearson's r of the dissimilarities 1 - r (Kriegeskorte 2008), mean over time.
 - `rsa_time`: the same in each bin of 45 ms, which is a step of the model, both counted from the
   first contact; r and ceiling are each averaged over the bins in which the animal is reliable. In
   a bin in which a layer does not tell the stimuli apart it fits by 0.
 - `cka`: the cosine of the U-centred linear kernels. Dropping the diagonal and centring so makes
   the mean of both HSIC and noise zero (Song et al. 2012, equation 5), where the usual linear CKA
-  of six stimuli and many units is near 1 for any pair.
+  of few stimuli and many units is near 1 for any pair.
 
 The ceiling is the root of the Spearman-Brown reliability of the animal's own geometry.
 """
@@ -18,7 +18,7 @@ import numpy as np
 
 from tactile_rt.alignment.metrics import Measure, noise_ceiling
 from tactile_rt.alignment.neural import Animal
-from tactile_rt.alignment.rdm import UPPER, Floats, pearson, rdm
+from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
 
 NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # of an animal that has too little
 
@@ -51,14 +51,14 @@ def rsa_time(animal: Animal) -> Measure:
 
 
 def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
-    """RDMs (bin, 15) of an animal and the ceiling (bin,) of each; None without a time course."""
+    """RDMs (bin, pair) of an animal and the ceiling (bin,) of each; None without a time course."""
     sessions = noise_ceiling.sessions_of(animal)
     bins = noise_ceiling.bins_of(sessions) if sessions else 0
     if not bins:
         return None
     goal = rdm(noise_ceiling.means_of(sessions, bins).swapaxes(0, 1))
     whole = np.concatenate([noise_ceiling.half_means(s, bins) for s in sessions], axis=-1)
-    parts = rdm(np.moveaxis(whole, 3, 0))  # (bin, division, 2, 15)
+    parts = rdm(np.moveaxis(whole, 3, 0))  # (bin, division, 2, pair)
     r = pearson(parts[:, :, 0], parts[:, :, 1])
     return goal, np.array([noise_ceiling.ceiling_of(row) for row in r])
 
@@ -92,7 +92,7 @@ def u_centred(patterns: Floats) -> Floats:
     """
     kernel = np.matmul(patterns, np.swapaxes(patterns, -1, -2))
     n = kernel.shape[-1]
-    upper = UPPER if n == 6 else np.triu_indices(n, 1)
+    i, j = upper(n)
     kernel = kernel * (1 - np.eye(n))
     rows = kernel.sum(axis=-1)
     centred = (
@@ -100,7 +100,7 @@ def u_centred(patterns: Floats) -> Floats:
         - (rows[..., :, None] + rows[..., None, :]) / (n - 2)
         + rows.sum(axis=-1)[..., None, None] / ((n - 1) * (n - 2))
     )
-    return np.asarray(centred[..., upper[0], upper[1]])
+    return np.asarray(centred[..., i, j])
 
 
 def cosine(a: Floats, b: Floats) -> Floats:
@@ -111,7 +111,7 @@ def cosine(a: Floats, b: Floats) -> Floats:
 
 
 def mean_pattern(layer: Floats) -> Floats:
-    """Mean over the steps that input reaches: (6, step, unit) -> (6, unit)."""
+    """Mean over the steps that input reaches: (stimulus, step, unit) -> (stimulus, unit)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a layer that no input reaches is NaN
         return np.asarray(np.nanmean(layer, axis=1))
