@@ -46,7 +46,7 @@ def test_every_relabelling_is_the_rdm_of_relabelled_stimuli():
     from itertools import permutations
 
     patterns = np.random.default_rng(3).normal(size=(6, 11))
-    made = rdm(patterns)[relabellings()]
+    made = rdm(patterns)[relabellings(6)]
     assert made.shape == (720, 15)
     for order, entries in zip(permutations(range(6)), made, strict=True):
         np.testing.assert_allclose(entries, rdm(patterns[list(order)]), rtol=0, atol=1e-14)

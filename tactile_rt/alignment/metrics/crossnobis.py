@@ -31,9 +31,9 @@ def crossnobis(animal: Animal) -> Measure:
         white = session.rates @ _whitening(session)
         every = np.ones((1, len(white)), dtype=np.bool_)
         first = divisions(session)
-        whole = whole + distances(white, session, every)[0] / units
+        whole = whole + distances(white, session.stimulus, every)[0] / units
         halves = halves + np.stack(
-            [distances(white, session, half) / units for half in (first, ~first)]
+            [distances(white, session.stimulus, half) / units for half in (first, ~first)]
         )
     goal = whole
     return Measure(
@@ -42,17 +42,18 @@ def crossnobis(animal: Animal) -> Measure:
     )
 
 
-def distances(white: Floats, session: NeuralSession, chosen: NDArray[np.bool_]) -> Floats:
+def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
     """Cross-validated squared distances, summed over units.
 
     Args:
         white: (trial, unit), whitened.
+        stimulus: (trial,), as indices of which each is there.
         chosen: (division, trial), which trials count; at least two of every stimulus.
 
     Returns:
         (division, pair).
     """
-    of_each = [chosen * (session.stimulus == k) for k in range(len(session.stimuli))]
+    of_each = [chosen * (stimulus == k) for k in range(int(stimulus.max()) + 1)]
     weights = np.stack(of_each, axis=1).astype(np.float64)  # (division, stimulus, trial)
     number = weights.sum(axis=-1)
     total = weights @ white
@@ -60,7 +61,7 @@ def distances(white: Floats, session: NeuralSession, chosen: NDArray[np.bool_]) 
     own = ((total**2).sum(axis=-1) - alone) / (number * (number - 1))
     mean = total / number[..., None]
     between = np.matmul(mean, mean.swapaxes(-1, -2))
-    i, j = upper(len(session.stimuli))
+    i, j = upper(len(of_each))
     return np.asarray(own[:, i] + own[:, j] - 2 * between[:, i, j])
 
 
