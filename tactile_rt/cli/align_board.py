@@ -13,6 +13,7 @@ from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Seed, argument, option
 from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
     from tactile_rt.alignment.board import Alignments, BoardRow
@@ -132,12 +133,18 @@ def write_board(
         ]
         felt = read_stimuli(stimuli)
         files = list(zip(models, check_models(models), strict=True))
-        boards = []
+        boards: list[Alignments] = []
+        first: tuple[str, ...] = ()
         for dataset, path in datasets:
             with share_bar(f"reading {dataset.name}") as tell:
                 read = dataset.read([path], felt, tell)
             with progress_bar(f"models on {dataset.name}", max(len(files), 1)) as update:
-                rows = _rows(files, read.stimuli or felt, seed, update)
+                names = read.animals[0].sessions[0].stimuli
+                if names != (first := first or names):
+                    raise ConfigError(
+                        f"{path} is of other stimuli than {named[0][1]}: a board each"
+                    )
+                rows = _rows(files, read.stimuli or felt, seed, update, names)
             with share_bar(f"scoring on {dataset.name}") as tell:
                 made = with_cells(rows, dataset, read.animals, parts, metrics, read.notes, tell)
             boards.append(made)
@@ -152,7 +159,11 @@ def write_board(
 
 
 def _rows(
-    files: list[tuple[Path, str]], felt: "StimuliInput", seed: int, update: Any
+    files: list[tuple[Path, str]],
+    felt: "StimuliInput",
+    seed: int,
+    update: Any,
+    stimuli: tuple[str, ...],
 ) -> list[tuple["BoardRow", Any]]:
     from tactile_rt.alignment.board import BoardRow, traces_of, traces_of_stimuli
     from tactile_rt.alignment.loading import load_layers, load_untrained
@@ -160,7 +171,7 @@ def _rows(
     rows: list[tuple[BoardRow, Any]] = []
     for path, name in files:
         update(description=name)
-        layers: Layers = load_layers(path, felt)[0]
+        layers: Layers = load_layers(path, felt, names=stimuli)[0]
         before = load_untrained(path, felt, seed)
         # The same network: a file keeps some of its numbers in other places than a checkpoint.
         size = before.parameters if before else layers.parameters
@@ -169,7 +180,8 @@ def _rows(
         if before is not None:
             rows.append((BoardRow(before.name, "untrained", "", size), traces_of(before)))
         update(advance=1)
-    rows.append((BoardRow("raw sensor input", "input"), traces_of_stimuli(felt)))
+    if stimuli == STIMULI:
+        rows.append((BoardRow("raw sensor input", "input"), traces_of_stimuli(felt)))
     return rows
 
 

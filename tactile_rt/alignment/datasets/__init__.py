@@ -2,8 +2,7 @@
 
 A dataset says where its recordings come from (title, citation, license, size), and reads what its
 user downloaded or fetched: animals, and the input of the models if it is not the six stimuli that
-ship. Its six conditions stand on the axis of `STIMULI`. Recordings are
-never bundled. Datasets of other packages are found by the entry points
+ship. Recordings are never bundled. Datasets of other packages are found by the entry points
 ``tactile_rt.alignment_datasets``.
 """
 
@@ -72,6 +71,7 @@ class NeuralDataset:
 DATASETS = {
     "000231": f"{__name__}.rodgers:DANDI_000231",
     "example": f"{__name__}.rodgers:EXAMPLE",
+    "own": f"{__name__}.own:OWN",
 }
 
 
