@@ -32,6 +32,8 @@ SPLITS = ("train", "validation", "test")
 # Further splits, of categories that are labelled -1: training never sees the first, and may learn
 # from the second what to refuse.
 WITHHELD, OUTLIERS = "withheld", "outliers"
+# Sweeps of training objects that no training learns from, where the recipe holds some out.
+NEW_SWEEPS = "new-sweeps"
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ archive's own checksums tell a damaged file at every reading.
 """
 
 import zipfile
+import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,14 @@ from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
 from tactile_rt.core.files import check_no_pointer, write_whole
-from tactile_rt.sets.manifest import CONTACTS, SKIPPED, SweepManifest, has_object, object_path
+from tactile_rt.sets.manifest import (
+    CONTACTS,
+    NEW_SWEEPS,
+    SKIPPED,
+    SweepManifest,
+    has_object,
+    object_path,
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +90,7 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
 
 def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
     """Read one split of a set whose manifest is known, as `read_sweeps` does."""
-    names = _names_of(folder, manifest, split)
+    names = _names_of(folder, manifest, "train" if split == NEW_SWEEPS else split)
     labels = [manifest.label(name) for name in names]
     missing = [name for name in names if not has_object(folder, name)]
     if missing:
@@ -98,23 +106,27 @@ def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
                 f"{object_path(folder, name)} holds sweeps of {shape[1]} samples, "
                 f"not {samples} as {names[0]}"
             )
-    counts = [shape[0] for shape in shapes]
+    taken = [
+        _choose_sweeps(object_path(folder, name), manifest, split, shape[0])
+        for name, shape in zip(names, shapes, strict=True)
+    ]
+    counts = [int(chosen.sum()) for chosen in taken]
     # Filled in place: a large set fits into memory once, not twice.
     values = np.empty((sum(counts), *shapes[0][1:]), dtype=np.float32)
     contacts = (
         np.empty(values.shape[:3], dtype=np.float32) if manifest.recipe.get(CONTACTS) else None
     )
     at = 0
-    for name, count in zip(names, counts, strict=True):
+    for name, count, chosen in zip(names, counts, taken, strict=True):
         path = object_path(folder, name)
-        values[at : at + count] = read_arrays(path, "values")["values"]
+        values[at : at + count] = read_arrays(path, "values")["values"][chosen]
         if contacts is not None:
             stored = read_arrays(path, CONTACTS).get(CONTACTS, contacts[:0])
-            if stored.shape != contacts[at : at + count].shape:
+            if stored.shape != (len(chosen), *contacts.shape[1:]):
                 raise _damage_error(
                     path, ValueError(f"contacts {stored.shape} beside other values")
                 )
-            contacts[at : at + count] = stored
+            contacts[at : at + count] = stored[chosen]
         at += count
     return Sweeps(
         values,
@@ -123,6 +135,33 @@ def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
         contacts,
         np.full(len(values), True) if manifest.recorded else None,
     )
+
+
+def holds_out_sweeps(manifest: SweepManifest) -> bool:
+    """Return whether a set's recipe holds out sweeps of its training objects."""
+    recipe = manifest.recipe.get("sweeps", {})
+    return bool(recipe.get("held_out_draws") or recipe.get("held_out"))
+
+
+def _choose_sweeps(
+    path: Path, manifest: SweepManifest, split: str, sweeps: int
+) -> NDArray[np.bool_]:
+    """Choose (sweep,) of an object what belongs to a split: of training objects some are held out.
+
+    Held out are the draws beyond the recipe's own, or as many as it says, drawn for each object.
+    """
+    chosen = np.ones(sweeps, dtype=np.bool_)
+    if split not in ("train", NEW_SWEEPS) or not holds_out_sweeps(manifest):
+        if split == NEW_SWEEPS:
+            raise ConfigError("the set's recipe holds out no sweeps of its training objects")
+        return chosen
+    recipe = manifest.recipe["sweeps"]
+    if recipe.get("held_out_draws"):
+        held = read_arrays(path, "draw").get("draw", np.zeros(sweeps)) >= recipe["draws"]
+    else:
+        rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
+        held = rng.permutation(sweeps) < recipe["held_out"]
+    return held if split == NEW_SWEEPS else ~held
 
 
 def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:

@@ -1,5 +1,6 @@
 """What the tasks of a grid have found, as it is kept in the grid's folder. Needs no torch."""
 
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -16,6 +17,7 @@ from tactile_rt.models.training.config import TrainingConfig
 SUBSET, OUTCOMES, RUNS = "sweeps", "outcomes", "runs"  # folders of a grid
 TESTED = "tested.json"  # a file of it
 POINT = "point.json"  # a file of one of its trainings
+CHANCE = 0.04  # of top-1: what is so near to chance may be chance
 
 Kept = TypeVar("Kept")
 Hits = Annotated[str, msgspec.Meta(pattern="^[01]*$")]
@@ -46,10 +48,12 @@ class Tested(msgspec.Struct, frozen=True):
 
     objects: tuple[tuple[str, int], ...]
     classes: int
+    known: tuple[tuple[str, int], ...] = ()  # of new sweeps of training objects
 
-    def names(self) -> NDArray[np.str_]:
+    @staticmethod
+    def names(objects: tuple[tuple[str, int], ...]) -> NDArray[np.str_]:
         """(sweep,) the object of each."""
-        names, counts = zip(*self.objects, strict=True)
+        names, counts = zip(*objects, strict=True) if objects else ((), ())
         return np.repeat(np.array(names, dtype=np.str_), counts)
 
 
@@ -60,6 +64,8 @@ class Outcome(msgspec.Struct, frozen=True):
         key: The settings that the outcome depends on, as JSON; another key is another experiment.
         top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
             at the rated noise.
+        known: Hits on new sweeps of the objects that it was trained on; empty where the set holds
+            none out.
         seconds: The CPU time of the training that was scored, s, as in `Training`.
         trials, growth: What chose rate and warm-up, then the updates; of the first seed alone.
     """
@@ -70,6 +76,7 @@ class Outcome(msgspec.Struct, frozen=True):
     top1: Hits = ""
     top5: Hits = ""
     noisy: Hits = ""
+    known: Hits = ""
     parameters: int = 0
     seconds: float = 0.0
     trials: tuple[Training, ...] = ()
@@ -82,15 +89,28 @@ class Outcome(msgspec.Struct, frozen=True):
         return np.asarray(np.array(list(getattr(self, which)), dtype=np.str_) == "1")
 
 
+def saw_nothing(trials: Sequence[Training], chance: float) -> bool:
+    """Return whether trials tell no rate from another: all near chance, or equal."""
+    scores = [trial.score for trial in trials if not trial.diverged]
+    if not scores:
+        return False  # all diverged: longer trials would, too
+    return max(scores) < chance + CHANCE or (len(scores) > 1 and max(scores) == min(scores))
+
+
 def outcome_path(folder: Path, task: Task) -> Path:
     """Where a grid's folder keeps a task's outcome."""
     return folder / OUTCOMES / f"{task.slug}.json"
 
 
-def write_tested(folder: Path, objects: NDArray[np.str_], classes: int) -> None:
-    """Write a grid's test objects (sweep,) and number of classes into its folder."""
-    counts = tuple((name, len(list(same))) for name, same in groupby(objects.tolist()))
-    text = msgspec.json.encode(Tested(counts, classes))
+def write_tested(
+    folder: Path, objects: NDArray[np.str_], classes: int, known: NDArray[np.str_] | None = None
+) -> None:
+    """Write a grid's test objects (sweep,), known ones, and number of classes into its folder."""
+    new, old = (
+        tuple((name, len(list(same))) for name, same in groupby(names.tolist()))
+        for names in (objects, objects[:0] if known is None else known)
+    )
+    text = msgspec.json.encode(Tested(new, classes, old))
     write_whole(folder / TESTED, lambda file: file.write(text))
 
 
@@ -153,7 +173,10 @@ def settings_of(grid: Grid, task: Task) -> str:
             config = {k: v for k, v in config.items() if k in OF_UNTRAINED}
             config |= {k: whole[k] for k in ("encoder", "attender", "width", "seed")}
         else:
-            settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
+            cell = msgspec.to_builtins(task.cell)
+            if not cell["recipe"]:
+                del cell["recipe"]  # what was done before there were any is as it was
+            settings |= {"search": grid.search, "growth": grid.growth, "cell": cell}
             if task.cell.begin:
                 settings |= {"begun": settings_of(grid, grid.begun(task))}
         settings |= {"config": config}

@@ -1,7 +1,7 @@
 """What a grid trains: a TOML file of encoder x attender x objective, each tuned alike.
 
 Every cell is tuned by as many short trials as any other, then trained with more and more updates
-until more gain nothing, then with further seeds:
+until more gain nothing, then with further seeds; a cell with a recipe is trained as that says:
 
 data = "data/wide24"
 search = { learning_rate = [1e-3, 5e-3], warmup = [0.05, 0.3], updates = 500 }
@@ -19,6 +19,7 @@ import msgspec
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
+from tactile_rt.models.training.recipes import load_recipe
 
 SHIPPED = resources.files("tactile_rt.models.grid")
 # of a training's configuration, what a grid sets task by task
@@ -45,6 +46,8 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         begin: The name of a cell whose trained network, of the same seed, this one begins with;
             empty begins with nothing.
         seeds: The number of seeds of this cell; 0 takes the grid's.
+        recipe: A recipe of `tactile-rt train`, by which this cell is trained once per seed, without
+            a search; `options` change it.
     """
 
     encoder: str
@@ -57,6 +60,7 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     begin: str = ""
     seeds: int = 0
     options: dict[str, Any] = {}
+    recipe: str = ""
 
     @property
     def network(self) -> str:
@@ -70,6 +74,7 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         views = [self.augmentation] if self.augmentation != "none" else []
         views += ["masking"] if self.masking else []
         views += [str(self.options[key]) for key in NAMING if key in self.options]
+        views += [self.recipe] if self.recipe else []
         before = f"after {self.begin.removeprefix(self.network).strip()}" if self.begin else ""
         share = f"of {self.share:g}" if self.share < 1 else ""
         return " ".join(filter(None, [self.objective, "+".join(views), before, share]))
@@ -211,6 +216,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def _options(self, cell: Candidate) -> dict[str, Any]:
         common = self.supervised if cell.objective == SUPERVISED else self.self_supervised
+        if cell.recipe:
+            said = load_recipe(cell.recipe).train
+            common = {k: v for k, v in said.items() if k not in (*OF_CELL, "width")}
         return {**common, **cell.options}
 
     def begun(self, task: Task) -> Task:
@@ -224,7 +232,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         cell = task.cell
         if cell is None or task.random:
             return ()
-        tuned = (Task(task.name, 0, cell),) if task.seed else ()
+        tuned = (Task(task.name, 0, cell),) if task.seed and not cell.recipe else ()
         begun = (self.begun(task),) if cell.begin else ()
         return tuple(one.slug for one in (*tuned, *begun))
 
@@ -267,8 +275,9 @@ def _check(grid: Grid) -> None:
     convert(make_node(grid.probe, "probe", 0, Path()), ProbeConfig)
     tables = {"supervised": grid.supervised, "self_supervised": grid.self_supervised}
     tables |= {f"options of cell {cell.name!r}": cell.options for cell in grid.cells}
+    own = {f"options of cell {cell.name!r}": OWN[:4] for cell in grid.cells if cell.recipe}
     for table, fields in tables.items():
-        if taken := [key for key in fields if key in OWN]:
+        if taken := [key for key in fields if key in own.get(table, OWN)]:
             raise ConfigError(f"{table}: {name_some(taken)} is what the grid itself decides")
     if "data" in grid.probe:
         raise ConfigError("probe: data is what the grid itself decides")
@@ -307,7 +316,12 @@ def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> No
                 f"{called} begins with {cell.begin!r}, which is trained with {has} of {wants} seeds"
             )
     task, search = Task(cell.name, 0, cell), grid.search
-    for rate in search.learning_rate:
+    if cell.recipe:
+        config, said = grid.config(task, Path(grid.data)), load_recipe(cell.recipe).train
+        for name in OF_CELL[2:]:
+            if name in said and getattr(config, name) != said[name]:
+                raise ConfigError(f"{called}: {name} is {said[name]!r} in recipe {cell.recipe}")
+    for rate in search.learning_rate if not cell.recipe else ():
         for warmup in search.warmup:
             config = grid.config(task, Path(grid.data), learning_rate=rate, warmup=warmup)
     if config.encoder != "graph":  # whose frame is that of an array, which is not read here

@@ -20,8 +20,14 @@ from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.grid.outcomes import SUBSET, TESTED, Outcome, waiting_tasks, write_tested
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
 from tactile_rt.models.grid.work import Workbench
-from tactile_rt.sets.manifest import SET_VERSION, SPLITS, SweepManifest, has_object
-from tactile_rt.sets.objects import read_object, read_skipped, write_object, write_skipped
+from tactile_rt.sets.manifest import NEW_SWEEPS, SET_VERSION, SPLITS, SweepManifest, has_object
+from tactile_rt.sets.objects import (
+    holds_out_sweeps,
+    read_object,
+    read_skipped,
+    write_object,
+    write_skipped,
+)
 
 Report = Callable[[Outcome, int, int], None]
 _bench: Workbench | None = None  # of a process of the pool
@@ -99,7 +105,10 @@ def prepare(grid: Grid, folder: Path) -> None:
     """Write, or go on writing, the sweeps of a grid and what of them it tests on."""
     write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
     test = SweepSet.read(folder / SUBSET, "test")
-    write_tested(folder, test.sweeps.objects, len(test.manifest.categories))
+    known = test.sweeps.objects[:0]
+    if holds_out_sweeps(test.manifest):
+        known = SweepSet.read(folder / SUBSET, NEW_SWEEPS).sweeps.objects
+    write_tested(folder, test.sweeps.objects, len(test.manifest.categories), known)
 
 
 def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:

@@ -9,7 +9,14 @@ import numpy as np
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import write_whole
 from tactile_rt.models.evaluation.measures import Interval, Names, accuracy
-from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
+from tactile_rt.models.grid.outcomes import (
+    Outcome,
+    Tested,
+    Training,
+    read_outcome,
+    read_tested,
+    saw_nothing,
+)
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid
 
 
@@ -21,6 +28,7 @@ class Row:
         network, learning: Names of the network and of how the cell learns; empty for the SVM.
         top1, top5, noisy: Accuracies on the test sweeps, 0 to 1; `noisy` is top-1 at the rated
             noise. None where there is no figure.
+        known: Top-1 on new sweeps of the objects that it was trained on; None where there are none.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
         seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
         flat: Whether the last of these gained less than the grid asks for.
@@ -41,6 +49,8 @@ class Row:
     growth: tuple[Training, ...] = ()
     flat: bool = False
     failed: str = ""
+    known: Interval | None = None
+    tuned: bool = True  # whether its search saw a difference between rates
 
 
 @dataclass(frozen=True)
@@ -81,7 +91,7 @@ def gather(grid: Grid, folder: Path) -> GridResults:
     if not found:
         raise ConfigError(f"{folder} has no outcome yet: run the grid first")
     tested = read_tested(folder)
-    objects = tested.names()
+    objects = tested.names(tested.objects)
     for outcome in (one for several in found.values() for one in several):
         if outcome.top1 and len(outcome.top1) != len(objects):
             raise ConfigError(
@@ -89,7 +99,7 @@ def gather(grid: Grid, folder: Path) -> GridResults:
                 f"{len(outcome.top1)} sweeps, of which there are {len(objects)}: delete its outcome"
             )
     cells = {SVM: None, **{cell.name: cell for cell in grid.cells}}
-    rows = [_row(grid, n, cell, found, objects) for n, cell in cells.items() if n in found]
+    rows = [_row(grid, n, cell, found, tested) for n, cell in cells.items() if n in found]
     answers = [
         Answer(question.text, pair.better, pair.than, difference)
         for question in grid.questions
@@ -101,10 +111,11 @@ def gather(grid: Grid, folder: Path) -> GridResults:
 
 
 def _row(
-    grid: Grid, name: str, cell: Candidate | None, found: dict[str, list[Outcome]], objects: Names
+    grid: Grid, name: str, cell: Candidate | None, found: dict[str, list[Outcome]], tested: Tested
 ) -> Row:
     def estimate(these: list[Outcome], which: str) -> Interval | None:
         right = [one.right(which) for one in these if getattr(one, which)]
+        objects = tested.names(tested.known if which == "known" else tested.objects)
         return accuracy(np.stack(right), objects) if right else None
 
     outcomes, random = found[name], found.get(f"{RANDOM} {cell.network}", []) if cell else []
@@ -126,6 +137,8 @@ def _row(
         first.growth,
         len(scores) > 1 and scores[-1] < scores[-2] + grid.growth.gain,
         "; ".join(sorted({one.failed for one in outcomes if one.failed})),
+        estimate(outcomes, "known"),
+        not (first.trials and saw_nothing(first.trials, 1 / tested.classes)),
     )
 
 
@@ -153,8 +166,8 @@ def table(results: GridResults) -> str:
         "been too many to try, so that its end is not known.",
         "",
         "| network | learning | parameters | rate, warm-up | updates | top-1 (%) | untrained (%) "
-        "| top-5 (%) | at rated noise (%) | seeds | CPU s |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| top-5 (%) | at rated noise (%) | new sweeps of known objects (%) | seeds | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in results.rows:
         at = row.chosen
@@ -162,10 +175,12 @@ def table(results: GridResults) -> str:
             row.network or "RBF SVM",
             row.learning or "on the same windows",
             f"{row.parameters:,}" if row.parameters else "",
-            f"{at.learning_rate:g}, {at.warmup:g}" if at else "",
-            f"{at.updates:,}{'' if row.flat else ' +'}" if at else "",
+            f"{at.learning_rate:g}, {at.warmup:g}{'' if row.tuned else ' (not tuned)'}"
+            if at
+            else "",
+            _updates(row),
             _percent(row.top1) if row.top1 else "failed" if row.failed else "",
-            *(_percent(one) for one in (row.random, row.top5, row.noisy)),
+            *(_percent(one) for one in (row.random, row.top5, row.noisy, row.known)),
             str(row.seeds),
             f"{row.seconds:.0f}" if row.seconds else "",
         ]
@@ -185,6 +200,12 @@ def table(results: GridResults) -> str:
         )
         asked = answer.question
     return "\n".join(lines) + "\n"
+
+
+def _updates(row: Row) -> str:
+    if row.chosen is None:
+        return ""
+    return f"{row.chosen.updates:,}{'' if row.flat else ' +'}" if row.chosen.updates else "recipe"
 
 
 def _percent(one: Interval | None) -> str:

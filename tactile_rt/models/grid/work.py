@@ -36,10 +36,13 @@ from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
 from tactile_rt.models.training.loop import initialise, launched, train
 from tactile_rt.models.training.probing import probe
-from tactile_rt.sets.manifest import SweepManifest
+from tactile_rt.sets.manifest import NEW_SWEEPS, SweepManifest
+from tactile_rt.sets.objects import holds_out_sweeps
 from tactile_rt.sets.splits import check_split
 
 BATCH = 128
+LONGER = (1, 2, 4)  # times the updates of a trial, as long as none sees anything
+FURTHER = 2  # rates beyond those that a plan names, at most
 Report = Callable[..., None]
 
 
@@ -52,6 +55,9 @@ class Workbench:
         check_split(self.data, SweepManifest.read(self.data))
         self.splits = SweepSet.read(self.data, "train"), SweepSet.read(self.data, "validation")
         self.test = SweepSet.read(self.data, "test")
+        self.known = None
+        if holds_out_sweeps(self.test.manifest):
+            self.known = SweepSet.read(self.data, NEW_SWEEPS)
         check_sets(self.data, (*self.splits, self.test))
         self._shares: dict[float, tuple[SweepSet, SweepSet]] = {}
         self._cut: dict[str, tuple[list[CutWindows], list[CutWindows]]] = {}
@@ -90,7 +96,12 @@ class Workbench:
         return found
 
     def _trained(self, found: Outcome, task: Task, report: Report) -> Outcome:
-        if task.seed:
+        assert task.cell is not None
+        if task.cell.recipe:
+            told = self.grid.config(task, self.data)
+            once = Training(told.learning_rate, told.warmup, 0, 0.0, 0.0)
+            chosen = self._train(task, once, report)
+        elif task.seed:
             first = outcomes.read_outcome(
                 self.grid, self.folder, msgspec.structs.replace(task, seed=0)
             )
@@ -105,7 +116,6 @@ class Workbench:
         if chosen.diverged:
             raise DivergedError("every training of it diverged")
         run = self._run(task, chosen)
-        assert task.cell is not None
         best = run / ("" if task.cell.objective == SUPERVISED else "probe") / "best.pt"
         if not best.exists():  # where only what its trainings scored was kept
             (run / outcomes.POINT).unlink()
@@ -114,15 +124,35 @@ class Workbench:
         return self._scored(found, best, self.grid.config(task, self.data))
 
     def _search(self, task: Task, report: Report) -> tuple[Training, ...]:
-        """The trials: every rate with the first warm-up, then the other warm-ups with the best."""
+        """Try every rate with the first warm-up, then the other warm-ups with the best.
+
+        Trials that see nothing are made twice as long; where the best rate is the first or the
+        last, the next one is tried, too.
+        """
         search = self.grid.search
+        chance = 1 / len(self.test.manifest.categories)
+        trials: list[Training] = []
 
-        def of(rate: float, warmup: float) -> Training:
-            return self._train(task, Training(rate, warmup, search.updates, 0.0, 0.0), report)
+        def of(rate: float, warmup: float, updates: int) -> Training:
+            trials.append(self._train(task, Training(rate, warmup, updates, 0.0, 0.0), report))
+            return trials[-1]
 
-        rates = [of(rate, search.warmup[0]) for rate in search.learning_rate]
-        best = max(rates, key=_score).learning_rate
-        return (*rates, *(of(best, warmup) for warmup in search.warmup[1:]))
+        for longer in LONGER:
+            updates = longer * search.updates
+            rates = [of(rate, search.warmup[0], updates) for rate in search.learning_rate]
+            if not outcomes.saw_nothing(rates, chance):
+                break
+        for _ in range(FURTHER if len(rates) > 1 else 0):
+            rates.sort(key=lambda one: one.learning_rate)
+            best, place = max(rates, key=_score), [one.learning_rate for one in rates]
+            if outcomes.saw_nothing(rates, chance) or best not in (rates[0], rates[-1]):
+                break
+            at, step = (0, place[0] / place[1]) if best is rates[0] else (-1, place[-1] / place[-2])
+            rates.append(of(place[at] * step, search.warmup[0], updates))
+        best = max(rates, key=_score)
+        for warmup in search.warmup[1:]:
+            of(best.learning_rate, warmup, updates)
+        return tuple(one for one in trials if one.updates == updates)
 
     def _grow(self, task: Task, best: Training, report: Report) -> tuple[Training, ...]:
         """Trainings of twice as many updates each, until one gains too little."""
@@ -230,11 +260,17 @@ class Workbench:
         classes = len(self.test.manifest.categories)
         # Had it to name one.
         clean, noisy = (among(posteriors(c, run)[:, -1], classes) for c in self._windows(config))
+        known = np.zeros(0, np.bool_)
+        if self.known is not None:
+            drawn = drawn_as(self.known, {"window": config.window})
+            answers = posteriors(cut_windows(drawn, batch=BATCH, disturbance=CLEAN), run)
+            known = hits(among(answers[:, -1], classes), self.known.sweeps.labels)
         return msgspec.structs.replace(
             found,
             top1=_as_text(hits(clean, labels)),
             top5=_as_text(hits(clean, labels, 5)),
             noisy=_as_text(hits(noisy, labels)),
+            known=_as_text(known),
             parameters=count_parameters(model.network),
         )
 

@@ -206,6 +206,8 @@ class SweepChoice:
         draws: The number of sweeps of every combination of the `each` values.
         held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
             `draws` and above.
+        held_out: The number of sweeps of every training object, drawn for each, that no training
+            learns from: the split ``new-sweeps``.
         least_whiskers: The least number of whiskers that can reach the object as it goes by; sweeps
             that fewer reach are drawn again.
     """
@@ -233,13 +235,21 @@ class SweepChoice:
     tilt_ms: Choice = 0.0
     draws: int = 1
     held_out_draws: int = 0
+    held_out: int = 0
     least_whiskers: int = 1
 
     def __post_init__(self) -> None:
-        for name, fewest in (("draws", 1), ("held_out_draws", 0), ("least_whiskers", 1)):
+        for name, fewest in (
+            ("draws", 1),
+            ("held_out_draws", 0),
+            ("held_out", 0),
+            ("least_whiskers", 1),
+        ):
             if getattr(self, name) < fewest:
                 bound = f"at least {fewest}" if fewest else "0 or more"
                 raise ConfigError(f"{name} must be {bound}, not {getattr(self, name)}")
+        if self.held_out >= len(self):
+            raise ConfigError(f"held_out is {self.held_out} of {len(self)} sweeps: none is left")
         for name in PARAMETERS:
             choice = getattr(self, name)
             for value in choice.ends if isinstance(choice, Range) else (choice,):
@@ -275,7 +285,7 @@ class SweepChoice:
         return Sweep(**values)
 
 
-COUNTS = ("draws", "held_out_draws", "least_whiskers")
+COUNTS = ("draws", "held_out_draws", "held_out", "least_whiskers")
 PARAMETERS = tuple(f.name for f in fields(SweepChoice) if f.name not in COUNTS)
 
 
@@ -366,4 +376,6 @@ class SweepRecipe:
         """Write it in full as a recipe file has it; `recipe_files.recipe_of_set` reads it."""
         # asdict, as msgspec leaves out what it has decoded from a default
         plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(self)))
+        if not self.sweeps.held_out:
+            del plain["sweeps"]["held_out"]  # sets that hold nothing out are as they were
         return plain

@@ -15,7 +15,13 @@ from tactile_rt.sets.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set, shipped_recipes
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
-from tactile_rt.sim_backend.datasets.recipes import ObjectChoice, Range, SweepChoice, SweepRecipe
+from tactile_rt.sim_backend.datasets.recipes import (
+    COUNTS,
+    ObjectChoice,
+    Range,
+    SweepChoice,
+    SweepRecipe,
+)
 from tactile_rt.sim_backend.objects import catalogue as objects
 from tactile_rt.sim_backend.sweep import Sweep
 from tests.helpers.refusals import refusal
@@ -110,7 +116,7 @@ def test_a_shipped_recipe_is_called_what_its_file_is_called(name: str) -> None:
 
 
 def test_every_parameter_of_a_sweep_can_be_chosen() -> None:
-    chosen = {f.name for f in fields(SweepChoice)} - {"draws", "held_out_draws", "least_whiskers"}
+    chosen = {f.name for f in fields(SweepChoice)} - set(COUNTS)
     assert chosen == {f.name for f in fields(Sweep)}
     assert all(getattr(SweepChoice, name) == getattr(Sweep, name) for name in chosen)
 
