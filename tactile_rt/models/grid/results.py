@@ -1,4 +1,4 @@
-"""What a grid found: accuracies with honest intervals, comparisons, and tables of both."""
+"""Results of a grid: accuracies with intervals, comparisons, and tables of both."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +22,8 @@ class Row:
         top1, top5, noisy: Accuracies on the test sweeps, 0 to 1; `noisy` is top-1 at the rated
             noise. None where there is no figure.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
-        seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
-        flat: Whether the last of these gained less than the grid asks for.
+        seconds: The mean CPU time of a seed's training, s, over seeds with a known time; else 0.
+        flat: Whether the last training of `growth` gained less than the grid asks for.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Answer:
 
     @property
     def verdict(self) -> str:
-        """In a word."""
+        """Answer in words: "yes", "no" or "cannot tell"."""
         if self.difference.low > 0:
             return "yes"
         return "no" if self.difference.high < 0 else "cannot tell"
@@ -62,7 +62,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class GridResults:
-    """Everything that a grid has found so far."""
+    """All results that a grid has so far."""
 
     rows: tuple[Row, ...]
     answers: tuple[Answer, ...]
@@ -72,7 +72,7 @@ class GridResults:
 
 
 def gather(grid: Grid, folder: Path) -> GridResults:
-    """Read the outcomes that there are."""
+    """Gather the results of all outcomes so far."""
     found: dict[str, list[Outcome]] = {}
     for task in grid.tasks():
         outcome = read_outcome(grid, folder, task)
@@ -89,18 +89,18 @@ def gather(grid: Grid, folder: Path) -> GridResults:
                 f"{len(outcome.top1)} sweeps, of which there are {len(objects)}: delete its outcome"
             )
     cells = {SVM: None, **{cell.name: cell for cell in grid.cells}}
-    rows = [_row(grid, n, cell, found, objects) for n, cell in cells.items() if n in found]
+    rows = [_make_row(grid, n, cell, found, objects) for n, cell in cells.items() if n in found]
     answers = [
         Answer(question.text, pair.better, pair.than, difference)
         for question in grid.questions
         for pair in question.pairs
-        if (difference := _difference(found.get(pair.better), found.get(pair.than), objects))
+        if (difference := _compare_seeds(found.get(pair.better), found.get(pair.than), objects))
     ]
     kinds = len(set(objects.tolist()))
     return GridResults(tuple(rows), tuple(answers), kinds, len(objects), tested.classes)
 
 
-def _row(
+def _make_row(
     grid: Grid, name: str, cell: Candidate | None, found: dict[str, list[Outcome]], objects: Names
 ) -> Row:
     def estimate(these: list[Outcome], which: str) -> Interval | None:
@@ -129,10 +129,10 @@ def _row(
     )
 
 
-def _difference(
+def _compare_seeds(
     better: list[Outcome] | None, than: list[Outcome] | None, objects: Names
 ) -> Interval | None:
-    """Of top-1, over the seeds that both have; the SVM has one for all."""
+    """Return the top-1 difference over common seeds; the SVM has one result for all."""
     mine = {one.seed: one.right() for one in better or () if one.top1}
     theirs = {one.seed: one.right() for one in than or () if one.top1}
     seeds = sorted(set(mine) & set(theirs))
@@ -144,7 +144,7 @@ def _difference(
 
 
 def table(results: GridResults) -> str:
-    """Markdown: every cell, then every comparison."""
+    """Return every cell, then every comparison, as Markdown."""
     lines = [
         f"Top-1 on {results.objects} objects that no network trained on ({results.sweeps} sweeps, "
         f"{results.classes} categories, chance {100 / results.classes:.1f} %); in brackets 95 %, "
@@ -164,8 +164,8 @@ def table(results: GridResults) -> str:
             f"{row.parameters:,}" if row.parameters else "",
             f"{at.learning_rate:g}, {at.warmup:g}" if at else "",
             f"{at.updates:,}{'' if row.flat else ' +'}" if at else "",
-            _percent(row.top1) if row.top1 else "failed" if row.failed else "",
-            *(_percent(one) for one in (row.random, row.top5, row.noisy)),
+            _format_percent(row.top1) if row.top1 else "failed" if row.failed else "",
+            *(_format_percent(one) for one in (row.random, row.top5, row.noisy)),
             str(row.seeds),
             f"{row.seconds:.0f}" if row.seconds else "",
         ]
@@ -187,7 +187,7 @@ def table(results: GridResults) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _percent(one: Interval | None) -> str:
+def _format_percent(one: Interval | None) -> str:
     if one is None:
         return ""
     return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"
