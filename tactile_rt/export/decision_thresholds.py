@@ -163,7 +163,7 @@ def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSE
     Args:
         groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
             objects (sweep,); the share holds in each group.
-            refused: largest share of sweeps of new objects that is refused.
+        refused: largest share of sweeps of new objects that is refused.
 
     Raises:
         RecordingError: no contact in any sweep.
@@ -231,7 +231,7 @@ def _drop_untouched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
 
 
 def _weights(names: Names) -> Doubles:
-    """Return (sweep,) weights; an object's sum to 1 / (number of objects + a new one)."""
+    """Return (sweep,) weights that sum to 1 / (objects + 1 new) for each object."""
     _, which, count = np.unique(names, return_inverse=True, return_counts=True)
     weights: Doubles = 1 / (count[which] * (len(count) + 1))
     return weights

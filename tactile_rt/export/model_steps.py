@@ -66,7 +66,7 @@ def measure_model(subject: Subject, steps: int) -> list[Record]:
 
 
 def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> NDArray[np.float64]:
-    """Return the (step,) CPU times in s of episodes of noise, run as the classifier does."""
+    """Return (step,) CPU times in s of episodes of noise, run as the classifier does."""
     rng = np.random.default_rng(0)
     scale = np.array(card.scale, dtype=np.float32)
     offset = np.zeros(card.array.shape, dtype=np.float32)

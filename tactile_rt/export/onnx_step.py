@@ -243,7 +243,7 @@ def write_model(
     """Write the graph of `step_graph` in a precision, as `export_step` does.
 
     Raises:
-        OSError: the folder of `path` cannot be written into, or the medium is full.
+        OSError: the folder cannot be written into, or the medium is full; it names `path`.
     """
     (embedding,) = (o.type.tensor_type.shape for o in proto.graph.output if o.name == "embedding")
     card = msgspec.structs.replace(

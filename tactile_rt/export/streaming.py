@@ -274,13 +274,13 @@ class Pointwise(nn.Module):
         self.register_buffer("bias", None if bias is None else bias.detach().clone())
 
     def forward(self, x: Tensor) -> Tensor:
-        missing = 4 - x.dim()  # lanes as the batch would read the weights anew for each
+        missing = 4 - x.dim()  # not lanes as the batch: each would read the weights anew
         out = F.conv2d(x[(None,) * missing].permute(0, 3, 1, 2), self.weight, self.bias)
         return out.permute(0, 2, 3, 1).flatten(0, missing)
 
 
 class StreamingGPT(nn.Module):
-    """A `GPT` with one cache tensor per layer and kind; a step writes its own rows."""
+    """A `GPT` with one cache tensor per layer and kind; steps write their own rows."""
 
     positions: Tensor
 
@@ -333,7 +333,7 @@ class StreamingGPT(nn.Module):
 
 @dataclass(frozen=True)
 class Rows:
-    """The places of a step's tokens in a cache: lane, head, row, each (lane, head, token).
+    """Places of a step's tokens in a cache: lane, head, row, each (lane, head, token).
 
     `unseen` is (lane, 1, token, row): 0 where a token attends, else minus infinity.
     """

@@ -172,7 +172,7 @@ def _read_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
 
 
 def read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
-    """Read the arrays of these names from an object's file, as far as it has them, or all."""
+    """Read those of the named arrays that an object's file holds; without names, all."""
     check_no_pointer(path)
     try:
         # Opened here because numpy leaves its own file open when it is damaged.

@@ -36,7 +36,7 @@ def check_labelled(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """Check that no object is in two splits and every object to train on has a label."""
+    """Check that splits share no object and every object to train on has a label."""
     side: dict[str, str] = {}
     for split, names in manifest.split.items():
         for name in names:
