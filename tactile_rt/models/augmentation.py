@@ -6,9 +6,9 @@
 - "tactile-paper": as published (Chung et al. 2025, Fig. 2b, and its code) on the frames: one draw
   for a whole batch, vectors left as they are, and a turned 5 x 7 grid loses its outer columns.
 - "image": the control: colour jitter, greyscale, blur and noise (Chen et al. 2020), with the
-loads of a cell as its colours.
+  loads of a cell as its colours.
 - "image-paper", "image-paper-weak": the published controls, of SimCLR and of SimSiam: forces
-are the three colours of a picture, moments those of another, from 0 to 1; one draw for a batch.
+  are the three colours of a picture, moments those of another, from 0 to 1; one draw for a batch.
 
 Mirroring, turning and reversal of "tactile" happen in half of the windows each; the image
 operations as in SimCLR. Temporal masking blanks whole steps.
@@ -83,7 +83,7 @@ def compose(spec: ArraySpec, *steps: Symmetry) -> Symmetry:
 
 
 def _mirror_places(grid: NDArray[np.int64], line: int) -> NDArray[np.int64]:
-    """Return (element,) the mirror whisker of each in its row (line 0) or column (line 1)."""
+    """Return (element,) every whisker's mirror in its row (line 0) or column (line 1)."""
     source = np.arange(len(grid))
     for value in np.unique(grid[:, line]):
         members = np.flatnonzero(grid[:, line] == value)

@@ -35,7 +35,7 @@ class SweepSet:
         noise: (channel,) The rated noise per sample, SI.
         floor: (channel,) The smallest sigma of the detector, SI.
         window: The first sample of a sweep's window: "onset", where the detector finds contact,
-            or "sweep", where the object starts, with the baseline that was measured until then.
+            or "sweep", where the object starts to move, with the baseline measured until then.
         joined_of: The manifests of the sets that it was joined from; empty for a single set.
     """
 

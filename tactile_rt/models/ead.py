@@ -42,7 +42,7 @@ GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and 
 
 
 class TactileClassifier(nn.Module):
-    """The input stage and the network as one module, from samples in SI units to logits.
+    """The input stage and the network in one, from samples in SI units to logits.
 
     Args:
         limits: clip and scale of the channels.
@@ -254,7 +254,7 @@ class EAD(nn.Module):
         return torch.cat([logits[:, : self.lag], total / counts[:, None]], dim=1)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return the state before the first step: zeros, each with a leading batch axis."""
+        """Return the state before the first step, in order: zeros with a leading batch axis."""
         weight = next(self.parameters())
         state = {
             "index": torch.zeros(batch, dtype=torch.int64, device=weight.device),

@@ -140,7 +140,7 @@ def with_hue(x: Tensor, by: float) -> Tensor:
 
 
 def blurred(x: Tensor, sigma: float) -> Tensor:
-    """Blur pictures (..., row, column) by a Gaussian of 3 x 3 cells, mirrored at the edge."""
+    """Blur pictures (..., row, column) by a 3 x 3 Gaussian, mirrored at the edge."""
     at = torch.arange(-1.0, 2.0)
     kernel = torch.exp(-0.5 * (at / sigma) ** 2).to(x)
     kernel = kernel / kernel.sum()

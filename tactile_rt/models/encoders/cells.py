@@ -61,7 +61,7 @@ class Cell(nn.Module):
                 norm._optim = {"stacked": True}  # type: ignore[attr-defined]
 
     def drive(self, x: Tensor) -> Tensor | None:
-        """Return W*x + b alone, for an x that is known for many steps at once."""
+        """Return W*x + b alone, for an x known for many steps at once."""
         return convolve(self.conv.weight[..., : self.channels], self.conv.bias, x)
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:

@@ -46,7 +46,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Edge:
-    """A source that a node reads, and how it is fused with the node's other sources.
+    """A source that a node reads, and how it joins the node's other sources.
 
     "concatenate": beside the others, on channels (the paper). "sum": projected to the channels of
     those that are concatenated, and added. "gate": as "sum", times a learned attention per site,

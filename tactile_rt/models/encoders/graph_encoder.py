@@ -119,7 +119,7 @@ class GraphEncoder(nn.Module):
         return features, {key: _to_state(new[key], state[key].dim()) for key in keys}
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return the features of a whole window at once, as `step` gives them step by step.
+        """Return the features of a whole window at once, as `step` gives them in turn.
 
         frames (batch, step, channel, row, column) -> (batch, step, feature)
 
@@ -218,7 +218,7 @@ class GraphEncoder(nn.Module):
         return F.relu(h), memory
 
     def _memory_names(self, node: Node) -> list[str]:
-        """List the names in the state of the memory of a node's cell."""
+        """List the state's names for the memory of a node's cell."""
         if node.cell == "none":
             return []
         cell = self.cells[node.name]

@@ -65,7 +65,7 @@ class ConvNorm(nn.Module):
         return out
 
     def matrix(self) -> Tensor:
-        """Return the taps inside the map as a matrix (site out * outputs, site in * inputs)."""
+        """Return the taps as a matrix (site out * outputs, site in * inputs)."""
         taps = F.pad(self.weight.flatten(2).permute(2, 0, 1), (0, 0, 0, 0, 0, 1))
         matrix = taps[self.taps]  # (site out, site in, output, input)
         return matrix.transpose(1, 2).flatten(2).flatten(0, 1)

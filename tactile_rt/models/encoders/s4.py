@@ -33,7 +33,7 @@ SSM_OPTIM = {"lr_scale": 0.1, "weight_decay": 0.0}
 
 
 def hippo_legs(states: int = STATES) -> tuple[Tensor, Tensor, Tensor]:
-    """Return Λ, P and B of HiPPO-LegS, one of each conjugate pair, (states / 2,) complex128.
+    """Return Λ, P, B of HiPPO-LegS, one of each conjugate pair, (states / 2,) complex128.
 
     A = -sqrt((2n+1)(2k+1)) below the diagonal, -(n+1) on it; with p = sqrt(n + 1/2), A + p p^T is
     skew-symmetric but for its diagonal of -1/2, hence unitarily diagonal (their appendix C.1).

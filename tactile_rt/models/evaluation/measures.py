@@ -96,7 +96,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> Floats:
 def cut_windows(
     data: SweepSet, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
 ) -> Iterator[CutWindows]:
-    """Yield the windows of all sweeps as the robot would cut them, `batch` at a time."""
+    """Yield the windows of all sweeps, cut as on the robot, `batch` at a time."""
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]
@@ -163,7 +163,7 @@ def split_by_class(
 
 
 def hits(posteriors: Floats, labels: Labels, top: int = 1) -> NDArray[np.bool_]:
-    """Return whether each (sweep,) label is among the `top` most probable (sweep, class)."""
+    """Return (sweep,) whether the label is among the `top` classes of (sweep, class)."""
     decided = ~np.isnan(posteriors).any(axis=1)
     order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
     return np.asarray(decided & (order == labels[:, None]).any(axis=1))

@@ -1,4 +1,4 @@
-"""RBF support vector machines, fitted for two comparisons.
+"""RBF support vector machines, all of them fitted here, for two comparisons.
 
 `fit_svm` gives a machine to compare a network with on the same windows: it takes the same onsets,
 baseline and compression, and the validation split chooses its penalty.

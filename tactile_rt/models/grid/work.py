@@ -138,7 +138,7 @@ class Workbench:
         return tuple(points)
 
     def _train(self, task: Task, at: Training, report: Report) -> Training:
-        """Train, or read the result if it exists; the score of a diverged training is 0."""
+        """Train, or read an existing result; the score of a diverged training is 0."""
         cell, run = task.cell, self._run_folder(task, at)
         assert cell is not None
         begin = ""

@@ -47,7 +47,7 @@ class TrainingConfig:
         first_weights: The weights that a graph's training begins with: "kaiming", or "paper", as
             `graph_encoder.draw_as_published` draws them.
         window: The first sample of a window: "onset", where the runtime's detector finds contact,
-            or "sweep", where the object starts (the paper).
+            or "sweep", where the object starts to move (the paper).
         jitter: The number of samples by which a window may begin earlier or later.
         faults: The sensor faults that are drawn each time that a sweep is taken; None: those of the
             set's recipe.
@@ -218,7 +218,7 @@ def as_json(config: TrainingConfig) -> dict[str, Any]:
 
 
 def begin_run(config: TrainingConfig, folder: Path) -> None:
-    """Make the folder of a run, or check that the existing one is of this run.
+    """Make a run's folder, or check that the existing one is of this run.
 
     Raises:
         ConfigError: the folder is of another configuration, or of an unknown one.
@@ -248,7 +248,7 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
 
 
 def _equal(key: str, one: Any, other: Any) -> bool:
-    """Return whether two values of a key are equal; a path may be spelt in several ways."""
+    """Return whether two values of a key are equal; paths may be spelt differently."""
     if key in PATHS and one and other:
         names = [[value] if isinstance(value, str) else value for value in (one, other)]
         one, other = ([str(Path(name).resolve()) for name in some] for some in names)
@@ -302,7 +302,7 @@ def _check_seed(seed: int) -> None:
 
 
 class DivergedError(ModelError):
-    """A training diverged: its gradients are not finite; a lower rate may help."""
+    """A diverged training, whose gradients are not finite: a lower rate may help."""
 
 
 @dataclass

@@ -222,7 +222,7 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
         raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
     for name in ("lightning.fabric", "lightning.pytorch"):  # a run reports enough itself
         logging.getLogger(name).setLevel(logging.WARNING)
-    # From 1 x 1 kernels, whose numbers lie alike with either strides.
+    # From 1 x 1 kernels, whose numbers lie alike under both strides.
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
     try:
         fabric = Fabric(
@@ -284,7 +284,7 @@ class Validation:
                 self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
 
     def __call__(self, objective: Objective) -> Score:
-        """Return metrics by name and the score, to be maximised; NaN if outputs are not finite."""
+        """Return metrics by name and a score to maximise; NaN if outputs are not finite."""
         objective.eval()
         return self._measure(objective)
 

@@ -342,9 +342,9 @@ class Autoencoder(Objective):
 class Predictive(Objective):
     """Prediction of the next four steps' frames from each step's features by a linear layer.
 
-    A network never sees later steps, so every step predicts what is hidden from it, masked steps
-    included. The loss is the mean squared error of the normalised frames, over all predictions of
-    later steps in the window by steps that an input has reached.
+    A network never sees later steps, so they are hidden from every step at once; masked steps are
+    predicted all the same. The loss is the mean squared error of the normalised frames, over all
+    predictions of later steps in the window by steps that an input has reached.
     """
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:

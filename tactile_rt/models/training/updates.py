@@ -189,7 +189,7 @@ class LARS(torch.optim.Optimizer):
 
 
 def _norm(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
-    """Return a tensor's norm, or that of each row, in a shape to multiply the tensor with."""
+    """Return a tensor's norm, or each row's, in a shape to multiply the tensor with."""
     size: torch.Tensor = torch.linalg.vector_norm(
         tensor, dim=-1 if stacked else None, keepdim=stacked
     )
@@ -219,7 +219,7 @@ def parameter_groups(
 
 
 def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
-    """Build the optimizer of a configuration: Table A2 has a weight decay of 1e-4 for all."""
+    """Build the optimizer of a configuration. Table A2 has a weight decay of 1e-4 for all."""
     rate, decay = config.learning_rate, config.weight_decay
     groups = parameter_groups(model, rate, decay, config.own_rates)
     if config.optimizer == "sgd":
