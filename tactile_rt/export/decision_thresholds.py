@@ -5,9 +5,8 @@ as the coverage says, whatever the network makes of them, as long as these are d
 that the rule was fitted on (Vovk, Gammerman & Shafer 2005). Sweeps of one object are alike, so that
 an object counts once, however often it was swept (Lee, Barber & Willett 2023, hierarchical
 conformal prediction). A robot may stop at any step, so that the coverage is that of all of them at
-once: a sweep's score is that of its worst step. What is usual at a step, which steps are compared
-by, is told by half of the objects; the other half, for which that is given, tells how far a sweep
-may be from it.
+once: a sweep's score is that of its worst step. Half of the objects give the usual score of each
+step, by which steps are compared; the other half show how far a sweep may exceed it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,19 +40,19 @@ from tactile_rt.models.evaluation.measures import (
 
 TEMPERATURES = np.geomspace(0.25, 4.0, 81)
 COVERAGE = 0.9
-REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
+REFUSED = 0.08  # largest share of the sweeps of known kinds that is refused at a step
 LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
 ENOUGH = 20  # objects of a class, of which half set a quantile of 90 %
 FEWEST = 50  # objects below which there is no rule: nearly all classes would be in each set
-USUAL = 0.9  # the share of sweeps that are no worse than what is usual at a step
-SMALLEST = 0.05  # what is usual, at least: where nearly all sweeps are right, it would be nothing
-# A rule holds up to a noise, in units of the rated, and is fitted at the ends of its range.
+USUAL = 0.9  # share of sweeps whose score at a step is at most the usual one
+SMALLEST = 0.05  # least usual score: it would be 0 where nearly all sweeps are right
+# A rule holds up to a noise level, in units of the rated noise, and is fitted at these levels.
 NOISE = {0.3: (0.0, 0.3), 1.2: (1.2,), 2.2: (2.2,)}
-REFUSED_AT = (0.0, 1.0)  # the noise at which so few are refused, each
+REFUSED_AT = (0.0, 1.0)  # noise levels at each of which at most `REFUSED` are refused
 
 
 def fit_temperature(posteriors: Floats, labels: Labels) -> float:
-    """The temperature that minimises the negative log-likelihood (Guo et al. 2017).
+    """Return the temperature that minimises the negative log-likelihood (Guo et al. 2017).
 
     Args:
         posteriors: (sweep, class) at temperature 1; undecided sweeps (NaN) are left out.
@@ -80,11 +79,11 @@ def fit_temperature(posteriors: Floats, labels: Labels) -> float:
 def fit_rules(
     sets: Sequence[SweepSet], run: Step, temperature: float, labels: Sequence[str], classes: int
 ) -> tuple[OpenSetRule | None, tuple[PredictionSetRule, ...]]:
-    """Fit the rules of a model.
+    """Fit the open-set rule and the prediction sets of a model on labelled sweeps.
 
     Args:
-        sets: labelled sweeps that it has not learnt from, as groups of which each is to have
-            the coverage.
+        sets: labelled sweeps that the model was not trained on, in groups; the coverage holds in
+            each group.
         run: (samples, offset, sigma) of windows to (batch, step, label) logits.
         classes: how many of the labels are classes; the others are refusals.
     """
@@ -121,19 +120,19 @@ def fit_rules(
 def fit_names(
     sets: Sequence[SweepSet], run: Step, kinds: Mapping[str, Sequence[str]]
 ) -> dict[str, tuple[PredictionSetRule, ...]]:
-    """Fit the prediction sets of kinds within each class, of which each has the coverage.
+    """Fit prediction sets of the kinds within each class, each with the coverage.
 
-    With few objects of a class, all of its kinds are in the set.
+    With few objects of a class, its set holds all kinds.
 
     Args:
-        sets: labelled sweeps that the model has not learnt from. Each that has `ENOUGH` objects of
-            a class is to have the coverage there; the others have it together.
+        sets: labelled sweeps that the model was not trained on. For each class, the coverage holds
+            in every set with `ENOUGH` objects, and over the other sets together.
         run: (samples, offset, sigma) of windows to (batch, step, name) logits.
-        kinds: those that it tells apart, by class.
+        kinds: the kinds that the model distinguishes, by class.
     """
     rules: dict[str, tuple[PredictionSetRule, ...]] = {}
     for bound, ends in NOISE.items():
-        groups: dict[str, dict[int, list[Any]]] = {}  # by class and set; 0: those of few objects
+        groups: dict[str, dict[int, list[Any]]] = {}  # by class and set; 0: sets of few objects
         for number, one in enumerate(sets, start=1):
             drawn: dict[str, list[Any]] = {}
             for level in ends:
@@ -163,14 +162,14 @@ def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSE
 
     Args:
         groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
-            objects (sweep,); each of the groups is refused no more.
-        refused: the share of sweeps of new objects.
+            objects (sweep,); the share holds in each group.
+        refused: largest share of sweeps of new objects that is refused.
 
     Raises:
         RecordingError: no contact in any sweep.
     """
     each = []
-    for posteriors, names in _touched(groups):
+    for posteriors, names in _drop_untouched(groups):
         order = np.argsort(posteriors, axis=0)
         share = np.cumsum(_weights(names)[order], axis=0)
         rank = (share < 1 - refused - 1e-12).sum(axis=0)  # (step,) of the threshold
@@ -186,43 +185,43 @@ def fit_prediction_sets(
     coverage: float = COVERAGE,
     fewest: int = FEWEST,
 ) -> PredictionSetRule | None:
-    """Fit the quantiles of a coverage in each group; None with too few objects.
+    """Fit the quantiles that reach a coverage in each group; None with too few objects.
 
     Args:
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)
             and objects (sweep,).
-        noise: the largest in units of the rated at which they hold.
+        noise: largest noise at which they hold, in units of the rated noise.
         fewest: the number of objects in a group below which there are too few.
 
     Raises:
         RecordingError: no contact in any sweep.
     """
     fitted, objects = [], set()
-    for posteriors, labels, names in _touched(groups):
+    for posteriors, labels, names in _drop_untouched(groups):
         own = sorted(set(names.tolist()))
         if len(own) < fewest:
             return None
         objects |= set(own)
         scores = mass_above(posteriors)[np.arange(len(labels)), :, labels]
         usual = np.isin(names, own[::2])
-        level = _usual(scores[usual], _weights(names[usual]))
-        fitted.append(_envelope(scores[~usual], _weights(names[~usual]), level, coverage))
+        level = _fit_usual(scores[usual], _weights(names[usual]))
+        fitted.append(_fit_envelope(scores[~usual], _weights(names[~usual]), level, coverage))
     quantiles = np.max(fitted, axis=0)
     return PredictionSetRule(
         MASS_ABOVE, coverage, tuple(float(q) for q in quantiles), len(objects), noise=noise
     )
 
 
-def _touched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """Of each group the sweeps in which a contact was found, posteriors first; of none: left out.
+def _drop_untouched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """Drop sweeps without contact from each group, and groups without any contact.
 
     Raises:
-        RecordingError: there is none in any.
+        RecordingError: no contact in any sweep.
     """
     found = [
         (group, ~np.isnan(group[0]).reshape(len(group[0]), -1).any(axis=1)) for group in groups
     ]
-    kept = [tuple(part[there] for part in group) for group, there in found if there.any()]
+    kept = [tuple(part[touch] for part in group) for group, touch in found if touch.any()]
     if not kept:
         raise RecordingError(
             "in no validation sweep a contact was found and answered by numbers, so that nothing "
@@ -232,14 +231,14 @@ def _touched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
 
 
 def _weights(names: Names) -> Doubles:
-    """(sweep,) Each object's weight is one of all objects and one yet to come."""
+    """Return (sweep,) weights that sum to 1 / (objects + 1 new) for each object."""
     _, which, count = np.unique(names, return_inverse=True, return_counts=True)
     weights: Doubles = 1 / (count[which] * (len(count) + 1))
     return weights
 
 
-def _usual(scores: Doubles, weights: Doubles) -> Doubles:
-    """(step,) What few sweeps (sweep, step) of scores in [0, 1) exceed at a step."""
+def _fit_usual(scores: Doubles, weights: Doubles) -> Doubles:
+    """Return the (step,) scores that few of the (sweep, step) scores in [0, 1) exceed."""
     order = np.argsort(scores, axis=0)
     share = np.cumsum(weights[order], axis=0) / weights.sum()
     rank = np.minimum((share < USUAL).sum(axis=0), len(scores) - 1)
@@ -248,16 +247,16 @@ def _usual(scores: Doubles, weights: Doubles) -> Doubles:
     return clipped
 
 
-def _envelope(scores: Doubles, weights: Doubles, usual: Doubles, coverage: float) -> Doubles:
-    """(step,) The scores that no step of so large a share of the sweeps exceeds.
+def _fit_envelope(scores: Doubles, weights: Doubles, usual: Doubles, coverage: float) -> Doubles:
+    """Return (step,) scores that a share of the sweeps exceeds at no step.
 
     Args:
         scores: (sweep, step), in [0, 1).
-        weights: (sweep,), of which the sum is less than 1.
-        usual: (step,), in (0, 1); the more, the larger a score is let through.
-        coverage: the share.
+        weights: (sweep,), with a sum below 1.
+        usual: (step,), in (0, 1); the larger, the larger the returned score.
+        coverage: the share of sweeps.
     """
-    # what is left of the posterior at and below a class, as a power of what usually is
+    # posterior at and below the true class, as a power of its usual value, at the worst step
     worst = (np.log1p(-np.minimum(scores, 1 - 1e-12)) / np.log1p(-usual)).max(axis=1)
     order = np.argsort(worst)
     enough = np.searchsorted(np.cumsum(weights[order]), coverage - 1e-12)

@@ -30,12 +30,12 @@ Precision = Literal["fp32", "fp16", "bf16", "int8"]
 PRECISIONS: tuple[Precision, ...] = ("fp32", "fp16", "bf16", "int8")
 BLOCK, LEAST_BLOCK = 128, 16  # inputs that share a scale; onnxruntime wants a power of two
 SMALL = 1024  # weights of fewer numbers stay as they are
-OUTPUTS = ("logits", "embedding", "names")  # the last of networks that tell kinds apart
+OUTPUTS = ("logits", "embedding", "names")  # the last: of networks that distinguish kinds
 CONTRIB = "com.microsoft"  # onnxruntime's own operators, which every build of it has
 
 
 def in_precision(proto: onnx.ModelProto, precision: Precision) -> onnx.ModelProto:
-    """A copy of a graph in another precision.
+    """Return a copy of a graph in another precision.
 
     Raises:
         ConfigError: no such precision.
@@ -45,14 +45,14 @@ def in_precision(proto: onnx.ModelProto, precision: Precision) -> onnx.ModelProt
     out = onnx.ModelProto()
     out.CopyFrom(proto)
     if precision in ("fp16", "bf16"):
-        _store(out, precision)
+        _store_16_bits(out, precision)
     elif precision == "int8":
         _quantise(out)
     return out
 
 
-def _store(proto: onnx.ModelProto, precision: Precision) -> None:
-    """Weights in 16 bits, each with a Cast that is folded when the file is loaded."""
+def _store_16_bits(proto: onnx.ModelProto, precision: Precision) -> None:
+    """Store weights in 16 bits, each with a Cast that loading the file folds."""
     casts = []
     for weight in proto.graph.initializer:
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < SMALL:
@@ -64,7 +64,7 @@ def _store(proto: onnx.ModelProto, precision: Precision) -> None:
             half = np.clip(values, -limit, limit).astype(np.float16)
             weight.CopyFrom(numpy_helper.from_array(half, f"{name}_16"))
         else:
-            weight.CopyFrom(_bfloat16(values, f"{name}_16"))
+            weight.CopyFrom(_to_bfloat16(values, f"{name}_16"))
         casts.append(
             helper.make_node("Cast", [weight.name], [name], f"{name}_cast", to=TensorProto.FLOAT)
         )
@@ -73,8 +73,8 @@ def _store(proto: onnx.ModelProto, precision: Precision) -> None:
     proto.graph.node.extend(nodes)
 
 
-def _bfloat16(values: NDArray[np.float32], name: str) -> TensorProto:
-    """Rounded to nearest, ties to even."""
+def _to_bfloat16(values: NDArray[np.float32], name: str) -> TensorProto:
+    """Return values as bfloat16, rounded to nearest, ties to even."""
     bits = np.ascontiguousarray(values).view(np.uint32)
     rounded = (bits + 0x7FFF + ((bits >> 16) & 1)) >> 16
     tensor = TensorProto(name=name, data_type=TensorProto.BFLOAT16, dims=values.shape)
@@ -87,7 +87,7 @@ def _quantise(proto: onnx.ModelProto) -> None:
     weights = {w.name: w for w in graph.initializer}
     makers = {output: node for node in graph.node for output in node.output}
     nodes: list[onnx.NodeProto] = []
-    biases = _biases(graph, weights)
+    biases = _find_biases(graph, weights)
     added: dict[str, TensorProto] = {}
     gathered: dict[str, tuple[str, str, str]] = {}
     for node in graph.node:
@@ -98,31 +98,31 @@ def _quantise(proto: onnx.ModelProto) -> None:
         values = numpy_helper.to_array(weight)
         if node.op_type == "Gemm" and any(a.name == "transB" and a.i for a in node.attribute):
             values = values.T
-        taps = _taps_of(node.input[0], makers)
+        taps = _find_taps(node.input[0], makers)
         replaced = (
-            _blocks(node, values, added)
+            _quantise_blocks(node, values, added)
             if taps is None
-            else _integer(node, values, taps, added, gathered, biases.get(node.output[0]))
+            else _quantise_taps(node, values, taps, added, gathered, biases.get(node.output[0]))
         )
         nodes.extend(replaced)
-    # What a product has added to itself already, the node that did so adds no more.
+    # A quantised product may add the bias itself: drop the Add with the same output.
     made = {output for node in nodes if node.domain == CONTRIB for output in node.output}
     nodes = [n for n in nodes if n.domain == CONTRIB or not made.intersection(n.output)]
     del graph.node[:]
-    graph.node.extend(_used(nodes, {o.name for o in graph.output}))
+    graph.node.extend(_select_used(nodes, {o.name for o in graph.output}))
     needed = {name for node in graph.node for name in node.input}
     kept = [w for w in (*graph.initializer, *added.values()) if w.name in needed]
     del graph.initializer[:]
     graph.initializer.extend(kept)
-    del graph.value_info[:]  # some say what is no longer there
+    del graph.value_info[:]  # some describe values that no longer exist
     if all(o.domain != CONTRIB for o in proto.opset_import):
         proto.opset_import.append(helper.make_opsetid(CONTRIB, 1))
 
 
-def _blocks(
+def _quantise_blocks(
     node: onnx.NodeProto, values: NDArray[np.float32], added: dict[str, TensorProto]
 ) -> Iterator[onnx.NodeProto]:
-    """x (..., inputs) times weights (inputs, outputs), the weights in blocks of inputs."""
+    """Yield nodes for x (..., inputs) times weights (inputs, outputs) in blocks of inputs."""
     inputs, outputs = values.shape
     block = min(BLOCK, max(LEAST_BLOCK, 1 << (inputs - 1).bit_length()))
     count = -(-inputs // block)
@@ -148,13 +148,13 @@ def _blocks(
         block_size=block,
         accuracy_level=4,  # integer products
     )
-    if len(node.input) == 3:  # of Gemm
+    if len(node.input) == 3:  # a Gemm has a bias
         yield helper.make_node(
             "Add", [product, node.input[2]], [node.output[0]], f"{node.name}_add"
         )
 
 
-def _integer(
+def _quantise_taps(
     node: onnx.NodeProto,
     values: NDArray[np.float32],
     taps: tuple[onnx.NodeProto, ...],
@@ -162,9 +162,9 @@ def _integer(
     gathered: dict[str, tuple[str, str, str]],
     bias: tuple[str, str] | None,
 ) -> Iterator[onnx.NodeProto]:
-    """Gathered taps times weights, from a map that is quantised before it is gathered.
+    """Yield nodes for gathered taps times weights; the map is quantised before gathering.
 
-    `bias` is what is added, and the name of the sum.
+    `bias` names the vector to add, and the sum.
     """
     final = taps[0].output[0]
     if final not in gathered:
@@ -200,8 +200,10 @@ def _integer(
     )
 
 
-def _biases(graph: onnx.GraphProto, weights: dict[str, TensorProto]) -> dict[str, tuple[str, str]]:
-    """By product: the vector that is added to it, where it has no other use, and their sum."""
+def _find_biases(
+    graph: onnx.GraphProto, weights: dict[str, TensorProto]
+) -> dict[str, tuple[str, str]]:
+    """Map each product that only an Add reads to the added vector and the sum."""
     uses = Counter(name for node in graph.node for name in node.input)
     uses.update(output.name for output in graph.output)
     found = {}
@@ -214,8 +216,8 @@ def _biases(graph: onnx.GraphProto, weights: dict[str, TensorProto]) -> dict[str
     return found
 
 
-def _taps_of(name: str, makers: dict[str, onnx.NodeProto]) -> tuple[onnx.NodeProto, ...] | None:
-    """The nodes that gather a convolution's taps, last first; None if nothing is gathered."""
+def _find_taps(name: str, makers: dict[str, onnx.NodeProto]) -> tuple[onnx.NodeProto, ...] | None:
+    """Return the nodes that gather a convolution's taps, last first; None without any."""
     chain = []
     while (node := makers.get(name)) is not None:
         if node.op_type not in ("Reshape", "Gather", "Pad"):
@@ -231,8 +233,8 @@ def _taps_of(name: str, makers: dict[str, onnx.NodeProto]) -> tuple[onnx.NodePro
     return tuple(chain)
 
 
-def _used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto]:
-    """Those nodes that an output needs, in order."""
+def _select_used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto]:
+    """Return the nodes that an output needs, in order."""
     needed, kept = set(outputs), []
     for node in reversed(nodes):
         if needed.intersection(node.output):
@@ -242,7 +244,7 @@ def _used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto
 
 
 def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.ModelProto:
-    """A model of kind "window" from the step that `onnx_step.step_graph` made.
+    """Return a model of kind "window" from the step that `onnx_step.step_graph` made.
 
     samples (batch, step, sub-step, element, channel), offset and sigma as for the step
     -> logits (batch, step, class), embedding (batch, step, unit), names (batch, step, name)
@@ -250,7 +252,7 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
     graph = step.graph
     values = {value.name: value for value in (*graph.input, *graph.output)}
     outputs = [name for name in OUTPUTS if name in values]
-    # The loop's body sees offset and sigma from outside; other names it may not share with outside.
+    # The loop's body reads offset and sigma from outside; its other names must differ from outside.
     inside = {name: f"scan_{name}" for name in ("samples", *outputs, *(s.name for s in state))}
     nodes = []
     for node in graph.node:
@@ -262,9 +264,9 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
     body = helper.make_graph(
         nodes,
         "step",
-        [_named(values[name], inside[name]) for name in (*(s.name for s in state), "samples")],
+        [_rename(values[name], inside[name]) for name in (*(s.name for s in state), "samples")],
         [values[f"{s.name}_next"] for s in state]
-        + [_named(values[name], inside[name]) for name in outputs],
+        + [_rename(values[name], inside[name]) for name in outputs],
         list(graph.initializer),
         value_info=list(graph.value_info),
     )
@@ -306,7 +308,7 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
             values["offset"],
             values["sigma"],
         ],
-        [_of_every_step(values[name]) for name in outputs],
+        [_add_step_axis(values[name]) for name in outputs],
         shapes,
     )
     model = helper.make_model(out, opset_imports=step.opset_import, ir_version=step.ir_version)
@@ -314,13 +316,13 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
     return model
 
 
-def _of_every_step(value: onnx.ValueInfoProto) -> onnx.ValueInfoProto:
-    """(batch, number) -> (batch, step, number)"""
+def _add_step_axis(value: onnx.ValueInfoProto) -> onnx.ValueInfoProto:
+    """Return an output (batch, number) as one of every step, (batch, step, number)."""
     number = value.type.tensor_type.shape.dim[1].dim_value
     return helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["batch", "step", number])
 
 
-def _named(value: onnx.ValueInfoProto, name: str) -> onnx.ValueInfoProto:
+def _rename(value: onnx.ValueInfoProto, name: str) -> onnx.ValueInfoProto:
     copy = onnx.ValueInfoProto()
     copy.CopyFrom(value)
     copy.name = name

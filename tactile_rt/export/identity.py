@@ -1,7 +1,7 @@
-"""The rule by which touches are of an enrolled object, measured on validation sweeps.
+"""The rule that matches touches to enrolled objects, fitted on validation sweeps.
 
-Half of the objects tell how objects and touches differ, and the other half below which score few
-touches are of their own object, and the other way round; a file has the Gaussians of all.
+Half of the objects give the Gaussians of objects and touches, the other half the score below which
+few touches of an enrolled object fall, and the other way round; a file has the Gaussians of all.
 """
 
 from collections.abc import Sequence
@@ -17,23 +17,23 @@ from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation.measures import Floats, Names, Step, cut_windows, run_over
 
 REFUSED = 0.05  # of touches of enrolled objects
-AMONG = (1, 5, 20, 100)  # objects that are enrolled
+AMONG = (1, 5, 20, 100)  # numbers of enrolled objects
 FEWEST = 20  # objects below which that share is not measured
-DRAWS = 20  # of touches to enrol an object by, and to judge
-SHARED = 0.2  # of the covariance of touches is taken to be the same in all directions
-DIRECTIONS, LEAST = 32, 0.05  # at most; variance of objects in each, at least
-TINY = 1e-6  # variance of embeddings of length 1
-PER_DIRECTION = 4  # objects, at least: of fewer, how they differ is not known in so many
+DRAWS = 20  # random draws of the touches that enrol an object and of those to judge
+SHARED = 0.2  # share of the touches' covariance that is taken as isotropic
+DIRECTIONS, LEAST = 32, 0.05  # most directions; least variance of objects in each
+TINY = 1e-6  # least variance of embeddings of length 1
+PER_DIRECTION = 4  # least objects per direction: fewer do not show how objects differ in it
 
 Doubles = NDArray[np.float64]
 NONE_YET = np.zeros((len(AMONG), enrolment.ENROLLED, enrolment.JUDGED))
 
 
 def fit_identity(sets: Sequence[SweepSet], run: Step) -> IdentityRule | None:
-    """Measure when touches are of an enrolled object; None with few objects.
+    """Fit the rule that matches touches to enrolled objects; None with few objects.
 
     Args:
-        sets: sweeps of objects that the network has not learnt from.
+        sets: sweeps of objects that the network was not trained on.
         run: (samples, offset, sigma) of windows to (batch, step, unit) embeddings.
     """
     embeddings, objects = [], []
@@ -47,15 +47,15 @@ def fit_identity(sets: Sequence[SweepSet], run: Step) -> IdentityRule | None:
 
 
 def identity_thresholds(embeddings: Floats, objects: Names) -> Doubles:
-    """Measure the score that few touches of enrolled objects lack.
+    """Return the log-odds below which few touches of enrolled objects fall.
 
     Args:
         embeddings: (touch, unit) of touches, at their last step.
-        objects: (touch,) what each is of.
+        objects: (touch,) name of the object that each touch is of.
 
     Returns:
-        (among, enrolled, judged) thresholds, by the number of objects and of touches; with too few
-        for one, that of fewer; NaN where there is none.
+        (among, enrolled, judged) thresholds by the numbers of objects and touches; with too few
+        objects for a number, the threshold of a smaller one; NaN without any.
     """
     rng = np.random.default_rng(0)
     table = np.full((len(AMONG), enrolment.ENROLLED, enrolment.JUDGED), np.nan)
@@ -91,7 +91,7 @@ def identity_thresholds(embeddings: Floats, objects: Names) -> Doubles:
 def fit_gaussians(
     embeddings: Floats, objects: Names, thresholds: Doubles = NONE_YET
 ) -> IdentityRule:
-    """Fit how objects and touches differ; return it as a rule of these thresholds."""
+    """Fit the Gaussians of objects and touches; return them as a rule with thresholds."""
     names, own, count = np.unique(objects, return_inverse=True, return_counts=True)
     means = np.stack([embeddings[own == k].mean(axis=0) for k in range(len(names))]).astype(float)
     apart = embeddings - means[own]
@@ -101,7 +101,7 @@ def fit_gaussians(
     whitening = vectors / np.sqrt(np.maximum(values, TINY))
     origin = means.mean(axis=0)
     spread = (means - origin) @ whitening
-    # of what the means of few touches vary, touches of one object are a part
+    # a mean of few touches also varies by the touches: subtract that part
     values, vectors = np.linalg.eigh(spread.T @ spread / (len(names) - 1))
     between = (values - (1 / count).mean())[::-1]
     known = min(DIRECTIONS, len(names) // PER_DIRECTION, int((between > LEAST).sum()))

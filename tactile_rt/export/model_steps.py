@@ -1,4 +1,4 @@
-"""What a step of a model file costs here: size, loading, memory, time."""
+"""Measured cost of a model file's step on this computer: size, loading, memory, time."""
 
 import gc
 import os
@@ -19,7 +19,7 @@ TAIL = "<= 1.3"  # p99 over p50 of every step
 
 @dataclass(frozen=True)
 class Subject:
-    """A model file to measure, and the bars that it must meet; without one it is only reported.
+    """A model file to measure and its bars; without a bar it is only reported.
 
     Attributes:
         path: The model file, of kind "step".
@@ -42,11 +42,11 @@ def measure_model(subject: Subject, steps: int) -> list[Record]:
     name, path = f"inference.{subject.name}", subject.path
     path.read_bytes()  # so that the file is cached
     gc.collect()
-    before, began = _resident(), time.process_time()
+    before, began = _read_resident(), time.process_time()
     session, card = load_model(path)
     load = time.process_time() - began
     ms = 1e3 * step_times(session, card, steps)
-    grown = _resident() - before
+    grown = _read_resident() - before
     p50, p99 = np.percentile(ms, [50, 99])
     how = f"network alone, {steps} steps, one thread"
     return [
@@ -66,7 +66,7 @@ def measure_model(subject: Subject, steps: int) -> list[Record]:
 
 
 def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> NDArray[np.float64]:
-    """Time the steps of episodes of noise, run as the classifier runs them: CPU time (step,), s."""
+    """Return (step,) CPU times in s of episodes of noise, run as the classifier does."""
     rng = np.random.default_rng(0)
     scale = np.array(card.scale, dtype=np.float32)
     offset = np.zeros(card.array.shape, dtype=np.float32)
@@ -86,7 +86,7 @@ def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> ND
     return taken
 
 
-def _resident() -> int:
-    """Bytes of memory that this process holds."""
+def _read_resident() -> int:
+    """Return the bytes of memory that this process holds."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")

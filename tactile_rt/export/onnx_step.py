@@ -49,7 +49,7 @@ class StreamingStep(nn.Module):
     """One step of a classifier with its state as arguments and results.
 
     Args:
-        integer: its products will be quantised, see `streaming`.
+        integer: whether its products will be quantised, see `streaming`.
     """
 
     def __init__(self, model: TactileClassifier, integer: bool = False) -> None:
@@ -61,15 +61,15 @@ class StreamingStep(nn.Module):
     def forward(
         self, samples: Tensor, offset: Tensor, sigma: Tensor, *state: Tensor
     ) -> tuple[Tensor, ...]:
-        """(batch, sub-step, element, channel) SI and state -> logits (batch, class), embedding
-        (batch, unit), names (batch, name) of a network that has some, and state.
-        """
+        """Return logits (batch, class), embedding (batch, unit), names (batch, name), next state.
+
+        Samples are (batch, sub-step, element, channel), SI; some networks have no names."""
         frame = self.inputs(samples, offset, sigma)
         outputs, following = self.network.step_outputs(
             frame, dict(zip(self.names, state, strict=True))
         )
-        told = (outputs[name] for name in OUTPUTS if name in outputs)
-        return (*told, *(following[name] for name in self.names))
+        results = (outputs[name] for name in OUTPUTS if name in outputs)
+        return (*results, *(following[name] for name in self.names))
 
 
 def export_checkpoint(
@@ -87,15 +87,15 @@ def export_checkpoint(
     kind: Kind = "step",
     licence: str = "",
 ) -> ModelCard:
-    """Export what `training.loop.train` saved.
+    """Export a checkpoint of `training.loop.train` as a model file.
 
     Args:
-        trained: the network of the checkpoint, and what the checkpoint holds.
-        manifests: of the sets that it was trained on.
+        trained: the network of the checkpoint, and the checkpoint's contents.
+        manifests: the manifests of the sets that it was trained on.
         temperature: divides the logits at run time.
-        rules: when the model refuses to name a class, and of its prediction sets.
-        names: of the prediction sets of kinds, by class.
-        identity: by which touches are of an enrolled object.
+        rules: the open-set rule, and the rules of the prediction sets.
+        names: the rules of the prediction sets of kinds, by class.
+        identity: the rule that matches touches to enrolled objects.
         kind: "step" or "window".
 
     Raises:
@@ -152,11 +152,11 @@ def export_step(
     precision: Precision = "fp32",
     kind: Kind = "step",
 ) -> ModelCard:
-    """Write a classifier's streaming step, or a whole window of it.
+    """Write a classifier's streaming step, or a whole window, as a model file.
 
-    What the card says of the graph (state, embedding, kind, precision, hashes, parity, probe) is
-    filled in. Parity is of the graph in single precision, the worst of its outputs; what
-    less precise weights change is ``quantisation_logits``, on the same input.
+    The card's fields about the graph (state, embedding, kind, precision, hashes, parity, probe) are
+    filled in. Parity is that of the graph's worst output in single precision; the effect of less
+    precise weights on the same input is ``quantisation_logits``.
 
     Raises:
         ModelError: the exported graph misses the parity bar.
@@ -169,10 +169,10 @@ def export_step(
 def step_graph(
     model: TactileClassifier, card: ModelCard, integer: bool = False
 ) -> tuple[onnx.ModelProto, tuple[StateTensor, ...]]:
-    """The step in single precision, without metadata, and its state.
+    """Return the step's graph in single precision, without metadata, and its state.
 
     Args:
-        integer: its products will be quantised, see `streaming`.
+        integer: whether its products will be quantised, see `streaming`.
     """
     step = StreamingStep(model.eval(), integer).eval()
     state = step.network.initial_state(2)
@@ -202,7 +202,7 @@ def step_graph(
         )
     assert program is not None
     proto = program.model_proto
-    # The exporter records where in the source each node came from: weight without use here.
+    # The exporter records each node's place in the source, which only makes the file larger.
     for node in proto.graph.node:
         del node.metadata_props[:]
         node.doc_string = ""
@@ -213,14 +213,14 @@ def step_graph(
             name,
             tuple(tensor.shape[1:]),
             str(tensor.dtype).removeprefix("torch."),
-            in_place=_written_by_rows(proto.graph, name),
+            in_place=_is_written_by_rows(proto.graph, name),
         )
         for name, tensor in state.items()
     )
 
 
-def _written_by_rows(graph: onnx.GraphProto, state: str) -> bool:
-    """Whether a state's numbers are read only by the `ScatterND` that makes the next one of it."""
+def _is_written_by_rows(graph: onnx.GraphProto, state: str) -> bool:
+    """Return whether only the `ScatterND` that makes a state's next value reads it."""
     readers = [n for n in graph.node if state in n.input and n.op_type != "Shape"]
     return (
         len(readers) == 1
@@ -240,10 +240,10 @@ def write_model(
     precision: Precision = "fp32",
     kind: Kind = "step",
 ) -> ModelCard:
-    """Write what `step_graph` made, in a precision, as `export_step` says.
+    """Write the graph of `step_graph` in a precision, as `export_step` does.
 
     Raises:
-        OSError: naming `path`: its folder cannot be written into, or the medium is full.
+        OSError: the folder cannot be written into, or the medium is full; it names `path`.
     """
     (embedding,) = (o.type.tensor_type.shape for o in proto.graph.output if o.name == "embedding")
     card = msgspec.structs.replace(
@@ -259,7 +259,7 @@ def write_model(
 
     def fill(file: BinaryIO) -> None:
         nonlocal card
-        partial = Path(file.name)  # written again and again, as what is found out goes into it
+        partial = Path(file.name)  # written again whenever the card has grown
         if kind == "window":
             card = msgspec.structs.replace(card, state=(), kind="window")
         form = window_graph(proto, state) if kind == "window" else proto
@@ -297,7 +297,7 @@ def _write(proto: onnx.ModelProto, card: ModelCard, path: Path) -> None:
 def parity(
     model: TactileClassifier, path: Path, episodes: int = 3, seed: int = 0
 ) -> dict[str, float]:
-    """Largest difference of each output, over every step, between a file and the torch window.
+    """Return each output's largest difference, over all steps, between a file and torch's window.
 
     In units of the output's largest number, where that is more than 1, as `align gate` measures:
     single precision rounds a sum as its largest part is rounded. NaN if either computes one.

@@ -1,4 +1,4 @@
-"""A checkpoint made ready for robots: calibrated on validation sweeps, exported, described."""
+"""Release of a checkpoint for robots: calibration on validation sweeps, export, figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,12 +36,12 @@ def release(
     data: Sequence[Path] = (),
     licence: str = "",
 ) -> ModelCard:
-    """Fit the temperature on the validation split, then export.
+    """Calibrate a checkpoint on its validation sweeps, then export it as a model file.
 
-    What a precision below fp32 costs on validation sweeps is measured and stored.
+    The cost of a precision below fp32 on validation sweeps is measured and stored.
 
     Args:
-        data: where the sweep sets that it was trained on lie now; default: where they lay.
+        data: folders of the sweep sets that it was trained on; default: those in its configuration.
 
     Raises:
         ModelError, RecordingError: the checkpoint or its sweep set cannot be read.
@@ -52,20 +52,20 @@ def release(
     there = trained_on(checkpoint, saved, data)
     manifests = [manifest for _, manifest in there]
     known = join_manifests(manifests).categories
-    sets = [  # their windows as the network knows them, for the rules of its decisions, too
+    sets = [  # with windows drawn as in training, also to fit the decision rules
         drawn_as(relabelled(SweepSet.read_known(folder, manifest, "validation"), known), config)
         for folder, manifest in there
         if manifest.split.get("validation")
     ]
     validation = joined(sets)
-    # Half clean, half at rated noise: what the checkpoint was chosen by, too.
+    # Half clean, half at rated noise, as for the choice of the checkpoint.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)
     last = among(posteriors[:, -1], len(known))
     right = hits(last, labels).reshape(2, -1).mean(axis=1).tolist()
     temperature = fit_temperature(last, labels)
-    told = (*known, *saved["refusals"])
-    unknown, prediction_sets = fit_rules(sets, run_on(model), temperature, told, len(known))
+    answers = (*known, *saved["refusals"])
+    unknown, prediction_sets = fit_rules(sets, run_on(model), temperature, answers, len(known))
     kinds = saved.get("kinds", {})
     names = fit_names(sets, run_on(model, "names"), kinds) if kinds else {}
     identity = model.network.config.identity
@@ -86,11 +86,11 @@ def release(
     )
     if precision == "fp32":
         return card
-    return _described(path, card, quantisation_figures(run_on(model), path, validation))
+    return _add_figures(path, card, quantisation_figures(run_on(model), path, validation))
 
 
 def run_file(path: Path) -> Step:
-    """The function that `evaluation.measures.predict` wants, of a model file of either kind."""
+    """Load a model file of either kind as a function for `evaluation.measures.predict`."""
     session, card = load_model(path, kind=None)
 
     def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
@@ -103,12 +103,12 @@ def run_file(path: Path) -> Step:
 
 
 def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[str, float]:
-    """What a file's precision costs on sweeps, half of them at rated noise, at the last step.
+    """Measure what a file's precision costs at the last step, clean and at rated noise.
 
     Returns:
         ``quantisation_top1_drop`` in points, ``quantisation_agreement`` in %,
         ``quantisation_posterior``, the largest difference of a posterior, and
-        ``quantisation_sweeps``, how many that were.
+        ``quantisation_sweeps``, the number of sweeps.
     """
     classes = len(sweeps.manifest.categories)
     before, after = (
@@ -127,8 +127,8 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
     }
 
 
-def _described(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelCard:
-    """Write further figures into a file."""
+def _add_figures(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelCard:
+    """Write further figures into a model file and return its new card."""
     card = msgspec.structs.replace(card, figures={**card.figures, **figures})
     proto = onnx.load(path)
     onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})

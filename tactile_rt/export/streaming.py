@@ -4,7 +4,7 @@ Maps are `(lane, site, channel)`, sites row by row, in the state and inside, so 
 transposed between steps; a convolution is one gather of every site's taps and one product, or two
 where that is less arithmetic. The cache of a layer of the GPT is written by rows: what was attended
 before stays where it is. Tokens are the rows of one matrix, (lane * token, width), or where that is
-faster (1, lane, token, width). What cannot be rewritten is left as it was trained.
+faster (1, lane, token, width). Parts that cannot be rewritten stay as trained.
 """
 
 import copy
@@ -23,24 +23,24 @@ from tactile_rt.models.ead import EAD
 from tactile_rt.models.encoders.cells import FORGET_BIAS, Cell, IntersectionCell, State
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 
-LARGE = 2**18  # numbers of a convolution's weights, from where on `Pointwise` was the faster form
-WIDE = 256  # features, from where on convolutions were the faster products
+LARGE = 2**18  # weights of a convolution from which on `Pointwise` was the faster form
+WIDE = 256  # features from which on convolutions were the faster products
 
 
 def streaming(network: EAD, integer: bool = False) -> EAD:
-    """The same network for the runtime: `step` and `initial_state`, not `forward`.
+    """Return a network rewritten for the runtime: `step` and `initial_state`, not `forward`.
 
     Its state has other names and layouts than the trained network's.
 
     Args:
         network: as trained, in evaluation mode.
-        integer: its products will be quantised: gather all taps of a convolution at once.
+        integer: whether its products will be quantised: then gather a convolution's taps at once.
     """
     out = copy.copy(network)
     out._modules = dict(network._modules)  # a shallow copy would share it
     encoder = network.encoder
     if isinstance(encoder, GraphEncoder):
-        if all(_plain(encoder, node.name) for node in encoder.graph.nodes):
+        if all(_is_plain(encoder, node.name) for node in encoder.graph.nodes):
             out.encoder = StreamingGraph(encoder, integer)
     elif hasattr(encoder, "deployed"):
         out.encoder = encoder.deployed()
@@ -49,8 +49,8 @@ def streaming(network: EAD, integer: bool = False) -> EAD:
     return out.eval()
 
 
-def _plain(encoder: GraphEncoder, name: str) -> bool:
-    """Whether a node only concatenates, and reads maps if it is one."""
+def _is_plain(encoder: GraphEncoder, name: str) -> bool:
+    """Return whether a node only concatenates and, if it is a map, reads only maps."""
     (node,) = [n for n in encoder.graph.nodes if n.name == name]
     fused = any(e.fusion != "concatenate" for e in node.reads)
     vectors = any(encoder.sizes[e.source] == (1, 1) for e in node.reads)
@@ -63,8 +63,8 @@ class Taps(nn.Module):
     Args:
         weight: (output, 2, 2, input).
         valid: without the padding that makes the output as large as the input.
-        whole: gather all four taps; else add the lower two as a product of their own, of fewer
-            sites or of none: what lies below the map needs no product.
+        whole: gather all four taps at once; else the lower two are a second product, without the
+            sites below the map, which need none.
     """
 
     taps: Tensor
@@ -177,7 +177,7 @@ class StreamingGraph(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: each node's cell state and, where a node hears it, its output, ``NAME_h``."""
+        """Return zeros: each node's cell state and, if a node reads it, its output ``NAME_h``."""
         zeros = next(self.buffers()).new_zeros
         state = {}
         for node in self.graph.nodes:
@@ -190,7 +190,7 @@ class StreamingGraph(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, channel, row, column) -> features (batch, feature), new state."""
+        """Run one step: frame (batch, channel, row, column) -> features (batch, feature), state."""
         now = frame.flatten(2).transpose(1, 2)
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
@@ -209,7 +209,7 @@ class StreamingGraph(nn.Module):
         return new[f"{self.graph.readout}_h"], {key: new[key] for key in kept}
 
     def _dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
-        """Of every site's channels, then those of vectors."""
+        """Apply a dense node to every site's channels, then those of vectors."""
         maps, vectors = [m for m in read if m.dim() == 3], [m for m in read if m.dim() == 2]
         if not vectors:
             joined = torch.cat(maps, -1)
@@ -257,12 +257,12 @@ class Columns(nn.Module):
 
 
 class Pointwise(nn.Module):
-    """W x + b of a few rows (..., row, input), of up to four axes, as a 1 x 1 convolution.
+    """W x + b of a few rows, as a 1 x 1 convolution.
 
-    The runtime's blocked convolution reads large weights faster for a few rows than its product
-    does: one at 26 GB/s, not 22, of 28; two at 27, not 19, of 31; 24 in 12 % less time. It has to
-    reorder them (the transpositions here become a part of that), so small weights are better off
-    as a `Product`.
+    Rows are (..., row, input), of up to four axes. For a few rows the runtime's blocked
+    convolution reads large weights faster than its product does: for one row at 26 GB/s, not 22,
+    of 28; for two at 27, not 19, of 31; for 24 in 12 % less time. It has to reorder them (which
+    includes the transpositions here), so a `Product` is better for small weights.
     """
 
     weight: Tensor
@@ -274,13 +274,13 @@ class Pointwise(nn.Module):
         self.register_buffer("bias", None if bias is None else bias.detach().clone())
 
     def forward(self, x: Tensor) -> Tensor:
-        missing = 4 - x.dim()  # lanes are not the batch, for each of which it would read anew
+        missing = 4 - x.dim()  # not lanes as the batch: each would read the weights anew
         out = F.conv2d(x[(None,) * missing].permute(0, 3, 1, 2), self.weight, self.bias)
         return out.permute(0, 2, 3, 1).flatten(0, missing)
 
 
 class StreamingGPT(nn.Module):
-    """A `GPT` whose cache is one tensor per layer and kind, of which a step writes its own rows."""
+    """A `GPT` with one cache tensor per layer and kind; steps write their own rows."""
 
     positions: Tensor
 
@@ -302,7 +302,7 @@ class StreamingGPT(nn.Module):
         self.blocks = nn.ModuleList(StreamingBlock(block, self.layout) for block in gpt.blocks)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: keys and values of each layer, (batch, head, step * token, width / head)."""
+        """Return zeros: each layer's keys and values, (batch, head, step * token, width / head)."""
         zeros = self.norm.weight.new_zeros
         shape = (batch, HEADS, TOKENS * self.max_steps, self.head)
         names = [f"gpt_{kind}{layer}" for layer in range(len(self.blocks)) for kind in "kv"]
@@ -311,10 +311,10 @@ class StreamingGPT(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step, as `GPT.step`."""
+        """Run one step, as `GPT.step` does."""
         index = index.clamp(max=self.max_steps - 1)
         query = TOKENS * index[:, None, None] + torch.arange(TOKENS)
-        # The observation sees the pairs before and itself, the action token its own pair too.
+        # The observation attends to earlier pairs and itself, the action token to its pair too.
         token = torch.arange(TOKENS * self.max_steps)
         unseen = torch.where(token <= query[..., None], 0.0, -torch.inf)
         lane = torch.arange(index.shape[0])[:, None, None]
@@ -333,9 +333,9 @@ class StreamingGPT(nn.Module):
 
 @dataclass(frozen=True)
 class Rows:
-    """Where a step's tokens go in a cache: lane, head, row, each (lane, head, token).
+    """Places of a step's tokens in a cache: lane, head, row, each (lane, head, token).
 
-    `unseen` is (lane, 1, token, row): 0 for what a token sees, else minus infinity.
+    `unseen` is (lane, 1, token, row): 0 where a token attends, else minus infinity.
     """
 
     lane: Tensor
@@ -344,7 +344,7 @@ class Rows:
     unseen: Tensor
 
     def write(self, cache: Tensor, values: Tensor) -> Tensor:
-        """A cache (lane, head, row, number) with values (lane, head, token, number) in place."""
+        """Return a cache (lane, head, row, number) with values (lane, head, token, number) set."""
         return cache.index_put((self.lane, self.head, self.row), values)
 
 

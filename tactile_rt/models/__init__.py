@@ -1,6 +1,6 @@
-"""Encoder-Attender-Decoder networks in torch, and what is done with them. Needs the `train` extra.
+"""Encoder-Attender-Decoder networks in torch, trained and evaluated. Needs the `train` extra.
 
-`alignment` and the RSA benchmark do without torch, so nothing is imported before it is asked for.
+`alignment` and the RSA benchmark do without torch, so modules are imported only when used.
 """
 
 from importlib import import_module

@@ -1,14 +1,14 @@
-"""Augmentations of tactile windows: what else the same touch could have looked like.
+"""Augmentations of tactile windows: other forms that the same touch could have had.
 
 - "tactile": the array is mirrored across its columns or rows, turned by a quarter, time reversed;
   drawn for every window, on the loads in SI units. Whiskers are only permuted, and force and
   moment vectors are mirrored and turned with the array.
 - "tactile-paper": as published (Chung et al. 2025, Fig. 2b, and its code) on the frames: one draw
   for a whole batch, vectors left as they are, and a turned 5 x 7 grid loses its outer columns.
-- "image": the control: colour jitter, greyscale, blur and noise (Chen et al. 2020), the loads of a
-  cell taken for its colours.
-- "image-paper", "image-paper-weak": the published controls, of SimCLR and of SimSiam: forces and
-  moments are the three colours of two pictures each, of values from 0 to 1; one draw for a batch.
+- "image": the control: colour jitter, greyscale, blur and noise (Chen et al. 2020), with the
+  loads of a cell as its colours.
+- "image-paper", "image-paper-weak": the published controls, of SimCLR and of SimSiam: forces
+  are the three colours of a picture, moments those of another, from 0 to 1; one draw for a batch.
 
 Mirroring, turning and reversal of "tactile" happen in half of the windows each; the image
 operations as in SimCLR. Temporal masking blanks whole steps.
@@ -41,7 +41,7 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Symmetry:
-    """One of an array.
+    """A symmetry of an array: which loads each element takes, and how they are turned.
 
     Attributes:
         source: (element,) The index of the element whose loads each element takes.
@@ -53,27 +53,27 @@ class Symmetry:
 
 
 def symmetries(spec: ArraySpec) -> tuple[Symmetry, Symmetry, Symmetry]:
-    """Mirrored across its columns, across its rows, and turned by a quarter.
+    """Return an array's symmetries: mirrored across columns, across rows, turned by a quarter.
 
     In a ragged grid every row (column) is reversed by itself, so that no whisker is lost. For a
     quarter turn, which a grid of 5 x 7 does not have, the grid is stretched to a square and every
-    whisker goes to the nearest place, no two to one.
+    whisker goes to the nearest place, no two to the same.
 
     Raises:
         ConfigError: the grid is a single line, or a channel is part of no force or moment vector.
     """
-    column, row = _directions(spec)
+    column, row = _fit_directions(spec)
     grid = np.array(spec.grid)
     turn = np.outer(row, column) - np.outer(column, row) + np.outer(*[np.cross(column, row)] * 2)
     return (
-        _symmetry(spec, _reversed(grid, 0), _reflection(column)),
-        _symmetry(spec, _reversed(grid, 1), _reflection(row)),
-        _symmetry(spec, _turned(grid), turn),
+        _symmetry(spec, _mirror_places(grid, 0), _reflection(column)),
+        _symmetry(spec, _mirror_places(grid, 1), _reflection(row)),
+        _symmetry(spec, _turn_places(grid), turn),
     )
 
 
 def compose(spec: ArraySpec, *steps: Symmetry) -> Symmetry:
-    """The last of the symmetries first, then the one before it ...; of none: the identity."""
+    """Return the symmetry that applies the given ones from last to first; none: identity."""
     n, channels = spec.shape
     source = np.arange(n)
     matrix = np.tile(np.eye(channels), (n, 1, 1))
@@ -82,8 +82,8 @@ def compose(spec: ArraySpec, *steps: Symmetry) -> Symmetry:
     return Symmetry(source, matrix)
 
 
-def _reversed(grid: NDArray[np.int64], line: int) -> NDArray[np.int64]:
-    """(element,) the whisker that mirrors each in its row (line 0) or column (line 1)."""
+def _mirror_places(grid: NDArray[np.int64], line: int) -> NDArray[np.int64]:
+    """Return (element,) every whisker's mirror in its row (line 0) or column (line 1)."""
     source = np.arange(len(grid))
     for value in np.unique(grid[:, line]):
         members = np.flatnonzero(grid[:, line] == value)
@@ -92,8 +92,8 @@ def _reversed(grid: NDArray[np.int64], line: int) -> NDArray[np.int64]:
     return source
 
 
-def _turned(grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(element,) the whisker that a quarter turn (column direction to row direction) puts there."""
+def _turn_places(grid: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return (element,) the whisker that a quarter turn (column to row) puts in each place."""
     low, high = grid.min(0), grid.max(0)
     square = 2 * (grid - low) / (high - low) - 1  # (row, column) in [-1, 1]
     image = np.stack([square[:, 1], -square[:, 0]], axis=1)
@@ -102,8 +102,8 @@ def _turned(grid: NDArray[np.int64]) -> NDArray[np.int64]:
     return source
 
 
-def _directions(spec: ArraySpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Unit vectors of the mount frame along growing columns and, across them, growing rows."""
+def _fit_directions(spec: ArraySpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mount-frame unit vectors along growing columns and, across them, growing rows."""
     grid = np.array(spec.grid, dtype=np.float64)
     positions = np.array(spec.positions, dtype=np.float64)
     design = np.column_stack([grid, np.ones(len(grid))])
@@ -132,13 +132,13 @@ def _symmetry(spec: ArraySpec, source: NDArray[np.int64], image: NDArray[np.floa
         polar[j] = frames[j].T @ _smallest_rotation(x, frames[j, :, 0]) @ seen
     axial = np.linalg.det(image).round() * polar
     matrix = np.zeros((len(source), *[len(spec.channels)] * 2))
-    for vector, parts in _vectors(spec).items():
+    for vector, parts in _find_vectors(spec).items():
         matrix[:, parts[:, None], parts] = polar if vector == "f" else axial
     return Symmetry(source, matrix)
 
 
-def _vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
-    """Channel indices (x, y, z) of the force and the moment."""
+def _find_vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
+    """Return channel indices (x, y, z) of the force and the moment."""
     found = {}
     for vector, unit in VECTORS.items():
         names = [vector + axis for axis in AXES]
@@ -157,9 +157,9 @@ def _vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
 
 
 def _smallest_rotation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation by the smallest angle that takes unit vector a to b (Rodrigues)."""
+    """Return the rotation by the smallest angle that takes unit vector a to b (Rodrigues)."""
     v, c = np.cross(a, b), float(a @ b)
-    if c < -1 + 1e-9:  # opposite: half a turn about any axis across, the same one for b to a
+    if c < -1 + 1e-9:  # opposite: half a turn about any normal axis, the same for b to a
         across = np.cross(a, np.eye(3)[np.abs(a).argmin()])
         across /= np.linalg.norm(across)
         half: NDArray[np.float64] = 2 * np.outer(across, across) - np.eye(3)
@@ -170,7 +170,7 @@ def _smallest_rotation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArra
 
 
 HALF = 0.5
-JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's, and a noise of the log
+JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's; noise of the logarithm
 BLUR = (1.0, 2.0, 1.0)
 
 T = TypeVar("T")
@@ -183,7 +183,7 @@ def _as_is(x: T, _: Generator) -> T:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What happens to a batch before and after the input stage; draws come from a generator.
+    """Functions that augment a batch before and after the input stage, drawing from a generator.
 
     Attributes:
         loads: The function that augments loads: (samples, offset, sigma) in SI units and a CPU
@@ -199,10 +199,10 @@ class Augmentation:
 
 
 def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
-    """An augmentation by name.
+    """Build an augmentation by name.
 
     Args:
-        masking: share of steps that are blanked, too.
+        masking: share of steps that are blanked as well.
 
     Raises:
         ConfigError: the array has no symmetries ("tactile"), or its channels are not the colours
@@ -241,7 +241,7 @@ class Tactile:
     """Mirroring, turning and time reversal of the loads themselves, drawn for every window.
 
     Raises:
-        ConfigError: its channels are neither forces nor moments, or it is no grid.
+        ConfigError: the array's channels are neither forces nor moments, or it is no grid.
     """
 
     def __init__(self, spec: ArraySpec) -> None:
@@ -258,7 +258,7 @@ class Tactile:
         return self.transform(loads, which, reverse)
 
     def transform(self, loads: Loads, which: Tensor, reverse: Tensor) -> Loads:
-        """Windows as the array's symmetry `which` (batch,) would have them, `reverse` (batch,)d.
+        """Transform windows by symmetry `which` (batch,); reverse time where `reverse` (batch,).
 
         A reversed movement bends a whisker the other way: its loads change their sign.
         """
@@ -281,10 +281,10 @@ class Tactile:
 
 
 def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Tensor:
-    """The published variant, one draw for the batch.
+    """Augment frames as published, with one draw for the batch.
 
-    With even chances it is either the columns or the rows that may be flipped, and they are in half
-    of the cases; any of four quarter turns is as likely; half of the windows run backwards.
+    Columns or rows, with even chances, are flipped in half of the cases; the four quarter turns
+    are equally likely; half of the batches run backwards.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).
@@ -301,7 +301,7 @@ def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Te
 def as_published(
     frames: Tensor, mirrored: int, turns: int, reverse: bool, channels: int = 6
 ) -> Tensor:
-    """Frames as `tactile_paper` makes them once it has drawn what to do.
+    """Augment frames as `tactile_paper` does, with what it draws given.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).
@@ -320,7 +320,7 @@ def as_published(
 
 
 def turned(frames: Tensor, turns: int) -> Tensor:
-    """Images turned by quarters, counter-clockwise, in their own frame: what leaves it is lost."""
+    """Return images turned by quarters, counter-clockwise; what leaves the grid is lost."""
     if turns % 2 == 0:
         return frames.flip((-2, -1)) if turns % 4 else frames
     side = min(frames.shape[-2:])
@@ -332,7 +332,7 @@ def turned(frames: Tensor, turns: int) -> Tensor:
 
 
 def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
-    """What SimCLR does to pictures, drawn for every window.
+    """Augment frames as SimCLR does pictures, with a draw for every window.
 
     Args:
         frames: (batch, step, sub-step * colour, row, column).
@@ -353,23 +353,23 @@ def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
     saturated = grey + (contrast - grey) * factor()
     x = torch.where(draw() < JITTER_CHANCE, saturated, x)
     x = torch.where(draw() < GREY_CHANCE, x.mean(3, keepdim=True).expand_as(x), x)
-    x = torch.where(draw() < HALF, _blurred(x), x)
+    x = torch.where(draw() < HALF, _blur(x), x)
     noise = torch.randn(x.shape, generator=generator, device=device)
     x = x + NOISE * (draw() < HALF) * noise
     return x.flatten(2, 3)
 
 
-def _blurred(x: Tensor) -> Tensor:
-    """Frames (..., row, column) blurred, cells at an edge repeated beyond it.
+def _blur(x: Tensor) -> Tensor:
+    """Blur frames (..., row, column), with the cells at an edge repeated beyond it.
 
     One product over all cells: as a convolution of single channels it takes twenty times as long.
     """
-    rows, columns = (_blur_along(n).to(x) for n in x.shape[-2:])
+    rows, columns = (_blur_matrix(n).to(x) for n in x.shape[-2:])
     return (x.flatten(-2) @ torch.kron(rows, columns).T).view(x.shape)
 
 
-def _blur_along(cells: int) -> Tensor:
-    """(cell, cell) The share of each cell of a line in what another one becomes."""
+def _blur_matrix(cells: int) -> Tensor:
+    """Return (cell, cell) weights: a line's blurred cells (rows) from its cells (columns)."""
     weights = torch.tensor(BLUR) / sum(BLUR)
     reach = len(BLUR) // 2
     shares = torch.zeros(cells, cells)
@@ -380,7 +380,7 @@ def _blur_along(cells: int) -> Tensor:
 
 
 def mask_steps(frames: Tensor, share: float, generator: Generator) -> Tensor:
-    """Blank this share of every window's steps, drawn for each; the others stay."""
+    """Blank a share of every window's steps, drawn for each window."""
     n, steps = frames.shape[:2]
     order = torch.rand(n, steps, generator=generator, device=frames.device).argsort(1).argsort(1)
     kept = order >= round(share * steps)

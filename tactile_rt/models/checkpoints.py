@@ -1,8 +1,8 @@
-"""Checkpoints of networks: what one says of itself, the sets that it fits, and its network.
+"""Checkpoints of networks: their contents, the sets that they fit, and their networks.
 
 torch writes an archive: a pickle of everything but the numbers of tensors, which lie beside it.
-What is read without torch leaves the numbers where they are, and nothing but plain values is made
-of the pickle. torch is imported where a network is made, seconds that a refusal need not take.
+Reading without torch skips the numbers and makes only plain values of the pickle. Importing torch
+takes seconds, so it is imported only where a network is made, after all other checks.
 """
 
 import pickle
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 PICKLE = "/data.pkl"  # in the archive, in a folder of any name
 NEEDED = ("model", "network", "config", "spec", "period_ns", "categories", "refusals")
-# of a network's configuration, what a training configuration says
+# fields of a network's configuration that a training configuration has too
 NETWORK = (
     "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",
     "preprocessing",
@@ -36,10 +36,10 @@ NETWORK = (
 
 
 def describe_checkpoint(path: Path) -> dict[str, Any]:
-    """Read what a `best.pt` holds; every tensor is None.
+    """Read the contents of a `best.pt`; every tensor is None.
 
     Raises:
-        ModelError: not there, or no such checkpoint, as far as can be told without its numbers.
+        ModelError: missing, or no such checkpoint; the numbers of tensors are not checked.
     """
     check_no_pointer(path)
     try:
@@ -48,9 +48,9 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
             if not names:
                 raise ModelError("it is another archive")
             with archive.open(names[0]) as pickled:
-                saved = _WithoutTensors(pickled).load()
+                saved = _PlainUnpickler(pickled).load()
         missing = [key for key in NEEDED if key not in saved]
-        if missing:  # of last.pt, for one
+        if missing:  # as in a last.pt
             raise ModelError(f"it has no {missing[0]}, which a best.pt has")
         EADConfig(**saved["network"])
         ArraySpec.from_json(saved["spec"])
@@ -63,43 +63,41 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def network_of(path: Path) -> dict[str, Any]:
-    """Read what a training configuration says of the network of a checkpoint."""
+    """Read the fields of a checkpoint's network that a training configuration has too."""
     network = describe_checkpoint(path)["network"]
     return {key: value for key, value in network.items() if key in NETWORK}
 
 
 def no_checkpoint(path: Path, error: Exception) -> ModelError:
-    """The error to raise of a file that is no checkpoint."""
+    """Return the error to raise for a file that is no checkpoint."""
     return ModelError(f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}")
 
 
 def reason(error: Exception) -> str:
-    """An error in one line."""
+    """Return an error's message in one line."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-class _WithoutTensors(pickle.Unpickler):
+class _PlainUnpickler(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> None:
-        """The numbers of a tensor."""
+        """Return None for the numbers of a tensor."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("collections", "OrderedDict"):
             return OrderedDict
         if module.partition(".")[0] == "torch":
-            return _nothing
+            return _skip_tensor
         raise ModelError(f"it asks for {module}.{name}")
 
 
-def _nothing(*_: Any) -> None:
-    """A tensor."""
+def _skip_tensor(*_: Any) -> None:
+    """Return None for a tensor."""
 
 
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
-    """A set that a checkpoint is to be used on is of the array that it was made for, and its
-    samples are so far apart that steps are of as many.
-    """
+    """Check that a set has a checkpoint's array and as many samples in a step."""
     spec = ArraySpec.from_json(saved["spec"])
     if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
         raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
@@ -119,10 +117,10 @@ def trained_on(
     """Find the sweep sets that a checkpoint was trained on: folders and manifests.
 
     Args:
-        data: the sets; default: where they lay when it was trained on.
+        data: folders of the sets; default: those in the checkpoint's configuration.
 
     Raises:
-        RecordingError: one is not there, or no sweep set.
+        RecordingError: one is missing, or is no sweep set.
         SpecMismatch: one is of another array, or they hold other categories.
     """
     config = saved["config"]
@@ -153,16 +151,16 @@ def trained_on(
 def probed_on(
     checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
 ) -> tuple[Path, SweepManifest]:
-    """The sweep set that a checkpoint is probed on.
+    """Find the sweep set to probe a checkpoint on: folder and manifest.
 
     Args:
         data: the set; empty: the first of those that it was trained on.
 
     Raises:
-        RecordingError: it is not there, or no sweep set.
+        RecordingError: the set is missing, or is no sweep set.
         SpecMismatch: it is of another array.
-        ConfigError: it has no labels; or the folder is that of a trained network, which the probe
-            would take the place of.
+        ConfigError: the set has no labels; or the folder holds a trained network, which the probe
+            would replace.
     """
     best = folder / "best.pt"
     if (folder / "config.json").exists() or (best.exists() and best.samefile(checkpoint)):
@@ -178,10 +176,10 @@ def probed_on(
 
 
 def load_checkpoint(path: Path) -> "tuple[TactileClassifier, dict[str, Any]]":
-    """The network of a `best.pt`, in evaluation mode on the CPU, with what it was trained on.
+    """Load the network of a `best.pt`, in evaluation mode on the CPU, and its contents.
 
     Raises:
-        ModelError: not there, or not such a checkpoint.
+        ModelError: missing, or not such a checkpoint.
     """
     import torch
 
@@ -201,16 +199,16 @@ def begin_from(
     labels: Sequence[str],
     kinds: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
-    """Give a network that is to be trained the weights of a checkpoint.
+    """Initialise a network with the weights of a checkpoint.
 
     Args:
-        model: of the same network, but that it may tell apart other things.
-        labels: what the network is to tell apart; it knows those from the beginning that the
-            checkpoint knew by the same name.
-        kinds: likewise, of each of these.
+        model: the same network, except that its labels and kinds may differ.
+        labels: the labels of the network; those that the checkpoint has by the same name begin
+            with its weights.
+        kinds: the kinds within each label, likewise.
 
     Returns:
-        What the checkpoint holds.
+        The checkpoint's contents.
 
     Raises:
         ModelError: no such checkpoint.
@@ -228,11 +226,11 @@ def begin_from(
     both = [name for name in wanted if name in known]
     to, of = [wanted.index(n) for n in both], [known.index(n) for n in both]
     weights, own = trained.state_dict(), model.state_dict()
-    # a row of the last layer may have another place though as many are known
+    # a label's row of the last layer may have moved, even if the number of rows is the same
     for name in [name for name in own if name.startswith("network.decoder.")][-2:]:
         own[name][to] = weights[name][of]
         weights[name] = own[name]
-    # what the channels are limited to is the new set's to say
+    # the channels' limits are those of the new set
     kept = {name: own[name] if name.startswith("inputs.") else w for name, w in weights.items()}
     model.load_state_dict(kept)
     return saved
@@ -247,7 +245,7 @@ def _name_rows(
 
 
 def untrained(saved: dict[str, Any]) -> "TactileClassifier":
-    """The network of a checkpoint as it might be before training: for the same channels."""
+    """Make an untrained network as a checkpoint's, for the same channels."""
     from tactile_rt.models.ead import TactileClassifier
 
     clip, scale = (saved["model"][f"inputs.{name}"].numpy() for name in ("clip", "scale"))
@@ -264,12 +262,12 @@ def fill_checkpoint(
     trained: Mapping[str, list[str]],
     metrics: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Tell what a `best.pt` holds of a network.
+    """Return the contents of a `best.pt` for a network.
 
     Args:
-        manifest: what the set is that it was trained on.
-        config: of its training, as JSON has it.
-        trained: names of the objects that it has learnt from, by where they come from.
+        manifest: the manifest of the set that it was trained on.
+        config: its training's configuration, as JSON values.
+        trained: names of the objects that it was trained on, by their source.
     """
     return {
         "model": model.state_dict(),
@@ -286,7 +284,7 @@ def fill_checkpoint(
 
 
 def save_whole(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all, also if the machine stops a moment later.
+    """Write a checkpoint whole or not at all, even if the machine stops soon after.
 
     Raises:
         OSError: the medium is full, or failed.
@@ -296,5 +294,5 @@ def save_whole(path: Path, state: dict[str, Any]) -> None:
     with replaced(path) as file:
         try:
             torch.save(state, file)
-        except RuntimeError as error:  # what torch says once the file has said what is wrong
+        except RuntimeError as error:  # torch's own, raised after the file's
             raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None

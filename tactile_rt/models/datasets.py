@@ -1,4 +1,4 @@
-"""Stored sweeps in memory, and the windows of them: onsets as the robot will find them.
+"""Stored sweeps in memory, and windows cut out of them at the onsets that a robot would find.
 
 A window is what the classifier would feed the network: it starts where `ContactDetector` reports
 onset on the noisy signal, and carries the baseline that the detector had measured by then.
@@ -29,14 +29,14 @@ NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which traini
 
 @dataclass(frozen=True)
 class SweepSet:
-    """One split of a sweep set, with what its windows need.
+    """One split of a sweep set, with all that is needed to cut its windows.
 
     Attributes:
         noise: (channel,) The rated noise per sample, SI.
         floor: (channel,) The smallest sigma of the detector, SI.
-        window: The first sample of a sweep's window: "onset", where the detector hears the touch,
-            or "sweep", where the object sets out, on the baseline that was measured until then.
-        joined_of: The manifests of the sets that it was joined of; none if of one alone.
+        window: The first sample of a sweep's window: "onset", where the detector finds contact,
+            or "sweep", where the object starts to move, with the baseline measured until then.
+        joined_of: The manifests of the sets that it was joined from; empty for a single set.
     """
 
     manifest: SweepManifest
@@ -59,7 +59,7 @@ class SweepSet:
 
     @property
     def manifests(self) -> tuple[SweepManifest, ...]:
-        """What the sets are that its sweeps are of."""
+        """Manifests of the sets that its sweeps come from."""
         return self.joined_of or (self.manifest,)
 
     def onsets(self, values: NDArray[np.float32]) -> Onsets:
@@ -67,7 +67,7 @@ class SweepSet:
         if self.window == "onset":
             return find_onsets(values, self.floor)
         n, shape = len(values), self.manifest.spec.shape
-        # after the lead, and what silence was put before it
+        # after the lead and any silence that was put before it
         begin = self.manifest.lead + values.shape[1] - self.sweeps.values.shape[1]
         offset = np.zeros((n, *shape), dtype=np.float32)
         sigma = np.broadcast_to(self.floor, (n, *shape)).astype(np.float32)
@@ -78,13 +78,12 @@ class SweepSet:
 
     @property
     def timing(self) -> Timing:
-        """How its windows are cut."""
+        """Numbers of steps and sub-steps in its windows."""
         return Timing.of(self.manifest.period_ns)
 
     @property
     def recorded(self) -> NDArray[np.bool_]:
-        """(sweep,) whether it was recorded: its sensor's noise, which counts as the rated, is in
-        it already."""
+        """(sweep,) True where recorded: a sweep with its sensor's noise, which counts as rated."""
         none = np.zeros(len(self.sweeps), dtype=np.bool_)
         return none if self.sweeps.recorded is None else self.sweeps.recorded
 
@@ -93,21 +92,21 @@ class SweepSet:
 
     @property
     def refusals(self) -> tuple[str, ...]:
-        """What a network that learns from these sweeps may decide without naming a category."""
+        """Labels other than categories for a network that is trained on these sweeps."""
         unknown = (UNKNOWN,) if (self.sweeps.labels < 0).any() else ()
         named = implausible(self.manifest.spec) if self.manifest.faults.implausible else ()
         return (*unknown, *named)
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Names of all that a network that learns from it tells apart: last the refusals."""
+        """Labels for a network that is trained on these sweeps: categories, then refusals."""
         return (*self.manifest.categories, *self.refusals)
 
     def kinds(self, of: Mapping[str, Sequence[str]]) -> NDArray[np.int64]:
         """Number the kind of each sweep's object; -1 where it has none of these.
 
         Args:
-            of: the kinds of each category, counted through all of them.
+            of: the kinds of each category, numbered through all categories.
 
         Returns:
             (sweep,) numbers.
@@ -125,8 +124,8 @@ class SweepSet:
     def noisy_starts(self) -> NDArray[np.int64]:
         """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found.
 
-        Of levels that training never draws there are none. Recorded sweeps have their own noise at
-        every level.
+        Levels that training never draws are left out. Recorded sweeps have their own noise at every
+        level.
         """
         rng, largest = np.random.default_rng(0), max(self.manifest.faults.noise, 1.0)
         levels = [level for level in NOISE_LEVELS if level <= largest]
@@ -144,8 +143,9 @@ class SweepSet:
 
     @cached_property
     def baselines(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Offset and sigma (sweep, element, channel), SI, as the detector has measured them by the
-        onset, of recorded sweeps; 0 of others, of which training draws them."""
+        """Offset and sigma (sweep, element, channel), SI, of recorded sweeps at their onsets.
+
+        0 for simulated sweeps, for which training draws them."""
         offset, sigma = np.zeros((2, len(self.sweeps), *self.manifest.spec.shape), dtype=np.float32)
         if self.recorded.any():
             found = self.onsets(self.sweeps.values[self.recorded])
@@ -170,11 +170,11 @@ def windows(
 
 
 def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, SweepSet]:
-    """Read and check what a training learns from, with outliers, and what it validates on.
+    """Read and check the training split, with outliers, and the validation split.
 
     Args:
-        folders: of sets that are learnt from together.
-        labelled: whether it is learnt from their labels.
+        folders: folders of sets to train on together.
+        labelled: whether training uses their labels.
 
     Raises:
         ConfigError: the sets cannot be joined, or one has no labels to learn from.
@@ -196,9 +196,9 @@ def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, Swee
 
 
 def joined(sets: Sequence[SweepSet]) -> SweepSet:
-    """Sets of one array as one, with the categories of all; faults are those of the first.
+    """Join sets of one array, with all their categories and the faults of the first.
 
-    Shorter sweeps rest longer before, as they did, and repeat their last sample after.
+    Shorter sweeps repeat their rest before the touch, and their last sample after it.
     """
     if len(sets) == 1:
         return sets[0]
@@ -206,7 +206,7 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
     after = max(one.sweeps.values.shape[1] - one.manifest.lead for one in sets)
     parts = [
         (
-            _lengthened(one, manifest.lead, after),
+            _pad_sweeps(one, manifest.lead, after),
             relabelled(one, manifest.categories).sweeps.labels,
             one.sweeps.objects,
             one.recorded,
@@ -219,41 +219,41 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
     return replace(sets[0], manifest=manifest, sweeps=whole, joined_of=of)
 
 
-def _lengthened(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
-    """Its values (sweep, sample, element, channel), so many samples before the touch and after."""
+def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
+    """Return values (sweep, sample, element, channel) padded to `lead` + `after` samples."""
     own, samples = data.manifest.lead, data.sweeps.values.shape[1]
     if (own, samples) == (lead, lead + after):
         return data.sweeps.values
-    rest = np.arange(-lead, 0) % max(own, 1)  # again and again, the latest last
+    rest = np.arange(-lead, 0) % max(own, 1)  # repeated, the latest last
     touch = np.minimum(own + np.arange(after), samples - 1)
     return data.sweeps.values[:, np.concatenate([rest, touch])]
 
 
 def of_categories(data: SweepSet) -> SweepSet:
-    """The sweeps of its categories alone, of which training then spoils none."""
+    """Return the sweeps of its categories alone; training makes none of them implausible."""
     if not data.refusals:
-        return data  # with the onsets that were found once
+        return data  # keeps the onsets that were found before
     known = np.flatnonzero(data.sweeps.labels >= 0)
     return with_faults(data[known], replace(data.manifest.faults, implausible=0.0))
 
 
 def drawn_as(data: SweepSet, training: Mapping[str, Any]) -> SweepSet:
-    """The set whose windows begin, and whose sensor fails, as a run's configuration says."""
+    """Return the set with the window and the sensor faults of a run's configuration."""
     window = training.get("window", data.window)
-    if window != data.window:  # else many trainings share the onsets that were found once
+    if window != data.window:  # else trainings share the onsets that were found before
         data = replace(data, window=window)
     faults = training.get("faults")
     return with_faults(data, SensorFaults(**faults)) if faults else data
 
 
 def with_faults(data: SweepSet, faults: SensorFaults) -> SweepSet:
-    """The set with other faults of the sensor to be drawn for training."""
+    """Return the set with other sensor faults for training to draw."""
     recipe = {**data.manifest.recipe, FAULTS: asdict(faults)}
     return replace(data, manifest=replace(data.manifest, recipe=recipe))
 
 
 def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
-    """The set with labels among these categories, which have all of its own."""
+    """Return the set with labels among these categories, which include its own."""
     place = np.array([*(categories.index(c) for c in data.manifest.categories), -1])
     return replace(
         data,
@@ -263,7 +263,7 @@ def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
 
 
 def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
-    """The sweeps themselves: finite, long enough, and none on two sides.
+    """Check that sweeps are finite and long enough, and none is in two splits.
 
     Raises:
         RecordingError: otherwise; the message names the object.
@@ -286,7 +286,7 @@ def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
                 )
         for name, at in first.items():
             if not np.ptp(sweeps.values[at], axis=0).any():
-                continue  # a miss is like any other miss, also above a magnet
+                continue  # sweeps that miss the object are all alike, also with a magnet's field
             key = hashlib.blake2b(sweeps.values[at].tobytes()).digest()
             twin, where = seen.setdefault(key, (name, number))
             if where != number:

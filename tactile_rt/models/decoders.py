@@ -1,4 +1,4 @@
-"""Decoders: from what a step means to the classes' logits.
+"""Decoders: from the features of steps to the logits of classes.
 
 Every decoder maps features `(batch, step, feature)` to logits `(batch, step, class)`, where a
 step's logits use no later step. It does so in two parts: `embed` gives what its last linear layer
@@ -21,7 +21,7 @@ class LinearDecoder(nn.Linear):
         super().__init__(features, classes)
 
     def embed(self, features: Tensor) -> Tensor:
-        """features (..., feature) -> themselves"""
+        """Return features (..., feature) unchanged."""
         return features
 
     def logits(self, embedding: Tensor) -> Tensor:
@@ -107,7 +107,7 @@ class MLPAllDecoder(nn.Module):
         products = torch.einsum("btf,thf->bth", features, self.weight[:steps])  # (b, step, hidden)
         # At least single precision: sums of many steps would stall in autocast's types.
         exact = torch.promote_types(products.dtype, torch.float32)
-        return self._rest(products.cumsum(1, dtype=exact))
+        return self._apply_rest(products.cumsum(1, dtype=exact))
 
     def logits(self, embedding: Tensor) -> Tensor:
         """(..., unit) -> (..., class)"""
@@ -115,7 +115,7 @@ class MLPAllDecoder(nn.Module):
         return logits
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zero: the first layer's running sum, (batch, hidden)."""
+        """Return zeros: the first layer's running sum, (batch, hidden)."""
         return {"decoder_sum": self.bias.new_zeros(batch, len(self.bias))}
 
     def step(
@@ -129,20 +129,20 @@ class MLPAllDecoder(nn.Module):
         product = torch.matmul(weight, features[:, :, None])[:, :, 0]  # (batch, hidden)
         inside = (index < len(self.weight))[:, None]  # (batch, 1)
         total = state["decoder_sum"] + torch.where(inside, product, 0.0)
-        return self._rest(total), {"decoder_sum": total}
+        return self._apply_rest(total), {"decoder_sum": total}
 
-    def _rest(self, total: Tensor) -> Tensor:
+    def _apply_rest(self, total: Tensor) -> Tensor:
         """The first layer's sum (..., hidden) -> embedding (..., unit)"""
         return F.relu(self.layer2(F.relu(total + self.bias)))
 
 
 def hidden(width: float) -> tuple[int, int]:
-    """Sizes of the two hidden layers at a width."""
+    """Return the sizes of the two hidden layers at a width."""
     wide, narrow = (round(units * width) for units in HIDDEN)
     return wide, narrow
 
 
-# each made of the numbers of features and of classes, the width, and an episode's steps
+# arguments: the numbers of features and classes, the width, and an episode's steps
 KINDS: dict[str, type[LinearDecoder | MLPDecoder | MLPAllDecoder]] = {
     "linear": LinearDecoder,
     "mlp": MLPDecoder,

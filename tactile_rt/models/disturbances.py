@@ -1,6 +1,6 @@
-"""What a real sensor does to sweeps that a simulated one does not, to try a model with.
+"""Disturbances by a real sensor that simulated sweeps lack, to test a model with.
 
-What training draws is `sensor_faults`.
+The faults that training draws are those of `sensor_faults`.
 """
 
 from collections.abc import Sequence
@@ -19,19 +19,19 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What is wrong with the sensor; each sweep is a draw of its own.
+    """Faults of the sensor, drawn anew for each sweep.
 
     Attributes:
         noise: The white noise on every stored sample, in units of the rated noise; recorded sweeps
             have one unit of it already, and only what is lacking is added.
         gain: The standard deviation of every whisker's relative gain error.
         dead: The number of whiskers, drawn at random, that read zero throughout.
-        rows: The number of rows of the grid, drawn at random, whose whiskers all do.
+        rows: The number of rows of the grid, drawn at random, whose whiskers all read zero.
         offset: The size of a constant that appears with the contact, after the baseline, in units
             of `OFFSET`; a sign is drawn for every whisker and channel.
         drift: The size that a linear drift from the contact on has reached at the window's end, in
             units of `OFFSET`; a sign is drawn as for the offset.
-        swapped: Whether the channels of x and of y are connected the wrong way round.
+        swapped: True if the channels of x and of y are swapped.
         rest: The number of stored samples of silence before each sweep, for the baseline; a robot
             has them, simulated sweeps have only a short lead.
 
@@ -54,7 +54,7 @@ class Disturbance:
                 raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
 
     def of_samples(self, values: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
-        """What the detector sees.
+        """Return sweeps as the contact detector receives them.
 
         Args:
             values: (sweep, sample, element, channel) of these sweeps, SI.
@@ -62,7 +62,7 @@ class Disturbance:
         if self == CLEAN:
             return values
         n, elements = len(values), values.shape[2]
-        if data.manifest.lead:  # what is wrong adds to rest, which is not nothing in a field
+        if data.manifest.lead:  # faults act on the change from rest, which is not 0 in a field
             values = values - values[:, : data.manifest.lead].mean(axis=1, keepdims=True)
         if self.rest and not data.recorded.any():
             silence = np.zeros((n, self.rest, *values.shape[2:]), dtype=np.float32)
@@ -79,7 +79,7 @@ class Disturbance:
             gone = (grid == rank[:, : self.rows, None]).any(axis=1)
             values = values * ~gone[:, None, :, None]
         if self.swapped:
-            values = values[..., _x_for_y(data.manifest.spec.channels)]
+            values = values[..., _swap_x_and_y(data.manifest.spec.channels)]
         if self.noise:
             noise = rng.normal(size=values.shape).astype(np.float32)
             lacking = np.sqrt(max(self.noise**2 - 1, 0))
@@ -88,7 +88,7 @@ class Disturbance:
         return values
 
     def of_windows(self, samples: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
-        """What the network sees, of (sweep, step, sub-step, element, channel) SI."""
+        """Return windows (sweep, step, sub-step, element, channel), SI, with offset and drift."""
         steps, substeps = samples.shape[1:3]
         course = np.arange(1, steps * substeps + 1, dtype=np.float32) / (steps * substeps)
         for amount, over_time in ((self.offset, np.ones_like(course)), (self.drift, course)):
@@ -105,8 +105,8 @@ CLEAN = Disturbance()
 RATED = Disturbance(noise=1.0)
 
 
-def _x_for_y(channels: Sequence[str]) -> list[int]:
-    """The place of every channel if those that end in x and in y are mistaken for one another."""
+def _swap_x_and_y(channels: Sequence[str]) -> list[int]:
+    """Return the index of every channel after those ending in x and y are swapped."""
     other = {"x": "y", "y": "x"}
     swapped = [name[:-1] + other.get(name[-1], name[-1]) for name in channels]
     return [channels.index(name if name in channels else channels[k])

@@ -1,4 +1,4 @@
-"""From a sensor's samples to what an array of whiskers touches, decided anew at every step.
+"""Networks that classify what an array of whiskers touches, anew at every step.
 
     samples -> input stage -> frames -> encoder -> attender -> decoder -> logits
     (batch, step, channel, row, column) -> (batch, step, feature) -> (batch, step, class)
@@ -9,9 +9,9 @@ x 6 loads on 5 x 7 cells for the mouse's whiskers of the paper.
 The input stage is in the graph, so that units travel with it. Most whiskers feel micronewtons
 while one that jams feels newtons, so values are compressed as sign(v) log(1 + |v| / s). The scale
 s never falls below the noise measured at rest, or the logarithm would magnify silent channels into
-signals. A recurrent network would never forget a number that is none: so a sample that is NaN or
-infinite counts as no load, and so does a channel whose baseline or noise is, also in a file that
-others run. The paper's own preprocessing ("paper") has no logarithm: forces in mN and moments in
+signals. A recurrent network would never forget a NaN: so a sample that is NaN or infinite counts
+as no load, as does a channel with such a baseline or noise; this is in the graph of exported files
+too. The paper's own preprocessing ("paper") has no logarithm: forces in mN and moments in
 uN m as they are, limited to 1000 of either (Chung et al. 2025, and its code).
 
 `EAD.forward` takes a whole window for training; `EAD.step` takes one frame and explicit state,
@@ -42,10 +42,10 @@ GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and 
 
 
 class TactileClassifier(nn.Module):
-    """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
+    """The input stage and the network in one, from samples in SI units to logits.
 
     Args:
-        limits: what is believed of the channels.
+        limits: clip and scale of the channels.
 
     Raises:
         ConfigError: the network is for another array, or its preprocessing for other units.
@@ -70,7 +70,7 @@ class TactileClassifier(nn.Module):
 
     @property
     def timing(self) -> Timing:
-        """How the windows are cut that it takes."""
+        """Numbers of steps and sub-steps in its windows."""
         config = self.network.config
         return Timing(config.max_steps, config.frame[0] // len(self.inputs.clip))
 
@@ -136,7 +136,7 @@ class InputStage(nn.Module):
         self.register_buffer("element", element.flatten())
 
     def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
-        """Frames, sub-step-major: all channels of the first sub-step, then of the second, ...
+        """Return frames, sub-step-major: all channels of the first sub-step, then the second, ...
 
         samples         (batch, ..., sub-step, element, channel)  SI
         offset, sigma   (batch, element, channel)                 SI: mean and noise at rest
@@ -153,10 +153,10 @@ class InputStage(nn.Module):
         for _ in range(samples.dim() - offset.dim()):
             offset, sigma = offset.unsqueeze(1), sigma.unsqueeze(1)
         load = samples - offset  # as samples, SI
-        load = torch.where(load.abs() < torch.inf, load, 0.0)  # NaN is not less either
+        load = torch.where(load.abs() < torch.inf, load, 0.0)  # False for NaN too
         value = torch.clamp(load, -self.clip, self.clip)  # as samples, SI
         scale = torch.sqrt(self.scale**2 + (NOISE_FLOOR * sigma) ** 2)  # as offset, SI
-        scale = torch.where(scale < torch.inf, scale, torch.inf)  # of which any load is nothing
+        scale = torch.where(scale < torch.inf, scale, torch.inf)  # NaN too: any load over it is 0
         if self.logarithm:
             value = torch.sign(value) * torch.log1p(value.abs() / scale)  # as samples, no unit
         else:
@@ -168,7 +168,7 @@ class InputStage(nn.Module):
 
 
 def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
-    """Clip and unit of each channel (channel,), SI, of the preprocessing "paper".
+    """Return clip and unit of each channel (channel,), SI, of the preprocessing "paper".
 
     Raises:
         ConfigError: a channel that is neither a force nor a moment.
@@ -188,18 +188,18 @@ class EAD(nn.Module):
     Attributes:
         feature_size: The number of features of a step, which the decoder reads.
         lag: The number of steps that a frame takes to reach the logits: the first `lag` steps of a
-            window know of no frame, the last `lag` frames do not count.
+            window depend on no frame, the last `lag` frames have no effect.
     """
 
     def __init__(self, config: EADConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder: Any = _encoder(config)
+        self.encoder: Any = _build_encoder(config)
         if config.norm_epsilon:
             for cell in self.encoder.modules():
                 if isinstance(cell, Cell):
                     cell.epsilon = config.norm_epsilon
-        self._alone = _alone(config)
+        self._needs_silent_cell = _needs_silent_cell(config)
         self.lag: int = self.encoder.lag
         width: int = self.encoder.features
         self.attender: attenders.GPT | attenders.MambaStack | attenders.NoAttender
@@ -217,13 +217,13 @@ class EAD(nn.Module):
         self.decoder = kind(width, config.outputs, config.width, config.max_steps)
 
     def features(self, frames: Tensor) -> Tensor:
-        """What the decoder reads of frames, (batch, step, feature)."""
-        frames = F.pad(frames, (0, 1)) if self._alone else frames
+        """Return the features (batch, step, feature) of frames that the decoder reads."""
+        frames = F.pad(frames, (0, 1)) if self._needs_silent_cell else frames
         features: Tensor = self.attender(self.encoder(frames))
         return features
 
     def embed(self, frames: Tensor) -> Tensor:
-        """Embed frames, (batch, step, unit), as each step's `step_outputs` has it."""
+        """Embed frames, (batch, step, unit), as `step_outputs` does in each step."""
         if self.config.identity:
             return self.split(self.answer(frames))["embedding"]
         return self.decoder.embed(self.features(frames))
@@ -233,7 +233,7 @@ class EAD(nn.Module):
         return self.answer(frames)[..., : self.config.classes]
 
     def split(self, answers: Tensor) -> dict[str, Tensor]:
-        """Take answers (..., output) apart: logits, names and an embedding of length 1, if any."""
+        """Split answers (..., output) into logits, names and an embedding of length 1, if any."""
         classes, names = self.config.classes, self.config.classes + self.config.names
         out = {"logits": answers[..., :classes]}
         if self.config.identity:
@@ -243,7 +243,7 @@ class EAD(nn.Module):
         return out
 
     def answer(self, frames: Tensor) -> Tensor:
-        """Answer frames with all that the last layer gives, (batch, step, output)."""
+        """Return all outputs of the last layer for frames, (batch, step, output)."""
         logits: Tensor = self.decoder(self.features(frames))
         if self.config.readout == "last":
             return logits
@@ -254,7 +254,7 @@ class EAD(nn.Module):
         return torch.cat([logits[:, : self.lag], total / counts[:, None]], dim=1)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """The state before the first step: zeros, each with a leading batch axis, in order."""
+        """Return the state before the first step, in order: zeros with a leading batch axis."""
         weight = next(self.parameters())
         state = {
             "index": torch.zeros(batch, dtype=torch.int64, device=weight.device),
@@ -267,9 +267,9 @@ class EAD(nn.Module):
         return state
 
     def step(self, frame: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to logits (batch, class), the next state.
+        """Map a frame (batch, channel, row, column) to logits (batch, class) and the next state.
 
-        A lane is reset by putting its rows of `initial_state` back.
+        To reset a lane, put its rows of `initial_state` back.
         """
         outputs, new = self.step_outputs(frame, state)
         return outputs["logits"], new
@@ -277,13 +277,13 @@ class EAD(nn.Module):
     def step_outputs(
         self, frame: Tensor, state: dict[str, Tensor]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Take a step as `step` does, with all outputs: `logits`, `embedding` and maybe `names`.
+        """Run `step` and return all outputs: `logits`, `embedding` and maybe `names`.
 
-        The embedding (batch, unit) is what the last layer reads in the step alone, also where the
-        logits are a mean over steps; one that is trained on identity is of all steps so far.
+        The embedding (batch, unit) is what the last layer reads in this step alone, even if the
+        logits are a mean over steps; an embedding trained on identity is such a mean too.
         """
         index = state["index"]
-        frame = F.pad(frame, (0, 1)) if self._alone else frame
+        frame = F.pad(frame, (0, 1)) if self._needs_silent_cell else frame
         features, encoder = self.encoder.step(frame, index, state)  # (batch, feature)
         features, attender = self.attender.step(features, index, state)
         embedding, decoder = self.decoder.step(features, index, state)  # (batch, unit)
@@ -299,23 +299,23 @@ class EAD(nn.Module):
         return outputs, {name: new[name] for name in state}
 
 
-def _encoder(config: EADConfig) -> Any:
+def _build_encoder(config: EADConfig) -> Any:
     module, name = encoder_class(config.encoder)
     kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
     if config.encoder == "graph":
         return kind(config.graph, config.width, config.frame)
     if config.encoder.startswith("zhuang-"):
         channels, rows, columns = config.frame
-        frame = (channels, rows, columns + int(_alone(config)))
+        frame = (channels, rows, columns + int(_needs_silent_cell(config)))
         return kind(config.width, config.encoder.removeprefix("zhuang-"), frame)
     return kind(config.width, config.frame)
 
 
-def _alone(config: EADConfig) -> bool:
-    """Whether a single cell gets a silent one beside it: convolutions need a map."""
+def _needs_silent_cell(config: EADConfig) -> bool:
+    """Return whether a single cell gets a silent one beside it: convolutions need a map."""
     return config.encoder.startswith("zhuang-") and config.frame[1:] == (1, 1)
 
 
 def count_parameters(module: nn.Module) -> int:
-    """The number of numbers in a module's parameters; buffers do not count."""
+    """Count the numbers in a module's parameters, without buffers."""
     return sum(parameter.numel() for parameter in module.parameters())

@@ -1,4 +1,4 @@
-"""Which network: its configuration, and the names of what it may be made of. Needs no torch."""
+"""The configuration of a network, and the names of its possible parts. Needs no torch."""
 
 import math
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ CELLS = (
     "lstm-ln-published",
 )  # fmt: skip
 ZHUANG = ("zhuang", "ZhuangEncoder")
-# name: (module in `encoders`, what makes it), imported when a network needs it
+# name: (module in `encoders`, class or function), imported when a network needs it
 ENCODERS: dict[str, tuple[str, str]] = {
     **{f"zhuang-{cell}": ZHUANG for cell in CELLS},
     "resnet18": ("resnet", "ResNet18Encoder"),
@@ -34,24 +34,24 @@ WIDEST = 4  # sixteen times the paper's parameters, a billion
 
 
 def added_cells() -> tuple[str, ...]:
-    """Names of the cells that other packages add, each plain and, with "-ln", normalised."""
+    """List the cells that other packages add, each plain and, with "-ln", normalised."""
     return tuple(f"{cell}{ln}" for cell in packages.added_names(packages.CELLS) for ln in LN)
 
 
 def encoder_class(name: str) -> tuple[str, str]:
-    """The module in `encoders`, and in it what makes an encoder that exists."""
+    """Return the module in `encoders`, and the class or function in it, of an encoder."""
     return ENCODERS.get(name, ZHUANG)
 
 
-def _encoders(asked: str) -> tuple[str, ...]:
-    """Names of all encoders; what is not installed is not looked for if `asked` is ours."""
+def _list_encoders(asked: str) -> tuple[str, ...]:
+    """List all encoders, those of other packages only if `asked` is none of ours."""
     ours = tuple(ENCODERS)
     return ours if asked in ours else (*ours, *(f"zhuang-{cell}" for cell in added_cells()))
 
 
 @dataclass(frozen=True)
 class EADConfig:
-    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters."""
+    """A network; the defaults are the paper's Intersection-LN + GPT, 63.8 M parameters."""
 
     classes: int
     encoder: str = "zhuang-intersection-ln"
@@ -62,13 +62,13 @@ class EADConfig:
     # could count, for a decision at any time.
     readout: str = "last"
     dropout: float = 0.1
-    max_steps: int = 22  # an episode; the GPT's positions end here
+    max_steps: int = 22  # of an episode; the GPT has no further positions
     graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph`
-    frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of what it reads
+    frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of its input
     norm_epsilon: float = 0.0  # of the cells' layer norms; 0: each cell's own, see `cells`
     preprocessing: str = "log"  # of the input stage, see `inputs`
-    names: int = 0  # kinds within the classes, of which it gives logits beside those of the classes
-    identity: int = 0  # units of an embedding that is trained to tell objects apart; 0: none
+    names: int = 0  # kinds within the classes, with logits beside those of the classes
+    identity: int = 0  # units of an embedding that is trained to distinguish objects; 0: none
 
     @property
     def outputs(self) -> int:
@@ -77,7 +77,7 @@ class EADConfig:
 
     def __post_init__(self) -> None:
         for field, known in (
-            ("encoder", _encoders(self.encoder)),
+            ("encoder", _list_encoders(self.encoder)),
             ("attender", ATTENDERS),
             ("decoder", DECODERS),
             ("readout", READOUTS),

@@ -1,7 +1,7 @@
 """Loads that no touch makes: a sensor wired the wrong way, or half of it gone.
 
-Faults that a network is to see through are `sensor_faults`; these it is to name, since no answer
-about the object can be had from such loads. Training makes them out of sound sweeps.
+A network should classify in spite of `sensor_faults`; the faults here it should name, since such
+loads allow no answer about the object. Training makes them out of sound sweeps.
 """
 
 from collections.abc import Callable
@@ -16,33 +16,33 @@ Samples = NDArray[np.float32]  # (sweep, ..., element, channel), SI
 AXES = "xyz"
 GAINS = (2.5, 5.0)  # too large, or too small, by a factor between these
 MISSING = (0.45, 0.7)  # of the elements
-FEWEST = 4  # elements of which a half can be missed
+FEWEST = 4  # elements from which on half of them can be missing
 
 
-def _swapped(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Two axes are mistaken for one another, of all vectors or of one."""
-    vectors = _vectors(spec)
+def _swap_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Swap two axes, of all vectors or of one."""
+    vectors = _find_vectors(spec)
     out = samples.copy()
     for k in range(len(out)):
         first, second = rng.choice(3, 2, replace=False)
-        for axes in _some(vectors, rng):
+        for axes in _pick(vectors, rng):
             out[k][..., [axes[first], axes[second]]] = samples[k][..., [axes[second], axes[first]]]
     return out
 
 
-def _turned(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Channels have the wrong sign: one axis or more, of all vectors or of one."""
-    vectors = _vectors(spec) or [tuple(range(len(spec.channels)))]
+def _invert_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Invert the sign of one axis or more, of all vectors or of one."""
+    vectors = _find_vectors(spec) or [tuple(range(len(spec.channels)))]
     out = samples.copy()
     for k in range(len(out)):
         turned = rng.permutation(len(vectors[0]))[: rng.integers(1, len(vectors[0]) + 1)]
-        for axes in _some(vectors, rng):
+        for axes in _pick(vectors, rng):
             out[k][..., [axes[i] for i in turned]] *= -1
     return out
 
 
-def _amplified(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """All is several times too large, or too small."""
+def _scale_loads(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Make all loads several times too large or too small."""
     n, (least, most) = len(samples), np.log(GAINS)
     factor = np.exp(rng.uniform(least, most, n) * rng.choice([-1, 1], n))
     each = factor.reshape(-1, *(1,) * (samples.ndim - 1))
@@ -50,8 +50,8 @@ def _amplified(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> S
     return amplified
 
 
-def _missing(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Half of the elements read nothing: any, or those of one side."""
+def _silence_half(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Set about half of the elements to zero: random ones, or those of one side."""
     elements = len(spec.elements)
     grid = np.array(spec.grid, dtype=np.float64)
     alive = np.ones((len(samples), elements))
@@ -63,30 +63,30 @@ def _missing(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Sam
 
 
 IMPLAUSIBLE: dict[str, Callable[[Samples, ArraySpec, np.random.Generator], Samples]] = {
-    "swapped channels": _swapped,
-    "turned channels": _turned,
-    "wrong gain": _amplified,
-    "missing elements": _missing,
+    "swapped channels": _swap_axes,
+    "turned channels": _invert_axes,
+    "wrong gain": _scale_loads,
+    "missing elements": _silence_half,
 }
 
 
 def implausible(spec: ArraySpec) -> tuple[str, ...]:
-    """The names of those that an array can have."""
+    """Return the names of the faults that an array can have."""
     possible = {
-        "swapped channels": bool(_vectors(spec)),
+        "swapped channels": bool(_find_vectors(spec)),
         "missing elements": len(spec.elements) >= FEWEST,
     }
     return tuple(name for name in IMPLAUSIBLE if possible.get(name, True))
 
 
-def _vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
-    """Where the x, y and z of each vector are among the channels: force and moment."""
+def _find_vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
+    """Return the channel indices (x, y, z) of each vector: force and moment."""
     names = list(spec.channels)
     stems = dict.fromkeys(name[:-1] for name in names if name[-1] in AXES)
     whole = [stem for stem in stems if all(stem + axis in names for axis in AXES)]
     return [tuple(names.index(stem + axis) for axis in AXES) for stem in whole]
 
 
-def _some(vectors: list[tuple[int, ...]], rng: np.random.Generator) -> list[tuple[int, ...]]:
-    """All of them, or one."""
+def _pick(vectors: list[tuple[int, ...]], rng: np.random.Generator) -> list[tuple[int, ...]]:
+    """Return all vectors or, as often, one of them."""
     return vectors if rng.random() < 0.5 else [vectors[rng.integers(len(vectors))]]

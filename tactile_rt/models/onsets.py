@@ -1,7 +1,7 @@
-"""The contact detector over many stored sweeps at once: the very numbers of `ContactDetector`.
+"""The contact detector over many stored sweeps at once, with the numbers of `ContactDetector`.
 
 The detector takes one sample of one stream; here each step takes one sample of every sweep, which
-is several times faster. Tests hold the two together.
+is several times faster. Tests check that both agree.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ BATCH = 128  # sweeps at a time: their histories should stay in the cache
 
 @dataclass(frozen=True)
 class Onsets:
-    """Where contact begins in every sweep, and the baseline there.
+    """The onset of contact in every sweep, and the baseline there.
 
     Attributes:
         start: (sweep,) sample of onset; -1 where none was found.
@@ -41,11 +41,11 @@ def find_onsets(values: NDArray[np.float32], floor: NDArray[np.float32]) -> Onse
     sigma = np.zeros((n, *shape), dtype=np.float32)
     for i in range(0, n, BATCH):
         part = slice(i, i + BATCH)
-        start[part], offset[part], sigma[part] = _batch(values[part], floor.astype(np.float32))
+        start[part], offset[part], sigma[part] = _detect(values[part], floor.astype(np.float32))
     return Onsets(start, offset, sigma)
 
 
-def _batch(
+def _detect(
     values: NDArray[np.float32], floor: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
     n, samples, elements, _ = values.shape
@@ -109,7 +109,7 @@ class _Baseline:
         self.came[of] += 1
 
     def learn(self, of: NDArray[np.int64], guard: NDArray[np.int64]) -> None:
-        """Let all but the latest `guard` (len(of),) waiting samples enter."""
+        """Let all but the latest `guard` (len(of),) waiting samples enter the baseline."""
         changed = of[self.came[of] - self.count[of] > guard]
         while len(of):
             more = self.came[of] - self.count[of] > guard

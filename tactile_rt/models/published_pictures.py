@@ -1,4 +1,4 @@
-"""What the paper's code does to touches as if they were pictures: its controls of augmentation.
+"""The control augmentations of the paper's code, which treat touches as pictures.
 
 Forces are the three colours of a picture of the array, moments those of another, and the usual
 operations on photographs follow: mirrored, colours jittered, greyscale, blurred (Chen et al. 2020).
@@ -20,13 +20,13 @@ COLOURS = 3
 JITTER_CHANCE, GREY_CHANCE, HALF = 0.8, 0.2, 0.5
 SIGMA = (0.1, 2.0)  # of the blur, in cells
 LUMINANCE = (0.2989, 0.587, 0.114)  # ITU-R BT.601
-# which of value, falling, rising and least each colour is, by sextant of the hue
+# for red, green and blue: index of value, falling, rising or low, by sextant of the hue
 SEXTANTS = ((0, 1, 3, 3, 2, 0), (2, 0, 0, 1, 3, 3), (3, 3, 2, 0, 0, 1))
 
 
 @dataclass(frozen=True)
 class Jitter:
-    """How far colours are jittered.
+    """The strength of a colour jitter.
 
     Attributes:
         strength: The largest change of brightness, contrast and saturation, as a factor from 1.
@@ -42,7 +42,7 @@ JITTERS = {"image-paper": Jitter(0.8, 0.2), "image-paper-weak": Jitter(0.4, 0.1)
 
 @dataclass(frozen=True)
 class Draw:
-    """What is done to a batch.
+    """The drawn operations on a batch.
 
     Attributes:
         order: The order in which brightness, contrast, saturation and hue are changed, by their
@@ -59,7 +59,7 @@ class Draw:
 
 
 def augment(frames: Tensor, generator: Generator, jitter: Jitter) -> Tensor:
-    """One draw for the batch.
+    """Augment frames with one draw for the batch.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column); channels in threes are colours.
@@ -84,7 +84,7 @@ def augment(frames: Tensor, generator: Generator, jitter: Jitter) -> Tensor:
 
 
 def as_drawn(frames: Tensor, done: Draw) -> Tensor:
-    """Frames (batch, step, sub-step * channel, row, column) to which this is done."""
+    """Apply drawn operations to frames (batch, step, sub-step * channel, row, column)."""
     x = frames.unflatten(2, (-1, COLOURS))  # (batch, step, picture, colour, row, column)
     if done.mirrored:
         x = x.flip(-1)
@@ -97,7 +97,7 @@ def as_drawn(frames: Tensor, done: Draw) -> Tensor:
 
 
 def jittered(x: Tensor, order: Sequence[int], by: tuple[float, float, float, float]) -> Tensor:
-    """Pictures (..., colour, row, column) with other brightness, contrast, saturation and hue."""
+    """Change brightness, contrast, saturation and hue of pictures (..., colour, row, column)."""
     brightness, contrast, saturation, hue = by
     for what in order:
         if what == 0:
@@ -113,13 +113,13 @@ def jittered(x: Tensor, order: Sequence[int], by: tuple[float, float, float, flo
 
 
 def grey(x: Tensor) -> Tensor:
-    """The luminance (..., 1, row, column) of pictures (..., colour, row, column)."""
+    """Return the luminance (..., 1, row, column) of pictures (..., colour, row, column)."""
     weights = torch.tensor(LUMINANCE).to(x)[:, None, None]
     return (x * weights).sum(-3, keepdim=True)
 
 
 def with_hue(x: Tensor, by: float) -> Tensor:
-    """Pictures (..., colour, row, column) with so many turns added to their hue."""
+    """Return pictures (..., colour, row, column) with `by` turns added to their hue."""
     red, green, _ = x.unbind(-3)
     value, least = x.amax(-3), x.amin(-3)
     span, none = value - least, value == least
@@ -140,7 +140,7 @@ def with_hue(x: Tensor, by: float) -> Tensor:
 
 
 def blurred(x: Tensor, sigma: float) -> Tensor:
-    """Pictures (..., row, column) under a Gaussian of 3 x 3 cells; the edge is a mirror."""
+    """Blur pictures (..., row, column) by a 3 x 3 Gaussian, mirrored at the edge."""
     at = torch.arange(-1.0, 2.0)
     kernel = torch.exp(-0.5 * (at / sigma) ** 2).to(x)
     kernel = kernel / kernel.sum()

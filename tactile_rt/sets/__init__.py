@@ -1,1 +1,1 @@
-"""Sweep sets at rest, which simulation makes, recordings are cut into, and networks learn from."""
+"""Sweep sets on disk: simulated or cut out of recordings, and read by training."""

@@ -1,4 +1,4 @@
-"""What a sweep set is: its array, period, categories, and which objects are on which side of it.
+"""The manifest of a sweep set: its array, period, categories, and the split of its objects.
 
 sets/default24/
     manifest.json      what the set is: array, period, categories, split by object, recipe
@@ -21,13 +21,13 @@ from tactile_rt.core.stream.sensor_spec import ChannelLimits, SensorSpec, channe
 from tactile_rt.sets.sensor_faults import SensorFaults
 
 SET_VERSION = 2
-RECORDED_VERSION = 3  # of recordings: who does not know them would add their noise again
+RECORDED_VERSION = 3  # of recordings: a reader of version 2 alone would add their noise again
 READABLE = (SET_VERSION, RECORDED_VERSION)
 MANIFEST, SKIPPED = "manifest.json", "skipped.json"
 CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
 FAULTS = "faults"  # in the recipe, see `sensor_faults`
 RECORDINGS = "recordings"  # in the recipe of a set that is made of them
-UNLABELLED = "unlabelled"  # the category of touches of which nobody said what was touched
+UNLABELLED = "unlabelled"  # the category of touches without a label
 SPLITS = ("train", "validation", "test")
 # Further splits, of categories that are labelled -1: training never sees the first, and may learn
 # from the second what to refuse.
@@ -38,7 +38,7 @@ NEW_SWEEPS = "new-sweeps"
 
 @dataclass(frozen=True)
 class SweepManifest:
-    """What a sweep set is.
+    """The description of a sweep set.
 
     Attributes:
         period_ns: The sample period of the stored arrays, ns.
@@ -47,8 +47,8 @@ class SweepManifest:
         split: The object names of each split, each ``category-index`` unless `category_of` has it.
         recipe: What made the set (profile, seed, sweeps per object ...), for provenance.
         withheld: The categories of the splits "withheld" and "outliers".
-        category_of: The category of objects whose name does not tell it.
-        kind_of: The kind of objects that have one within their category: box, where that is block.
+        category_of: The category of each object whose name does not give it.
+        kind_of: The kind of objects that have one within their category: box, within block.
         versions: The versions of what made the set (mujoco, numpy, ...).
         sensor: The description of the array's sensor; None: it has none, and the values are base
             loads.
@@ -71,10 +71,10 @@ class SweepManifest:
 
     @property
     def faults(self) -> SensorFaults:
-        """What training draws to be wrong with the sensor.
+        """The sensor faults that training draws.
 
         Raises:
-            RecordingError: the recipe says it in a way that cannot be.
+            RecordingError: the recipe's faults are invalid.
         """
         try:
             return msgspec.convert(self.recipe.get(FAULTS, {}), SensorFaults)
@@ -83,29 +83,29 @@ class SweepManifest:
 
     @property
     def source(self) -> str:
-        """Where the objects come from, as its recipe says it; "" if it does not."""
+        """The source of the objects according to the recipe; "" if it has none."""
         objects = self.recipe.get("objects")
         return str(objects.get("from", "")) if isinstance(objects, dict) else ""
 
     @property
     def recorded(self) -> bool:
-        """Whether its sweeps were recorded, with the noise of their sensor, not simulated."""
+        """True if its sweeps were recorded, with their sensor's noise, rather than simulated."""
         return RECORDINGS in self.recipe
 
     @property
     def frame(self) -> tuple[int, int, int]:
-        """Channels, rows and columns of what a network sees of the array in a step."""
+        """Channels, rows and columns of a network's input in a step."""
         rows, columns = self.spec.grid_shape
         return Timing.of(self.period_ns).substeps * len(self.spec.channels), rows, columns
 
     @property
     def limits(self) -> ChannelLimits:
-        """What a network may believe of the channels."""
+        """Noise, detector floor, clip and scale of each channel."""
         return channel_limits(self.spec, self.sensor, self.period_ns)
 
     @property
     def kinds(self) -> dict[str, tuple[str, ...]]:
-        """The kinds of each category, as far as there are objects to learn from."""
+        """The kinds of each category that its training objects have."""
         found: dict[str, set[str]] = {}
         for name in self.split["train"]:
             if kind := self.kind_of.get(name):
@@ -113,7 +113,7 @@ class SweepManifest:
         return {c: tuple(sorted(found[c])) for c in self.categories if c in found}
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
-        """Object names of these splits, or of all.
+        """List the object names of these splits, or of all.
 
         Raises:
             ConfigError: no such split.
@@ -124,10 +124,10 @@ class SweepManifest:
         return [name for split in dict.fromkeys(splits or self.split) for name in self.split[split]]
 
     def category(self, name: str) -> str:
-        """The category of an object.
+        """Return the category of an object.
 
         Raises:
-            RecordingError: it is of none that the set names.
+            RecordingError: the set does not name its category.
         """
         category = self.category_of.get(name) or name.rpartition("-")[0]
         if category not in self.categories and category not in self.withheld:
@@ -135,15 +135,15 @@ class SweepManifest:
         return category
 
     def label(self, name: str) -> int:
-        """The label of an object: -1 if its category is withheld from training."""
+        """Return the label of an object: -1 if its category is withheld from training."""
         category = self.category(name)
         return self.categories.index(category) if category in self.categories else -1
 
     def write(self, folder: Path) -> None:
-        """Write into a folder, or check that the set already there is this very one.
+        """Write into a folder, or check that the folder already holds this set.
 
         Raises:
-            ConfigError: the folder holds another set, or things that are none.
+            ConfigError: the folder holds another set, or other files.
         """
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / MANIFEST
@@ -156,7 +156,7 @@ class SweepManifest:
                 )
         text = msgspec.json.encode(self)
         if path.exists():
-            # Compared as JSON, which knows no tuples: a recipe may have been written with some.
+            # Compared as JSON, which has no tuples: this recipe may have some.
             here = msgspec.json.decode(text)
             there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
             differing = _compare_recipes(here, there)
@@ -173,7 +173,7 @@ class SweepManifest:
         """Read a set's manifest.
 
         Raises:
-            RecordingError: there is none, it is damaged, or of another version.
+            RecordingError: it is missing, damaged, or of another version.
         """
         path = folder / MANIFEST
         try:
@@ -194,17 +194,17 @@ class SweepManifest:
 
 
 def object_path(folder: Path, name: str) -> Path:
-    """The file of one object's sweeps."""
+    """Return the path of the file of one object's sweeps."""
     return folder / f"{name}.npz"
 
 
 def has_object(folder: Path, name: str) -> bool:
-    """Return True if an object's sweeps are there, which are written whole."""
+    """Return whether the file of an object's sweeps, written whole or not at all, exists."""
     return object_path(folder, name).exists()
 
 
 def _compare_recipes(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
-    """List the keys that differ, those of tables by their full name."""
+    """List the keys that differ, those of nested tables by their full name."""
     found = []
     for key in dict.fromkeys([*here, *there]):
         mine, theirs = here.get(key), there.get(key)

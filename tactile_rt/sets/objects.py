@@ -1,7 +1,7 @@
 """The sweeps of a set's objects on disk: one file per object, written whole or not at all.
 
-So no half-written one is ever read, and a split can never put one object on two sides. The
-archive's own checksums tell a damaged file at every reading.
+So no half-written file is ever read, and a split cannot divide an object. The archive's own
+checksums reveal a damaged file at every reading.
 """
 
 import zipfile
@@ -35,9 +35,9 @@ class Sweeps:
         labels: The (sweep,) int64 index into the manifest's categories; -1: of none of them.
         objects: The (sweep,) names of the objects; sweeps of one object share the name.
         contacts: The (sweep, sample, element) float32 arc length (m) from the whisker's base to
-            where it touches, NaN where it does not; None: the set was made without.
-        recorded: The (sweep,) bool whether it was recorded, so that its sensor's noise is in it;
-            None: all were simulated, without any.
+            where it touches, NaN where it does not; None: the set has none.
+        recorded: The (sweep,) bool: True if a sweep was recorded, and so has its sensor's noise;
+            None: all were simulated, without noise.
     """
 
     values: NDArray[np.float32]
@@ -50,7 +50,7 @@ class Sweeps:
         return len(self.labels)
 
     def __getitem__(self, at: slice | NDArray[Any]) -> "Sweeps":
-        """Some of the sweeps."""
+        """Return the sweeps at a slice or at indices."""
         there = ((f.name, getattr(self, f.name)) for f in fields(self))
         taken: dict[str, Any] = {name: v if v is None else v[at] for name, v in there}
         return Sweeps(**taken)
@@ -78,11 +78,11 @@ def write_object(
 
 
 def read_sweeps(folder: Path, split: str) -> Sweeps:
-    """Read all sweeps of one split; objects that were skipped are not among them.
+    """Read all sweeps of one split, without those of skipped objects.
 
     Raises:
-        RecordingError: no such set, an object is missing (the run that makes it was interrupted)
-            or damaged.
+        RecordingError: no such set, or an object is missing (the run that makes it was
+            interrupted) or damaged.
         ConfigError: no such split.
     """
     return read_split(folder, SweepManifest.read(folder), split)
@@ -90,7 +90,7 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
 
 def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
     """Read one split of a set whose manifest is known, as `read_sweeps` does."""
-    names = _names_of(folder, manifest, "train" if split == NEW_SWEEPS else split)
+    names = _list_objects(folder, manifest, "train" if split == NEW_SWEEPS else split)
     labels = [manifest.label(name) for name in names]
     missing = [name for name in names if not has_object(folder, name)]
     if missing:
@@ -98,7 +98,7 @@ def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
             f"{folder} is unfinished: {len(missing)} of {len(names)} objects of {split!r} are "
             f"missing ({missing[0]} ...); run the same `tactile-rt sweep` again to finish it"
         )
-    shapes = [_stored_shape(object_path(folder, name), manifest.spec.shape) for name in names]
+    shapes = [_read_shape(object_path(folder, name), manifest.spec.shape) for name in names]
     samples = shapes[0][1]
     for name, shape in zip(names, shapes, strict=True):
         if shape[1] != samples:
@@ -165,11 +165,11 @@ def _choose_sweeps(
 
 
 def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
-    """All sweeps of one object.
+    """Read all sweeps of one object.
 
     Returns:
         (sweep, sample, element, channel) values, SI, and the (sweep,) arrays that describe each.
-        Contacts, if any, are `read_sweeps`'s to read.
+        Contacts are left out; `read_sweeps` reads them.
 
     Raises:
         RecordingError: the file is damaged.
@@ -182,7 +182,7 @@ def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str,
     return arrays.pop("values"), arrays
 
 
-def _names_of(folder: Path, manifest: SweepManifest, split: str) -> list[str]:
+def _list_objects(folder: Path, manifest: SweepManifest, split: str) -> list[str]:
     if split not in manifest.split:
         raise ConfigError(f"no split {split!r} in {folder}: it has {name_some(manifest.split)}")
     skipped = read_skipped(folder)
@@ -192,8 +192,8 @@ def _names_of(folder: Path, manifest: SweepManifest, split: str) -> list[str]:
     return names
 
 
-def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
-    """The shape of an object's values, without reading them."""
+def _read_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
+    """Read the shape of an object's values, without the values."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("values.npy") as member:
             version = np.lib.format.read_magic(member)
@@ -211,7 +211,7 @@ def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
 
 
 def read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
-    """Read of an object's file what there is of some arrays; without a name, of all."""
+    """Read those of the named arrays that an object's file holds; without names, all."""
     check_no_pointer(path)
     try:
         # Opened here because numpy leaves its own file open when it is damaged.
@@ -229,7 +229,7 @@ def _damage_error(path: Path, error: Exception) -> RecordingError:
 
 
 def read_skipped(folder: Path) -> dict[str, str]:
-    """Read which objects could not be made, and why; empty without a list.
+    """Read the objects that could not be made and the causes; empty without a list.
 
     Raises:
         RecordingError: the list is damaged.

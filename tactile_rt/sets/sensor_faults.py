@@ -1,35 +1,35 @@
-"""What is wrong with a robot's sensor, and a network has to be taught: drawn, never stored.
+"""Faults of a robot's sensor that networks are trained with: drawn in training, never stored.
 
-A sweep set keeps the loads of sound whiskers. Each time that training takes a sweep it draws what
-is wrong with the sensor this time, by these amounts, which the set's recipe may say.
+A sweep set holds the loads of sound whiskers. Each time that training takes a sweep, it draws the
+sensor's faults anew, by these amounts, which the set's recipe may give.
 """
 
 from dataclasses import dataclass, fields
 
 from tactile_rt.core.errors import ConfigError
 
-LARGEST = 100.0  # of amounts: beyond it is a slip of the pen
+LARGEST = 100.0  # largest amount: a larger one is a typing error
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorFaults:
-    """How a sensor is drawn for training.
+    """Amounts of the sensor faults that training draws.
 
     Attributes:
         noise: The largest noise, in units of the rated: a third of the sweeps have none, a third
             the rated, the others any up to this one.
         gain: The standard deviation of every whisker's relative gain error.
-        dead: The probability of each whisker to read nothing.
-        dead_row: The probability of each row of whiskers to read nothing.
-        offset: The standard deviation of the constant that every channel has got since its
-            baseline, in units of its rated noise: at most, as half of the sweeps have none, and the
-            others draw a share of it evenly.
-        drift: The same of what has come to it by the end of a window, growing evenly.
+        dead: The probability that a whisker reads nothing.
+        dead_row: The probability that a row of whiskers reads nothing.
+        offset: The largest standard deviation of the constant that every channel has gained since
+            its baseline, in units of its rated noise: half of the sweeps have no offset, the others
+            draw a share of it uniformly.
+        drift: The same for an offset that grows linearly until the end of a window.
         implausible: The probability of loads that no touch makes, which a network learns to name:
-            channels swapped or turned, a gain that is wrong by far, half of the elements gone.
+            channels swapped or turned, a gain far too large or small, half of the elements gone.
 
     Raises:
-        ConfigError: a probability that is none, or an amount below 0 or far too large.
+        ConfigError: a probability outside [0, 1], or an amount below 0 or above `LARGEST`.
     """
 
     noise: float = 1.0

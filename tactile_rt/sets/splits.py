@@ -1,4 +1,4 @@
-"""How sweep sets are split by object and joined, and what of a split would spoil a training."""
+"""Splits of sweep sets by object, checks of them, and sweep sets joined into one."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from tactile_rt.sets.manifest import OUTLIERS, SPLITS, UNLABELLED, WITHHELD, Swe
 def split_by_object(
     categories: Sequence[str], objects: int, validation: int, test: int
 ) -> dict[str, tuple[str, ...]]:
-    """Split `objects` instances of every category by object: the last ones are the test."""
+    """Split `objects` instances of every category by object; the last ones are the test split."""
     first = {"train": 0, "validation": objects - test - validation, "test": objects - test}
     stop = {"train": first["validation"], "validation": first["test"], "test": objects}
     return {
@@ -23,7 +23,7 @@ def split_by_object(
 
 
 def check_labelled(folder: Path, manifest: SweepManifest) -> None:
-    """Check that a set which is to teach its labels has some.
+    """Check that a set whose labels are used in training has labels.
 
     Raises:
         ConfigError: its touches have none.
@@ -36,7 +36,7 @@ def check_labelled(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """Check that no object is on two sides, and every trained one has a label."""
+    """Check that splits share no object and every object to train on has a label."""
     side: dict[str, str] = {}
     for split, names in manifest.split.items():
         for name in names:
@@ -57,7 +57,7 @@ def check_split(folder: Path, manifest: SweepManifest) -> None:
 def trained_objects(
     manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
 ) -> dict[str, list[str]]:
-    """List the objects that a network has learnt from, by their source."""
+    """List the objects that a network was trained on, by their source."""
     before = saved.get("trained_objects", {}) if saved else {}
     found = {source: dict.fromkeys(names) for source, names in before.items()}
     for one in manifests:
@@ -67,7 +67,7 @@ def trained_objects(
 
 
 def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
-    """Join sets of one array: the first, with categories and objects of all.
+    """Join sets of one array into the first, with the categories and objects of all.
 
     Raises:
         ConfigError: sets of another array or sensor, or of another period.
@@ -101,7 +101,7 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
 def merge_categories(
     manifest: SweepManifest, classes: Mapping[str, Sequence[str]]
 ) -> SweepManifest:
-    """Merge categories into classes; what an object was labelled by becomes its kind.
+    """Merge categories into classes; an object's category becomes its kind.
 
     Args:
         classes: the categories of each class; any other category stays a class.
@@ -132,14 +132,14 @@ def merge_categories(
 def read_manifests(
     folders: Sequence[Path], labelled: bool
 ) -> tuple[list[SweepManifest], SweepManifest]:
-    """Read what sets are that are learnt from together: each, and all as one.
+    """Read the manifests of sets to train on together: each, and all joined.
 
     Args:
-        labelled: whether it is learnt from their labels.
+        labelled: whether training uses their labels.
 
     Raises:
         ConfigError: they cannot be joined, or one has no labels to learn from.
-        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+        RecordingError: a set is missing, is no sweep set, or has an invalid split.
     """
     manifests = [SweepManifest.read(folder) for folder in folders]
     whole = join_manifests(manifests)

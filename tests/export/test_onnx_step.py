@@ -305,7 +305,7 @@ def test_a_state_that_something_else_reads_is_not_written_in_place(other, marked
         "g (float[B,4,2] cache, int64[B,1,2] rows, float[B,1,2] new) => (float[B,4,2] cache_next)"
         f"{{ {other}\n cache_next = ScatterND(cache, rows, new) }}"
     )
-    assert onnx_step._written_by_rows(graph, "cache") == marked
+    assert onnx_step._is_written_by_rows(graph, "cache") == marked
 
 
 def test_what_the_card_says_of_sensor_and_rules_is_in_the_file(

@@ -9,7 +9,7 @@ import torch
 from tactile_rt.calibration.device_calibration import Mirror
 from tactile_rt.models.augmentation import (
     Tactile,
-    _blurred,
+    _blur,
     build,
     image,
     mask_steps,
@@ -255,7 +255,7 @@ def test_a_row_of_whiskers_is_no_picture(name):
 @pytest.mark.parametrize("grid", [(5, 7), (1, 4), (2, 1)])
 def test_a_blur_is_that_of_a_plain_loop_with_edges_repeated(grid):
     frame = torch.randn(2, 3, *grid, generator=torch.Generator().manual_seed(0))
-    found = _blurred(frame)
+    found = _blur(frame)
     weights = (0.25, 0.5, 0.25)
     for row in range(grid[0]):
         for column in range(grid[1]):

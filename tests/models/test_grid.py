@@ -301,8 +301,8 @@ def test_a_damaged_checkpoint_is_not_a_training_that_diverged(plan: Path, tmp_pa
 def test_windows_of_the_test_begin_as_those_that_were_learnt_from(plan: Path) -> None:
     bench = begun(plan, plan.parent / "out")
     config = bench.grid.config(bench.grid.tasks()[1], bench.data)
-    heard, _ = bench._windows(config)
-    set_out, _ = bench._windows(replace(config, window="sweep"))
+    heard, _ = bench._cut_test(config)
+    set_out, _ = bench._cut_test(replace(config, window="sweep"))
     lead = bench.test.manifest.lead
     first = bench.test.sweeps.values[0, lead : lead + 5]
     np.testing.assert_array_equal(set_out[0].samples[0, 0], first)

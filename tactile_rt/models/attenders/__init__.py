@@ -1,7 +1,7 @@
-"""Attenders: what a step's features mean in the light of the steps before it.
+"""Attenders: the parts of a network that join a step's features with those of earlier steps.
 
 Every attender maps features `(batch, step, feature)` to the same shape, causally, and has a
-`step` that gives the same one by one.
+`step` that gives the same step by step.
 """
 
 from torch import Tensor, nn
@@ -13,10 +13,10 @@ __all__ = ["GPT", "HEADS", "TOKENS", "MambaStack", "NoAttender"]
 
 
 class NoAttender(nn.Module):
-    """Each step on its own."""
+    """An attender that leaves each step on its own."""
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, feature), as they are"""
+        """Return features (batch, step, feature) unchanged."""
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
@@ -25,5 +25,5 @@ class NoAttender(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature), as they are, {}"""
+        """Return features (batch, feature) unchanged, and {}."""
         return features, {}

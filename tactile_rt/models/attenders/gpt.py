@@ -12,7 +12,7 @@ __all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "Transforme
 
 HEADS = 4
 LAYERS = 8
-BLOCK = 2 * MAX_STEPS + 1  # positions the table has: two tokens a step, and the paper's one more
+BLOCK = 2 * MAX_STEPS + 1  # positions in the table: two tokens a step, and one more as in the paper
 TOKENS = 2  # a step's observation, then the action token
 
 
@@ -30,19 +30,19 @@ class TransformerBlock(nn.Module):
         self.dropout = dropout
 
     def heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Queries, keys and values of tokens (batch, token, width), (batch, head, token, ·)."""
+        """Return queries, keys, values (batch, head, token, ·) of tokens (batch, token, width)."""
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, HEADS, -1))  # (batch, token, 3, head, ·)
         q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)  # (batch, head, token, ·) each
         return q, k, v
 
     def merge(self, x: Tensor, attended: Tensor) -> Tensor:
-        """The rest of the layer, from attended (batch, head, token, ·)."""
+        """Apply the rest of the layer to attended (batch, head, token, ·)."""
         x = x + self._drop(self.proj(attended.transpose(1, 2).flatten(2)))  # (batch, token, width)
         hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")  # (batch, token, 4 width)
         return x + self._drop(self.mlp_out(hidden))
 
     def forward(self, x: Tensor) -> Tensor:
-        """All tokens (batch, token, width) at once, each attending to itself and those before."""
+        """Map all tokens (batch, token, width) at once; each attends to itself and those before."""
         q, k, v = self.heads(x)
         dropout = self.dropout if self.training else 0.0
         return self.merge(
@@ -61,7 +61,7 @@ class GPT(nn.Module):
     Args:
         dropout: share of the activations, while training.
         max_steps: an episode's; at most `MAX_STEPS`.
-        inputs: features per step that come in, `width` unless told. The paper's ResNet18 has
+        inputs: features per step that come in, `width` by default. The paper's ResNet18 has
             512 and its GPT 256.
     """
 
@@ -99,7 +99,7 @@ class GPT(nn.Module):
         if steps > self.max_steps:
             raise ValueError(f"{steps} steps, but this attender ends at {self.max_steps}")
         # (batch, step, token of the step, width)
-        x = self._embed(features) + self.positions[: TOKENS * steps].unflatten(0, (steps, TOKENS))
+        x = self._project(features) + self.positions[: TOKENS * steps].unflatten(0, (steps, TOKENS))
         x = F.dropout(x.flatten(1, 2), self.dropout, self.training)  # (batch, token, width)
         for block in self.blocks:
             x = block(x)
@@ -107,7 +107,7 @@ class GPT(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Empty caches of keys and values, (batch, layer, head, step, token, width / head)."""
+        """Return empty key and value caches, (batch, layer, head, step, token, width / head)."""
         head = self.positions.shape[1] // HEADS
         shape = (batch, LAYERS, HEADS, self.max_steps, TOKENS, head)
         zeros = self.positions.new_zeros
@@ -116,19 +116,19 @@ class GPT(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. features (batch, inputs); index (batch,) int64, steps since the reset.
+        """Run one step: features (batch, inputs), index (batch,) int64, steps since the reset.
 
-        Past `max_steps` the last position is overwritten again and again: reset before.
+        Past `max_steps` every step overwrites the last position: reset before.
         """
         index = index.clamp(max=self.max_steps - 1)
         slots = torch.arange(self.max_steps, device=index.device)
         here = (slots == index[:, None])[:, None, :, None, None]  # where this step's pair goes
-        # The observation sees the pairs before and itself, the action token its own pair too.
+        # The observation attends to earlier pairs and itself, the action token to its pair too.
         token = torch.arange(TOKENS * self.max_steps, device=index.device)
         query = TOKENS * index[:, None] + torch.arange(TOKENS, device=index.device)
         seen = (token <= query[:, :, None])[:, None]  # (batch, 1, query, token)
         positions = self.positions[: TOKENS * self.max_steps].unflatten(0, (-1, TOKENS))
-        x = self._embed(features) + positions[index]  # (batch, token of the step, width)
+        x = self._project(features) + positions[index]  # (batch, token of the step, width)
         keys, values = [], []
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, TransformerBlock)
@@ -143,7 +143,7 @@ class GPT(nn.Module):
         out = self.project_out(self.norm(x[:, TOKENS - 1]))
         return out, {"gpt_k": torch.stack(keys, 1), "gpt_v": torch.stack(values, 1)}
 
-    def _embed(self, features: Tensor) -> Tensor:
+    def _project(self, features: Tensor) -> Tensor:
         """features (..., inputs) -> (..., token, width): the observation, then the action token."""
         action = self.action.expand_as(features)
         out: Tensor = self.project_in(torch.stack([features, action], dim=-2))

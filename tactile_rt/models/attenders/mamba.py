@@ -6,10 +6,10 @@ channel d and state n
     h_t[d, n] = exp(dt_t[d] A[d, n]) h_{t-1}[d, n] + dt_t[d] B_t[n] x_t[d]
     y_t[d] = sum_n C_t[n] h_t[d, n] + D[d] x_t[d]
 
-where dt, B and C are read off x itself: so what is kept and what is forgotten is chosen by what
-is felt. The output is y silu(z), projected back.
+where dt, B and C are computed from x itself, so that the loads choose what is kept and what is
+forgotten. The output is y silu(z), projected back.
 
-The scan over a window is written out with its gradient. Time leads inside it, so that a step is one
+The scan over a window is written out with its gradient. Time is its first axis, so that a step is a
 contiguous block: the recurrence is a loop of products into buffers that already hold what they add
 to, and everything else is done for all steps at once.
 """
@@ -58,7 +58,7 @@ class MambaBlock(nn.Module):
             parameter._optim = {"lr_scale": 1.0, "weight_decay": 0.0}  # type: ignore[attr-defined]
 
     def forward(self, features: Tensor) -> Tensor:
-        """All steps at once, from a zero state."""
+        """Process all steps at once, from a zero state."""
         x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, step, inner) each
         steps = x.shape[1]
         padded = F.pad(x, (0, 0, TAPS - 1, 0))
@@ -70,7 +70,7 @@ class MambaBlock(nn.Module):
         return self._out(y, x, gate)
 
     def step(self, features: Tensor, taps: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One step.
+        """Run one step.
 
         features (batch, width), taps (batch, TAPS - 1, inner): the last x, oldest first,
         h (batch, inner, STATES) -> the output and the new taps and h
@@ -83,7 +83,7 @@ class MambaBlock(nn.Module):
         return self._out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
 
     def _select(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What `selective_scan` takes, of x (..., inner): dt, x, a, b and c."""
+        """Return the arguments of `selective_scan` for x (..., inner): dt, x, a, b and c."""
         dt, b, c = self.x_proj(x).split([self.rank, STATES, STATES], dim=-1)
         dt = F.softplus(self.dt_proj(dt))
         # In the parameters' type whatever autocast says: the state is a long product.
@@ -99,7 +99,7 @@ class MambaStack(nn.Module):
     """Four pre-norm residual Mamba blocks and a last norm: 6,784,000 parameters at 512.
 
     Args:
-        prefix: of the names in the state, so that an encoder's and an attender's differ.
+        prefix: prefix of the names in the state, so that an encoder's and an attender's differ.
     """
 
     def __init__(self, width: int, prefix: str = "mamba") -> None:
@@ -118,8 +118,7 @@ class MambaStack(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: the convolutions' last inputs (batch, layer, TAPS - 1, inner) and the states
-        (batch, layer, inner, STATES)."""
+        """Return zeros: taps (batch, layer, TAPS - 1, inner), h (batch, layer, inner, STATES)."""
         inner = EXPAND * self.features
         zeros = self.norm.weight.new_zeros
         return {
@@ -130,7 +129,7 @@ class MambaStack(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. features (batch, width) -> (batch, width), the new state."""
+        """Run one step: features (batch, width) -> (batch, width), the new state."""
         old_taps, old_h = state[f"{self.prefix}_taps"], state[f"{self.prefix}_h"]
         x, new_taps, new_h = features, [], []
         for layer, (block, norm) in enumerate(zip(self.blocks, self.norms, strict=True)):
@@ -147,10 +146,10 @@ class MambaStack(nn.Module):
 
 
 def selective_scan(dt: Tensor, x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """y_t = h_t c_t with h_t = exp(dt_t a) h_{t-1} + dt_t x_t b_t, from h = 0.
+    """Return y_t = h_t c_t of a recurrence that starts from h = 0.
 
-    dt, x (batch, step, channel); a (channel, state); b, c (batch, step, state)
-    -> (batch, step, channel). All real, of one type.
+    h_t = exp(dt_t a) h_{t-1} + dt_t x_t b_t, with dt, x (batch, step, channel); a (channel, state);
+    b, c (batch, step, state) -> y (batch, step, channel). All real, of one type.
     """
     steps_first = [part.transpose(0, 1).contiguous() for part in (dt, dt * x, b, c)]
     with torch.autocast(x.device.type, enabled=False):
@@ -159,7 +158,7 @@ def selective_scan(dt: Tensor, x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Te
 
 
 class _Scan(torch.autograd.Function):
-    """(step, batch, ·) throughout; u is dt x."""
+    """The scan with its gradient, (step, batch, ·) throughout; u is dt x."""
 
     @staticmethod
     def forward(ctx: Any, dt: Tensor, u: Tensor, b: Tensor, c: Tensor, a: Tensor) -> Tensor:

@@ -25,14 +25,14 @@ from tactile_rt.models.encoders.convolution import Convolution, convolve
 FORGET_BIAS = 1.0
 # Where nothing is touched the gates have no variance, and the gradient through a norm grows by
 # 1 / sqrt(epsilon) with every step: at the usual 1e-5 it reaches 1e29 in a window of 22. At 1 it
-# stays below 10 with every cell. The Intersection's x passes beside the norms: it bears 0.1.
+# stays below 10 with every cell. The Intersection's x passes beside the norms: it tolerates 0.1.
 NORM_EPSILON = 1.0
 
 State = tuple[Tensor, ...]
 
 
 class Cell(nn.Module):
-    """What all cells share: one convolution to `gates` maps, and the norm of each.
+    """The base of all cells: one convolution to `gates` maps, and the norm of each.
 
     Attributes:
         gates: The number of maps that `conv` makes, one per gate.
@@ -61,15 +61,15 @@ class Cell(nn.Module):
                 norm._optim = {"stacked": True}  # type: ignore[attr-defined]
 
     def drive(self, x: Tensor) -> Tensor | None:
-        """W*x + b alone, for an x that is known for many steps at once."""
+        """Return W*x + b alone, for an x known for many steps at once."""
         return convolve(self.conv.weight[..., : self.channels], self.conv.bias, x)
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
-        """One step: the output h, shaped like x, and the new state. `drive` saves convolving x."""
+        """Return the output h, shaped like x, and the new state; `drive` saves convolving x."""
         raise NotImplementedError
 
     def convolved(self, x: Tensor, recurrent: Tensor, drive: Tensor | None) -> Tensor:
-        """The gates before their non-linearity, (..., gate * channel), in the state's type.
+        """Return the gates before their non-linearity, (..., gate * channel), in the state's type.
 
         Autocast rounds the convolutions, but not the memory.
         """
@@ -80,7 +80,7 @@ class Cell(nn.Module):
         return self.normal(gates.to(recurrent.dtype))
 
     def normal(self, gates: Tensor, first: int = 0) -> Tensor:
-        """Layer norm of maps (..., n * channel), the `first`th to `first + n`th of the cell."""
+        """Normalise maps (..., n * channel) by the cell's layer norms from `first` on."""
         if self.gamma is None or self.beta is None:
             return gates
         n = gates.shape[-1] // self.channels
@@ -90,9 +90,9 @@ class Cell(nn.Module):
 
 
 class TimeDecayCell(Cell):
-    """s' = x + tau s, h = s', with one learned tau, at first 0 (Zhuang et al. 2017).
+    """Time decay (Zhuang et al. 2017): s' = x + tau s, h = s'.
 
-    With `layer_norm`, x is normalised: there is no gate.
+    tau is one learned number, at first 0. With `layer_norm`, x is normalised: there is no gate.
     """
 
     gates, norms = 0, 1
@@ -122,7 +122,7 @@ class VanillaCell(Cell):
 
 
 class VanillaELUCell(VanillaCell):
-    """s' = elu(W*x + U*s + b), h = s': the published code's plain cell, whose default is "-ln"."""
+    """The published code's plain cell. s' = elu(W*x + U*s + b), h = s'; its default is "-ln"."""
 
     elu = True
 
@@ -193,8 +193,8 @@ class LSTMCell(Cell):
     j = tanh(W_j*x + U_j*h + b_j)            o = sigmoid(W_o*x + U_o*h + b_o)
     c' = f c + i j                           h' = o tanh(c')
 
-    With `layer_norm`, also c' inside the last tanh (Ba et al. 2016, equation 31). The h that it
-    keeps is the one before the node's ReLU.
+    With `layer_norm`, c' inside the last tanh is normalised too (Ba et al. 2016, equation 31). Its
+    state holds the h before the node's ReLU.
     """
 
     gates, norms = 4, 5
@@ -211,7 +211,7 @@ class LSTMCell(Cell):
 
 
 class PublishedLSTMCell(LSTMCell):
-    """As `LSTMCell`, but that the memory it keeps is the normalised one: another network."""
+    """An `LSTMCell` that keeps the normalised memory, which makes it another network."""
 
     keeps_normal = True
 
@@ -233,10 +233,10 @@ CELLS["lstm-ln-published"] = partial(PublishedLSTMCell, layer_norm=True)
 
 
 def make_cell(name: str, channels: int) -> Cell:
-    """A cell of so many channels: one of `CELLS`, or one that another package adds.
+    """Make a cell of `CELLS`, or one that another package adds.
 
     Args:
-        name: of the cell; of an added one as its entry point is called, or with "-ln" after it.
+        name: name of the cell; of an added cell its entry point's, with or without "-ln".
     """
     if name in CELLS:
         return CELLS[name](channels)

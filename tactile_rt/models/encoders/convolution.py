@@ -29,7 +29,7 @@ class Convolution(nn.Module):
 
 
 def convolve(weight: Tensor, bias: Tensor | None, *maps: Tensor) -> Tensor:
-    """The 'same' convolution of maps, concatenated on channels.
+    """Return the 'same' convolution of maps that are concatenated on channels.
 
     weight  (output, 2, 2, sum of channels)
     bias    (output,) or None
@@ -48,7 +48,7 @@ def convolve(weight: Tensor, bias: Tensor | None, *maps: Tensor) -> Tensor:
 
 
 def convolve_valid(weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:
-    """Without padding: x (row + 1, column + 1, lane, channel) -> (row, column, lane, output)."""
+    """Convolve unpadded. x (row + 1, column + 1, lane, channel) -> (row, column, lane, output)."""
     taps = [x[:-1, :-1], x[:-1, 1:], x[1:, :-1], x[1:, 1:]]
     return F.linear(torch.cat(taps, dim=-1), weight.flatten(1), bias)
 

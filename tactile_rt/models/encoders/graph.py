@@ -1,4 +1,4 @@
-"""A network as data: what enters, nodes and the edges between them, feedback included.
+"""A network as data: the frame, nodes and the edges between them, feedback included.
 
 Time is unrolled as in biology: a step costs every edge the same delay, so at step t a node reads
 what its predecessors put out at step t-1 (nothing at t = 0); only the frame is read at step t.
@@ -36,7 +36,7 @@ DENSE_CELLS = ("none", "timedecay", "timedecay-ln")
 
 @dataclass(frozen=True)
 class Input:
-    """What enters at every step: the frame, a map."""
+    """The input at every step: the frame, a map."""
 
     name: str
     channels: int
@@ -46,11 +46,11 @@ class Input:
 
 @dataclass(frozen=True)
 class Edge:
-    """What a node reads, and how it joins what the node reads besides.
+    """A source that a node reads, and how it joins the node's other sources.
 
     "concatenate": beside the others, on channels (the paper). "sum": projected to the channels of
-    those that are concatenated, and added. "gate": the same, times a learned attention per site,
-    0 to 1, to what is being added in the light of what is there. A vector is the same at all sites.
+    those that are concatenated, and added. "gate": as "sum", times a learned attention per site,
+    0 to 1, computed from the concatenated maps and the added one. A vector is equal at all sites.
     """
 
     source: str
@@ -59,7 +59,7 @@ class Edge:
 
 @dataclass(frozen=True)
 class Node:
-    """One area: what it reads -> convolution -> cell -> ReLU.
+    """One area: sources -> convolution -> cell -> ReLU.
 
     Attributes:
         reads: The edges that the node reads, in the order of their channels; the first is
@@ -117,13 +117,13 @@ class Graph:
                 maps = {sizes[e.source] for e in node.reads if e.source in sizes} - {(1, 1)}
                 if node.name not in sizes and maps:
                     rows, columns = min(maps)
-                    sizes[node.name] = _less(node, rows, columns)
+                    sizes[node.name] = _shrink(node, rows, columns)
         for node in self.nodes:
             if node.name not in sizes:
                 raise ConfigError(f"{node.name}: reads no map, but is {node.kind!r}; make it dense")
         for node in self.nodes:
             maps = {sizes[e.source] for e in node.reads} - {(1, 1)}
-            fits = node.kind == "dense" or {_less(node, *m) for m in maps} == {sizes[node.name]}
+            fits = node.kind == "dense" or {_shrink(node, *m) for m in maps} == {sizes[node.name]}
             if len(maps) > 1 or not fits:
                 found = ", ".join(
                     f"{e.source} {sizes[e.source][0]}x{sizes[e.source][1]}" for e in node.reads
@@ -135,7 +135,7 @@ class Graph:
 
     @property
     def remaining(self) -> dict[str, int]:
-        """Steps from each node's output to the readout's, for the frame as if the reader's own."""
+        """Steps from each node's output to the readout's; the frame counts as its reader."""
         distance = {self.readout: 0}
         nodes = {node.name: node for node in self.nodes}
         queue = [self.readout]
@@ -155,7 +155,7 @@ class Graph:
 
     @property
     def components(self) -> tuple[tuple[Node, ...], ...]:
-        """Nodes that hear each other (strongly connected), each group after those it reads."""
+        """Strongly connected groups of nodes, each after the groups that it reads."""
         reads = {n.name: {e.source for e in n.reads} for n in self.nodes}
         above = {name: set(sources) & set(reads) for name, sources in reads.items()}
         for _ in self.nodes:
@@ -170,7 +170,7 @@ class Graph:
         )
 
     def scaled(self, width: float) -> "Graph":
-        """The same graph with every node's channel count times `width`."""
+        """Return the graph with every node's channel count times `width`."""
         scale = [replace(n, channels=max(round(n.channels * width), 1)) for n in self.nodes]
         return replace(self, nodes=tuple(scale))
 
@@ -178,7 +178,7 @@ class Graph:
 def _check_node(node: Node, names: list[str]) -> None:
     for what, value, known in (
         ("kind", node.kind, KINDS),
-        ("cell", node.cell, _cells(node)),
+        ("cell", node.cell, _allowed_cells(node)),
         *(("reads", edge.source, tuple(names)) for edge in node.reads),
         *(("fusion", edge.fusion, FUSIONS) for edge in node.reads),
     ):
@@ -191,14 +191,14 @@ def _check_node(node: Node, names: list[str]) -> None:
         raise ConfigError(f"{node.name}: reads the same node twice")
 
 
-def _cells(node: Node) -> tuple[str, ...]:
+def _allowed_cells(node: Node) -> tuple[str, ...]:
     if node.kind == "dense":
         return DENSE_CELLS
     ours = ("none", *CELLS)
     return ours if node.cell in ours else (*ours, *added_cells())
 
 
-def _less(node: Node, rows: int, columns: int) -> tuple[int, int]:
+def _shrink(node: Node, rows: int, columns: int) -> tuple[int, int]:
     return (rows - 1, columns - 1) if node.kind == "valid" else (rows, columns)
 
 

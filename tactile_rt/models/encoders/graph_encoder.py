@@ -19,7 +19,7 @@ from tactile_rt.models.encoders.graph import Graph, Input, Node, parse_graph
 class Fusion(nn.Module):
     """The edges of a node that are summed or gated into those that are concatenated.
 
-    gate: sigmoid(w . [there, added] + b), a scalar per site and edge (gated attention).
+    gate: sigmoid(w . [base, added] + b), a scalar per site and edge (gated attention).
     """
 
     def __init__(self, base: int, sources: Sequence[int], gated: Sequence[bool]) -> None:
@@ -89,7 +89,7 @@ class GraphEncoder(nn.Module):
         self.features = channels[graph.readout]
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: each node's cell state and, where a node hears it, its output, ``NAME_h``."""
+        """Return zeros: each node's cell state and, if a node reads it, its output ``NAME_h``."""
         zeros = next(self.parameters()).new_zeros
         state = {}
         for node in self.graph.nodes:
@@ -101,87 +101,87 @@ class GraphEncoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, channel, row, column) -> features (batch, feature), new state.
+        """Run one step: frame (batch, channel, row, column) -> features (batch, feature), state.
 
-        index does not matter to a network without positions.
+        `index` is not used: the network has no positions.
         """
-        name, now = self.graph.frame.name, _inside(frame)
+        name, now = self.graph.frame.name, _to_inside(frame)
         keys = [key for node in self.graph.nodes for key in self.keys(node)]
         old = {key: _from_state(state[key]) for key in keys}
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
             sources = [edge.source for edge in node.reads]
             read = [now if source == name else old[f"{source}_h"] for source in sources]
-            memory = tuple(old[key] for key in self._memory(node))
-            new[f"{node.name}_h"], memory = self._cell(node, self._drive(node, read), memory)
-            new |= dict(zip(self._memory(node), memory, strict=True))
+            memory = tuple(old[key] for key in self._memory_names(node))
+            new[f"{node.name}_h"], memory = self._run_cell(node, self._drive(node, read), memory)
+            new |= dict(zip(self._memory_names(node), memory, strict=True))
         features = new[f"{self.graph.readout}_h"][0, 0]
         return features, {key: _to_state(new[key], state[key].dim()) for key in keys}
 
     def forward(self, frames: Tensor) -> Tensor:
-        """A whole window at once: the features that `step` gives one by one.
+        """Return the features of a whole window at once, as `step` gives them in turn.
 
         frames (batch, step, channel, row, column) -> (batch, step, feature)
 
-        What does not depend on a loop of the graph is computed for all steps in one product, and
-        what cannot reach a feature of this window is not computed. A node has one lane until the
-        first frame reaches it: until then all lanes are equal.
+        Nodes outside loops of the graph are computed for all steps in one product, and what cannot
+        reach a feature of this window is not computed. A node has one lane until the first frame
+        reaches it: until then all lanes are equal.
         """
         batch, steps = frames.shape[:2]
-        # What can be heard of every part of the graph, by the step in which it is read.
-        every = _inside(frames.transpose(0, 1).flatten(0, 1))
-        heard = {self.graph.frame.name: list(every.split(batch, 2))}
+        # The outputs of every part of the graph, by the step in which they are read.
+        every = _to_inside(frames.transpose(0, 1).flatten(0, 1))
+        outputs = {self.graph.frame.name: list(every.split(batch, 2))}
         state = {key: _from_state(value) for key, value in self.initial_state(1).items()}
         for node in self.graph.nodes:
-            heard[node.name] = [state[f"{node.name}_h"]] if node.name in self.heard else []
+            outputs[node.name] = [state[f"{node.name}_h"]] if node.name in self.heard else []
         for component in self.graph.components:
             first = component[0]
             if len(component) == 1 and all(e.source != first.name for e in first.reads):
-                self._sequence(first, heard, state, batch, steps)
+                self._append_outputs(first, outputs, state, batch, steps)
                 continue
             for t in range(steps):
                 for node in component:
                     if t >= steps - self.remaining[node.name]:
                         continue
-                    x = self._drive(node, [heard[e.source][t] for e in node.reads])
-                    memory = tuple(state[key] for key in self._memory(node))
-                    h, memory = self._cell(node, x, memory)
-                    state |= dict(zip(self._memory(node), memory, strict=True))
-                    heard[node.name].append(h)
-        out = [h.expand(-1, -1, batch, -1)[0, 0] for h in heard[self.graph.readout][-steps:]]
+                    x = self._drive(node, [outputs[e.source][t] for e in node.reads])
+                    memory = tuple(state[key] for key in self._memory_names(node))
+                    h, memory = self._run_cell(node, x, memory)
+                    state |= dict(zip(self._memory_names(node), memory, strict=True))
+                    outputs[node.name].append(h)
+        out = [h.expand(-1, -1, batch, -1)[0, 0] for h in outputs[self.graph.readout][-steps:]]
         return torch.stack(out, dim=1)
 
-    def _sequence(
+    def _append_outputs(
         self,
         node: Node,
-        heard: dict[str, list[Tensor]],
+        outputs: dict[str, list[Tensor]],
         state: dict[str, Tensor],
         batch: int,
         steps: int,
     ) -> None:
-        """Append all outputs of a node that is in no loop, from all that it will hear."""
+        """Append all outputs of a node in no loop, computed from those of its sources."""
         steps -= self.remaining[node.name]
         if steps <= 0:
             return
         maps = []
         for edge in node.reads:
-            lanes = [m.expand(-1, -1, batch, -1) for m in heard[edge.source][:steps]]
+            lanes = [m.expand(-1, -1, batch, -1) for m in outputs[edge.source][:steps]]
             maps.append(torch.cat(lanes, dim=2))
         x = self._drive(node, maps)
         if node.cell == "none":
-            heard[node.name] += F.relu(x).split(batch, 2)
+            outputs[node.name] += F.relu(x).split(batch, 2)
             return
         cell = self.cells[node.name]
         assert isinstance(cell, Cell)
         drive = cell.drive(x)
         drives = [None] * steps if drive is None else drive.split(batch, 2)
-        memory = tuple(state[key] for key in self._memory(node))
+        memory = tuple(state[key] for key in self._memory_names(node))
         for now, driven in zip(x.split(batch, 2), drives, strict=True):
-            h, memory = self._cell(node, now, memory, driven)
-            heard[node.name].append(h)
+            h, memory = self._run_cell(node, now, memory, driven)
+            outputs[node.name].append(h)
 
     def _drive(self, node: Node, maps: Sequence[Tensor]) -> Tensor:
-        """The node's convolution of what it reads, in the order of its edges."""
+        """Return the node's convolution of its sources, in the order of its edges."""
         fused = [edge.fusion != "concatenate" for edge in node.reads]
         if node.kind == "dense":
             beside = _flat([m for m, f in zip(maps, fused, strict=True) if not f])
@@ -209,7 +209,7 @@ class GraphEncoder(nn.Module):
         out: Tensor = self.fusions[node.name](beside, added)
         return out
 
-    def _cell(
+    def _run_cell(
         self, node: Node, x: Tensor, memory: tuple[Tensor, ...], drive: Tensor | None = None
     ) -> tuple[Tensor, tuple[Tensor, ...]]:
         if node.cell == "none":
@@ -217,8 +217,8 @@ class GraphEncoder(nn.Module):
         h, memory = self.cells[node.name](x, tuple(m.expand_as(x) for m in memory), drive)
         return F.relu(h), memory
 
-    def _memory(self, node: Node) -> list[str]:
-        """Names in the state of the node's cell's memory."""
+    def _memory_names(self, node: Node) -> list[str]:
+        """List the state's names for the memory of a node's cell."""
         if node.cell == "none":
             return []
         cell = self.cells[node.name]
@@ -226,13 +226,13 @@ class GraphEncoder(nn.Module):
         return [f"{node.name}_{kind}" for kind in cell.states]
 
     def keys(self, node: Node) -> list[str]:
-        """List a node's names in the state: its cell's memory and its output, if heard."""
-        return self._memory(node) + [f"{node.name}_h"] * (node.name in self.heard)
+        """List a node's names in the state: its cell's memory and, if read, its output."""
+        return self._memory_names(node) + [f"{node.name}_h"] * (node.name in self.heard)
 
 
 @torch.no_grad()
 def draw_as_published(encoder: nn.Module) -> None:
-    """Draw the first weights of a graph as the paper's code does: evenly, +-1 / sqrt(fan-in).
+    """Draw first weights as the paper's code does: uniformly within +-1 / sqrt(fan-in).
 
     Biases of its cells are drawn as well; those of its convolutions stay 0, of its dense nodes 0.1.
     """
@@ -247,7 +247,7 @@ def draw_as_published(encoder: nn.Module) -> None:
             nn.init.uniform_(part.weight, -bound, bound)
 
 
-def _inside(x: Tensor) -> Tensor:
+def _to_inside(x: Tensor) -> Tensor:
     """(lane, channel[, row, column]) -> (row, column, lane, channel)"""
     return x[None, None] if x.dim() == 2 else x.permute(2, 3, 0, 1)
 
@@ -267,7 +267,7 @@ def _cat(maps: Sequence[Tensor]) -> Tensor:
 
 
 def _flat(maps: Sequence[Tensor]) -> Tensor:
-    """Every site's channels, then those of vectors: (1, 1, lane, site * channel + ...)."""
+    """Return every site's channels, then vectors': (1, 1, lane, site * channel + ...)."""
     sites = [m for m in maps if m.shape[:2] != (1, 1)]
     parts = [_cat(sites).movedim(2, 0).flatten(1)[None, None]] if sites else []
     return _cat(parts + [m for m in maps if m.shape[:2] == (1, 1)])
@@ -277,11 +277,11 @@ def build_encoder(text: str, width: float, frame: tuple[int, int, int]) -> Graph
     """Build the encoder of a graph in TOML.
 
     Args:
-        width: what its channel counts are multiplied by.
+        width: the factor of its channel counts.
         frame: channels, rows and columns of the array's frames.
 
     Raises:
-        ConfigError: the text is no graph, or one of other frames.
+        ConfigError: the text is no graph, or its frames are not the array's.
     """
     graph = parse_graph(text)
     read = graph.frame

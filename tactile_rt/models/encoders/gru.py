@@ -1,4 +1,4 @@
-"""A plain GRU on the whole frame: what the whiskers' layout and the paper's graph must beat."""
+"""A plain GRU on the whole frame: the control for the whiskers' layout and the paper's graph."""
 
 from math import prod
 
@@ -26,12 +26,12 @@ class GRUEncoder(nn.Module):
         self.gru = nn.GRU(prod(frame), self.features, LAYERS, batch_first=True)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """All steps at once, from a zero state: (batch, step, feature)."""
+        """Return the features (batch, step, feature) of all steps, from a zero state."""
         features: Tensor = self.gru(frames.flatten(2))[0]
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: every layer's output, (batch, layer, feature)."""
+        """Return zeros: every layer's output, (batch, layer, feature)."""
         return {"gru_h": self.gru.all_weights[0][1].new_zeros(batch, LAYERS, self.features)}
 
     def step(

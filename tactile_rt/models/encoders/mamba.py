@@ -24,12 +24,12 @@ class MambaEncoder(nn.Module):
         self.stack = MambaStack(self.features, "encoder")
 
     def forward(self, frames: Tensor) -> Tensor:
-        """All steps at once, from a zero state: (batch, step, feature)."""
+        """Return the features (batch, step, feature) of all steps, from a zero state."""
         features: Tensor = self.stack(self.embed(frames.flatten(2)))
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros, as `MambaStack` has them."""
+        """Return zeros, as `MambaStack` does."""
         return self.stack.initial_state(batch)
 
     def step(

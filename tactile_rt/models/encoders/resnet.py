@@ -20,13 +20,13 @@ Shape = tuple[int, int]
 
 
 def output_shape(shape: Shape, kernel: int, stride: int) -> Shape:
-    """Rows and columns behind a kernel that is padded by half its size."""
+    """Return rows and columns after a kernel that is padded by half its size."""
     rows, columns = ((n + 2 * (kernel // 2) - kernel) // stride + 1 for n in shape)
     return rows, columns
 
 
 def site_taps(shape: Shape, kernel: int, stride: int) -> Tensor:
-    """Which tap joins two sites: (site out, site in), row-major taps; kernel**2 where none does."""
+    """Return the row-major tap (site out, site in) that joins two sites; kernel**2: none."""
 
     def along(size_in: int, size_out: int) -> Tensor:
         centre = stride * torch.arange(size_out)[:, None]
@@ -65,13 +65,13 @@ class ConvNorm(nn.Module):
         return out
 
     def matrix(self) -> Tensor:
-        """(site out * outputs, site in * inputs)"""
+        """Return the taps as a matrix (site out * outputs, site in * inputs)."""
         taps = F.pad(self.weight.flatten(2).permute(2, 0, 1), (0, 0, 0, 0, 0, 1))
         matrix = taps[self.taps]  # (site out, site in, output, input)
         return matrix.transpose(1, 2).flatten(2).flatten(0, 1)
 
     def folded(self) -> tuple[Tensor, Tensor]:
-        """Matrix and bias with the norm's running statistics multiplied in."""
+        """Return matrix and bias with the norm's running statistics multiplied in."""
         norm = self.norm
         assert norm.running_var is not None and norm.running_mean is not None
         gain = norm.weight / torch.sqrt(norm.running_var + norm.eps)
@@ -99,7 +99,7 @@ class ResidualBlock(nn.Module):
 
 
 class _FrameEncoder(nn.Module):
-    """Each frame on its own, by `_encode`."""
+    """An encoder of each frame on its own, by `_encode`."""
 
     def forward(self, frames: Tensor) -> Tensor:
         """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
@@ -130,7 +130,7 @@ class ResNet18Encoder(_FrameEncoder):
         channels = [round(stage * width) for stage in STAGES]
         self.features = round(FEATURES * width)
         self.stem = ConvNorm(frame[0], channels[0], 7, 2, frame[1:])
-        shape = output_shape(self.stem.shape, 3, 2)  # the maximum
+        shape = output_shape(self.stem.shape, 3, 2)  # after `maximum`
         inputs, blocks = channels[0], []
         for i, outputs in enumerate(channels):
             for stride in (1 if i == 0 else 2, 1):
@@ -142,7 +142,7 @@ class ResNet18Encoder(_FrameEncoder):
         self.fc = nn.Linear(inputs, self.features)
 
     def deployed(self) -> "FoldedResNet18":
-        """The same outputs from only the taps that matter, batch norm folded in; for inference."""
+        """Return its form for inference: only the taps that matter, batch norm folded in."""
         return FoldedResNet18(self)
 
     def _encode(self, frames: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ class ResNet18Encoder(_FrameEncoder):
 
 
 class FoldedResNet18(_FrameEncoder):
-    """A trained `ResNet18Encoder` as plain products: 2 M numbers at width 1 instead of 11.5 M."""
+    """A trained `ResNet18Encoder` as plain products; 2 M numbers at width 1, not 11.5 M."""
 
     lag = 0
 
@@ -162,15 +162,15 @@ class FoldedResNet18(_FrameEncoder):
         super().__init__()
         self.features, self.shape = encoder.features, encoder.stem.shape
         self.layers = nn.ModuleDict()
-        self._add("stem", encoder.stem)
+        self._add_layer("stem", encoder.stem)
         self.count = len(encoder.blocks)
         for i, block in enumerate(encoder.blocks):
             assert isinstance(block, ResidualBlock)
-            self._add(f"{i}_first", block.first)
-            self._add(f"{i}_second", block.second)
+            self._add_layer(f"{i}_first", block.first)
+            self._add_layer(f"{i}_second", block.second)
             if block.shortcut is not None:
-                self._add(f"{i}_shortcut", block.shortcut)
-        self.layers["fc"] = _linear(encoder.fc.weight, encoder.fc.bias)
+                self._add_layer(f"{i}_shortcut", block.shortcut)
+        self.layers["fc"] = _make_linear(encoder.fc.weight, encoder.fc.bias)
 
     def _encode(self, frames: Tensor) -> Tensor:
         layers = self.layers
@@ -181,8 +181,8 @@ class FoldedResNet18(_FrameEncoder):
         features: Tensor = layers["fc"](x)
         return features
 
-    def _add(self, name: str, layer: ConvNorm) -> None:
-        self.layers[name] = _linear(*layer.folded())
+    def _add_layer(self, name: str, layer: ConvNorm) -> None:
+        self.layers[name] = _make_linear(*layer.folded())
 
 
 def sites_first(frames: Tensor) -> Tensor:
@@ -191,7 +191,7 @@ def sites_first(frames: Tensor) -> Tensor:
 
 
 def maximum(x: Tensor, shape: Shape) -> Tensor:
-    """Largest of 3 x 3 sites, stride 2, padded by 1: (frame, site * channel) to the same layout."""
+    """Max-pool (frame, site * channel) over 3 x 3 sites, stride 2, padding 1."""
     x = x.unflatten(1, (*shape, -1))  # not by len(x), which an export would take for fixed
     for axis in (1, 2):
         size = x.shape[axis]
@@ -200,7 +200,7 @@ def maximum(x: Tensor, shape: Shape) -> Tensor:
     return x.flatten(1)
 
 
-def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+def _make_linear(weight: Tensor, bias: Tensor) -> nn.Linear:
     layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
     layer.weight = nn.Parameter(weight.detach().clone(), requires_grad=False)
     layer.bias = nn.Parameter(bias.detach().clone(), requires_grad=False)

@@ -33,7 +33,7 @@ SSM_OPTIM = {"lr_scale": 0.1, "weight_decay": 0.0}
 
 
 def hippo_legs(states: int = STATES) -> tuple[Tensor, Tensor, Tensor]:
-    """Λ, P and B of HiPPO-LegS, one of each conjugate pair, (states / 2,) complex128.
+    """Return Λ, P, B of HiPPO-LegS, one of each conjugate pair, (states / 2,) complex128.
 
     A = -sqrt((2n+1)(2k+1)) below the diagonal, -(n+1) on it; with p = sqrt(n + 1/2), A + p p^T is
     skew-symmetric but for its diagonal of -1/2, hence unitarily diagonal (their appendix C.1).
@@ -82,7 +82,7 @@ class S4Block(nn.Module):
         return self.merge(x, torch.einsum("cts,bsc->btc", toeplitz, x.flip(1)))
 
     def merge(self, x: Tensor, y: Tensor) -> Tensor:
-        """What follows the convolution y of x, (..., channel)."""
+        """Apply the part of the block after the convolution y of x, (..., channel)."""
         y = F.dropout(F.gelu(y), DROPOUT, self.training)
         y = F.dropout(F.glu(self.mix(y), -1), DROPOUT, self.training)
         out: Tensor = self.norm(x + y)
@@ -90,20 +90,20 @@ class S4Block(nn.Module):
 
 
 def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
-    """The first `steps` taps of every block, (block, channel, step); D is added to tap 0.
+    """Return every block's first `steps` taps (block, channel, step); tap 0 includes D.
 
     All blocks at once: the recurrence is short and its vectors are small.
     """
 
-    def joined(name: str) -> Tensor:
+    def concatenate(name: str) -> Tensor:
         return torch.cat([getattr(block, name) for block in blocks])
 
     # log_dt (block * channel,); p, b, c (block * channel, 2, state / 2)
-    log_dt, p, b, c = (joined(name) for name in ("log_dt", "P", "B", "C"))
+    log_dt, p, b, c = (concatenate(name) for name in ("log_dt", "P", "B", "C"))
     part = torch.arange(2, device=p.device, dtype=p.dtype)[:, None]  # real, imaginary
     conjugate = 1 - 2 * part
     dt = torch.exp(log_dt)[:, None]
-    re, im = -torch.exp(joined("log_decay")) * dt / 2, joined("frequency") * dt / 2
+    re, im = -torch.exp(concatenate("log_decay")) * dt / 2, concatenate("frequency") * dt / 2
     # r = 1 / (1 - Δ/2 Λ), and e = (1 + Δ/2 Λ) r, the diagonal part's share of Ā
     size = (1 - re) ** 2 + im**2
     r = torch.stack([(1 - re) / size, im / size], 1)
@@ -128,7 +128,7 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
         states.append(x)
     # (step, block * channel, 2, state / 2) -> (block * channel, step)
     taps = torch.einsum("kcpn,cpn->ck", torch.stack(states), 2 * conjugate * c)
-    taps = torch.cat([taps[:, :1] + joined("D")[:, None], taps[:, 1:]], 1)
+    taps = torch.cat([taps[:, :1] + concatenate("D")[:, None], taps[:, 1:]], 1)
     out: Tensor = taps.unflatten(0, (len(blocks), -1))
     return out
 
@@ -137,7 +137,7 @@ class S4Encoder(nn.Module):
     """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
 
     Args:
-        taps: how many steps back the convolutions reach: an episode's.
+        taps: the steps that the convolutions reach back: an episode's.
     """
 
     lag = 0
@@ -152,7 +152,7 @@ class S4Encoder(nn.Module):
         self.out = nn.Linear(self.features, self.features)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """All steps at once, from a zero state: (batch, step, feature)."""
+        """Return the features (batch, step, feature) of all steps, from a zero state."""
         x = self.embed(frames.flatten(2))  # (batch, step, channel)
         for block, kernel in zip(self.blocks, self.kernels(frames.shape[1]), strict=True):
             x = block(x, kernel)
@@ -160,7 +160,7 @@ class S4Encoder(nn.Module):
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: every block's last inputs, newest first, (batch, layer, tap, channel)."""
+        """Return zeros: every block's last inputs, newest first, (batch, layer, tap, channel)."""
         weight = self.out.weight
         return {"s4_inputs": weight.new_zeros(batch, LAYERS, self.taps, self.features)}
 
@@ -174,7 +174,7 @@ class S4Encoder(nn.Module):
         return self.filter(frame, self.kernels(self.taps), state)
 
     def kernels(self, steps: int) -> Tensor:
-        """What an episode of so many steps needs of every block's kernel, (layer, channel, tap)."""
+        """Return every block's kernel (layer, channel, tap) for an episode of `steps`."""
         blocks = [block for block in self.blocks if isinstance(block, S4Block)]
         # In single precision whatever autocast says: the state is a long product.
         with torch.autocast(self.out.weight.device.type, enabled=False):
@@ -183,7 +183,7 @@ class S4Encoder(nn.Module):
     def filter(
         self, frame: Tensor, kernels: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """`step` with the kernels (layer, channel, tap) given."""
+        """Run `step` with given kernels (layer, channel, tap)."""
         x, inputs = self.embed(frame.flatten(1)), []  # (batch, channel)
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, S4Block)
@@ -193,7 +193,7 @@ class S4Encoder(nn.Module):
         return self.out(x), {"s4_inputs": torch.stack(inputs, 1)}
 
     def deployed(self) -> "FoldedS4":
-        """The same outputs from kernels computed once; for inference."""
+        """Return its form for inference, with kernels computed once."""
         return FoldedS4(self)
 
 
@@ -225,6 +225,6 @@ class FoldedS4(nn.Module):
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Of complex numbers as (..., 2, state): real parts, imaginary parts."""
+    """Multiply complex numbers stored as (..., 2, state): real parts, imaginary parts."""
     (a_re, a_im), (b_re, b_im) = a.unbind(-2), b.unbind(-2)
     return torch.stack([a_re * b_re - a_im * b_im, a_re * b_im + a_im * b_re], -2)

@@ -18,7 +18,7 @@ EDGES = {
 
 
 def zhuang_graph(cell: str = "intersection-ln", frame: tuple[int, int, int] = MOUSE_FRAME) -> Graph:
-    """The paper's graph with one of `cells.CELLS` on every map, for frames of any size.
+    """Return the paper's graph with one of `cells.CELLS` on every map, for any frame size.
 
     Time decay, the original, is on fc7 and fc8 too; gated cells are not.
     """

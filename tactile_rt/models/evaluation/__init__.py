@@ -1,1 +1,1 @@
-"""How good a model is on objects that it never saw: accuracy, robustness, open-set decisions."""
+"""Evaluation of a model on objects that it never saw: accuracy, robustness, open set."""

@@ -1,4 +1,4 @@
-"""What a model file says of its own decisions, held against what it does: coverage, refusals."""
+"""Measured coverage and refusals of a model file, to compare with those that it states."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -26,12 +26,12 @@ class Coverage:
     """The coverage and the refusals of a model on a test.
 
     Attributes:
-        nominal: The coverage that the model file tells, 0 to 1; NaN without prediction sets.
-        covered: The share of the sweeps of kinds that it knows, and in which it found a contact, of
-            which the true kind was in the prediction set of every step.
-        size: The mean number of classes in the prediction set at the last step of these.
-        unknown: The share of the sweeps that it calls unknown.
-        faulty: The share that it refuses for what is wrong with the loads.
+        nominal: The coverage that the model file states, 0 to 1; NaN without prediction sets.
+        covered: The share of sweeps whose true class is in the prediction set of every step, of
+            those of known classes in which a contact was found.
+        size: The mean number of classes in the prediction set at the last step of these sweeps.
+        unknown: The share of sweeps that the model calls unknown.
+        faulty: The share of sweeps that the model refuses for faulty loads.
     """
 
     nominal: float
@@ -44,11 +44,11 @@ class Coverage:
 def measure_names(
     path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
 ) -> Iterator[tuple[str, Interval]]:
-    """Measure the prediction sets of kinds; nothing of a model, or a test, without.
+    """Measure the prediction sets of kinds; yield nothing if model or test has no kinds.
 
-    The coverage of each class is that of its rule: of the sweeps of things of kinds that the model
-    knows, the share of which the kind is in the set of their class at every step. Classes of one
-    kind are left out.
+    The coverage of a class is the share of sweeps whose kind is in the prediction set of their
+    class at every step, of the sweeps of kinds that the model knows. Classes of one kind are left
+    out.
 
     Args:
         test: the sweeps, labelled by the model's classes; sweeps without a contact are left out.
@@ -75,7 +75,7 @@ def measure_names(
             continue
         touched = found[at]
         taken.append(at[touched])
-        rows.append(_in_sets(rule, posteriors[touched], kinds[touched]))
+        rows.append(_measure_sets(rule, posteriors[touched], kinds[touched]))
     if not sum(map(len, taken)):
         return
     at, (inside, first, size) = np.concatenate(taken), np.concatenate(rows, axis=1)
@@ -95,27 +95,27 @@ def measure_names(
 def measure_coverage(
     path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
 ) -> Coverage | None:
-    """Measure coverage and refusals on a test; None of a model without either.
+    """Measure coverage and refusals on a test; None for a model without either.
 
     Args:
-        test: the sweeps, labelled by the model's classes; those of none (-1) are only refused or
-            not.
+        test: the sweeps, labelled by the model's classes; with sweeps of no class (-1), only
+            refusals are measured.
     """
     _, card = load_model(path)
     if not card.refusals and not card.candidates:
         return None
-    posteriors = _posteriors(path, test, disturbance)
+    posteriors = _predict_all(path, test, disturbance)
     labels, objects = test.sweeps.labels, test.sweeps.objects
-    said = _decisions(card, posteriors[:, -1])
+    answers = _decide(card, posteriors[:, -1])
     faults = [name for name in card.refusals if name in IMPLAUSIBLE]
-    unknown = measures.accuracy(said == UNKNOWN, objects)
-    faulty = measures.accuracy(np.isin(said, faults), objects)
+    unknown = measures.accuracy(answers == UNKNOWN, objects)
+    faulty = measures.accuracy(np.isin(answers, faults), objects)
     rule = fitting(card.candidates, disturbance.noise)
     if rule is None or (labels < 0).any():
         return Coverage(float("nan"), NOTHING, NOTHING, unknown, faulty)
     found = np.flatnonzero(~np.isnan(posteriors[:, 0, 0]))
     labels, objects = labels[found], objects[found]
-    inside, _, sizes = _in_sets(rule, posteriors[found][..., : len(card.classes)], labels)
+    inside, _, sizes = _measure_sets(rule, posteriors[found][..., : len(card.classes)], labels)
     return Coverage(
         rule.coverage,
         measures.accuracy(inside, objects),
@@ -125,15 +125,15 @@ def measure_coverage(
     )
 
 
-def _in_sets(rule: PredictionSetRule, posteriors: Floats, labels: Labels) -> Doubles:
-    """Form the sets of sweeps at every step.
+def _measure_sets(rule: PredictionSetRule, posteriors: Floats, labels: Labels) -> Doubles:
+    """Form the prediction sets of sweeps at every step and compare them with the labels.
 
     Args:
         posteriors, labels: (sweep, step, class) and (sweep,).
 
     Returns:
-        (3, sweep) whether the truth is in the set of every step, whether it is the first of the
-        last one, and how many are in that.
+        (3, sweep) whether the label is in the set of every step, whether it comes first in the
+        last set, and the size of the last set.
     """
     rows = []
     for p, label in zip(posteriors, labels.tolist(), strict=True):
@@ -143,13 +143,13 @@ def _in_sets(rule: PredictionSetRule, posteriors: Floats, labels: Labels) -> Dou
 
 
 def score_known(path: Path, test: SweepSet) -> Floats:
-    """Score (sweep,), open set, how sure a model is that things are of known kinds.
+    """Return (sweep,) open-set scores: how probable a known class is to a model.
 
-    That is the posterior of all labels but `unknown`; of a model that has no such label, that of
-    the most probable class. 0 where no contact was found.
+    The score is the posterior of all labels but `unknown`; for a model without that label, that
+    of the most probable class. 0 where no contact was found.
     """
     _, card = load_model(path)
-    last = _posteriors(path, test, CLEAN)[:, -1]
+    last = _predict_all(path, test, CLEAN)[:, -1]
     if UNKNOWN in card.refusals:
         sure = 1 - last[:, card.labels.index(UNKNOWN)]
     else:
@@ -158,9 +158,9 @@ def score_known(path: Path, test: SweepSet) -> Floats:
 
 
 def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
-    """Of each kind of loads that no touch makes: the share that a model refuses for its loads.
+    """Measure the share of sweeps with each implausible fault that a model refuses as faulty.
 
-    Only of those that it has a label for.
+    Only faults that the model has a label for are measured.
     """
     _, card = load_model(path)
     faults = [name for name in card.refusals if name in IMPLAUSIBLE]
@@ -168,17 +168,17 @@ def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
     for name in faults:
         values = IMPLAUSIBLE[name](test.sweeps.values, test.manifest.spec, rng)
         spoilt = replace(test, sweeps=replace(test.sweeps, values=values))
-        said = _decisions(card, _posteriors(path, spoilt, CLEAN)[:, -1])
-        yield name, measures.accuracy(np.isin(said, faults), test.sweeps.objects)
+        answers = _decide(card, _predict_all(path, spoilt, CLEAN)[:, -1])
+        yield name, measures.accuracy(np.isin(answers, faults), test.sweeps.objects)
 
 
-def _posteriors(path: Path, test: SweepSet, disturbance: Disturbance) -> Floats:
-    """(sweep, step, label) of all labels, refusals last."""
+def _predict_all(path: Path, test: SweepSet, disturbance: Disturbance) -> Floats:
+    """Return posteriors (sweep, step, label) of all labels, refusals last."""
     run = run_steps(*load_model(path), refusals=True)
     return measures.predict(test, run, disturbance=disturbance)
 
 
-def _decisions(card: ModelCard, posteriors: Floats) -> NDArray[np.str_]:
-    """(sweep,) What is decided at the last step; "" where no contact was found."""
+def _decide(card: ModelCard, posteriors: Floats) -> NDArray[np.str_]:
+    """Return (sweep,) labels decided at the last step; "" where no contact was found."""
     found = [None if np.isnan(p).any() else decided(card, p, card.steps) for p in posteriors]
     return np.array(["" if k is None else card.labels[k] for k in found])

@@ -1,4 +1,4 @@
-"""How well does a classifier do on objects that it never saw? Accuracy with honest intervals.
+"""Measures of a classifier on objects that it never saw, with intervals by object.
 
 The sweeps may be disturbed first (`disturbances`). Sweeps of one object are not independent, so
 intervals resample objects.
@@ -35,7 +35,7 @@ LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
 
 @dataclass(frozen=True)
 class CutWindows:
-    """Windows of some sweeps, and the baseline that the detector had by then.
+    """Windows of some sweeps, and the detector's baseline at their onsets.
 
     Attributes:
         samples: The (sweep, step, sub-step, element, channel) samples of the windows, SI.
@@ -69,7 +69,7 @@ def predict(
     seed: int = 0,
     disturbance: Disturbance = CLEAN,
 ) -> Floats:
-    """Posteriors of every sweep at every step, from where the detector finds its onset.
+    """Return the posteriors of every sweep at every step from its detected onset.
 
     Args:
         run: (samples, offset, sigma) of windows to (batch, step, class) logits.
@@ -85,9 +85,7 @@ def predict(
 
 
 def posteriors(cut: Iterable[CutWindows], run: Step) -> Floats:
-    """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected,
-    or the network overflows.
-    """
+    """Return (sweep, step, class) posteriors of windows; NaN without contact or on overflow."""
     logits, found = run_over(cut, run)
     with np.errstate(invalid="ignore"):
         posterior = softmax(logits)
@@ -98,7 +96,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> Floats:
 def cut_windows(
     data: SweepSet, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
 ) -> Iterator[CutWindows]:
-    """The windows of all sweeps as the robot would cut them, so many at a time."""
+    """Yield the windows of all sweeps, cut as on the robot, `batch` at a time."""
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]
@@ -109,10 +107,10 @@ def cut_windows(
 
 
 def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return what a function makes of windows, and (sweep,) whether a contact was detected.
+    """Run a function on windows; return its outputs and (sweep,) whether contact was detected.
 
     Args:
-        run: as `predict` takes it; what it gives need not be logits.
+        run: as `predict` takes it; its outputs need not be logits.
     """
     parts = [(run(one.samples, one.offset, one.sigma), one.detected) for one in cut]
     out, detected = zip(*parts, strict=True)
@@ -120,7 +118,7 @@ def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[Floats, NDArray[np.b
 
 
 def at_temperature(posteriors: Floats, temperature: float) -> Floats:
-    """(..., class) posteriors as they would be with their logits divided by a temperature."""
+    """Return (..., class) posteriors with their logits divided by a temperature."""
     with np.errstate(divide="ignore"):
         logits = np.log(posteriors) / np.float32(temperature)
     return softmax(logits)
@@ -133,7 +131,7 @@ def softmax(logits: NDArray[Any]) -> Floats:
 
 
 def among(posteriors: Floats, classes: int) -> Floats:
-    """(..., class) posteriors of the first so many labels alone, had it to be one of them."""
+    """Return (..., class) posteriors given that the label is one of the first `classes`."""
     own = posteriors[..., :classes]
     return np.asarray(own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30))
 
@@ -144,17 +142,17 @@ def split_by_class(
     numbers: Labels,
     kinds: Mapping[str, Sequence[str]],
 ) -> Iterator[tuple[str, Labels, Floats, Labels]]:
-    """Split sweeps by the class that they are of, with posteriors of its kinds alone.
+    """Split sweeps by class, with posteriors of the kinds of that class alone.
 
     Args:
         logits: (sweep, step, name) of the kinds of all classes.
         found: (sweep,) whether a contact was detected.
         numbers: (sweep,) the true kind, as `SweepSet.kinds` counts them.
-        kinds: those of each class.
+        kinds: the kinds of each class.
 
     Yields:
-        The class, which sweeps are of a kind of it, their posteriors (sweep, step, kind), NaN where
-        no contact was detected, and their kinds (sweep,) among those of the class.
+        The class, the indices of sweeps of its kinds, their posteriors (sweep, step, kind), NaN
+        where no contact was detected, and their kinds (sweep,), counted within the class.
     """
     for name, columns in kind_columns(kinds).items():
         at = np.flatnonzero((numbers >= columns.start) & (numbers < columns.stop))
@@ -165,14 +163,14 @@ def split_by_class(
 
 
 def hits(posteriors: Floats, labels: Labels, top: int = 1) -> NDArray[np.bool_]:
-    """(sweep,) whether the label is among the `top` most probable of (sweep, class) posteriors."""
+    """Return (sweep,) whether the label is among the `top` classes of (sweep, class)."""
     decided = ~np.isnan(posteriors).any(axis=1)
     order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
     return np.asarray(decided & (order == labels[:, None]).any(axis=1))
 
 
 def auroc(known: Floats, unknown: Floats) -> float:
-    """Chance that a sweep of a known category scores higher than one of an unknown category.
+    """Return the chance that a known category's sweep scores higher than an unknown one's.
 
     Args:
         known, unknown: (sweep,) scores; NaN, where no contact was detected, is the lowest.
@@ -189,7 +187,7 @@ def auroc(known: Floats, unknown: Floats) -> float:
 
 
 def open_set(known: Floats, objects: Names, unknown: Floats, others: Names) -> Interval:
-    """Measure the AUROC, open set, of scores (sweep,) of known things against unknown ones."""
+    """Measure the open-set AUROC of scores (sweep,) of known objects against unknown ones."""
     scores = np.concatenate([known, unknown])
 
     def area(at: Labels) -> float:
@@ -200,7 +198,7 @@ def open_set(known: Floats, objects: Names, unknown: Floats, others: Names) -> I
 
 
 def deciding_step(posteriors: Floats, labels: Labels) -> NDArray[np.int64]:
-    """(sweep,) the step, from 1, from which the decision is right and stays so; 0: it never does.
+    """Return (sweep,) the step, from 1, since which the decision stays right; 0: never.
 
     Args:
         posteriors: (sweep, step, class).
@@ -213,7 +211,7 @@ def deciding_step(posteriors: Floats, labels: Labels) -> NDArray[np.int64]:
 
 
 def fused_accuracy(posteriors: Floats, labels: Labels, objects: Names, sweeps: int = 2) -> Interval:
-    """Accuracy of decisions fused over consecutive sweeps of one object, (sweep, class) given.
+    """Measure the accuracy of (sweep, class) posteriors fused over an object's successive sweeps.
 
     An undetected sweep contributes nothing; a group of only such sweeps is wrong.
     """
@@ -228,7 +226,7 @@ def fused_accuracy(posteriors: Floats, labels: Labels, objects: Names, sweeps: i
 
 
 def confusion(posteriors: Floats, labels: Labels, classes: int) -> NDArray[np.int64]:
-    """(true class, decided class) counts of the sweeps that were decided."""
+    """Count the decided sweeps by (true class, decided class)."""
     decided = ~np.isnan(posteriors).any(axis=1)
     table = np.zeros((classes, classes), dtype=np.int64)
     np.add.at(table, (labels[decided], posteriors[decided].argmax(axis=1)), 1)
@@ -236,7 +234,7 @@ def confusion(posteriors: Floats, labels: Labels, classes: int) -> NDArray[np.in
 
 
 def expected_calibration_error(posteriors: Floats, labels: Labels, bins: int = 15) -> float:
-    """ECE (Guo et al. 2017): mean gap between confidence and accuracy over equal-width bins."""
+    """Return the ECE (Guo et al. 2017): mean gap of confidence and accuracy in equal bins."""
     decided = ~np.isnan(posteriors).any(axis=1)
     confidence = posteriors[decided].max(axis=1)
     right = posteriors[decided].argmax(axis=1) == labels[decided]
@@ -249,7 +247,7 @@ def expected_calibration_error(posteriors: Floats, labels: Labels, bins: int = 1
 
 
 def accuracy(correct: NDArray[Any], objects: Names, resamples: int = 2000) -> Interval:
-    """A mean over sweeps with a percentile bootstrap over objects.
+    """Return a mean over sweeps with a percentile bootstrap over objects.
 
     Args:
         correct: (sweep,) whether each was right; or the difference of two such arrays, for the
@@ -275,11 +273,11 @@ def accuracy(correct: NDArray[Any], objects: Names, resamples: int = 2000) -> In
 def bootstrap(
     statistic: Callable[[NDArray[np.int64]], float], objects: Names, resamples: int = 300
 ) -> Interval:
-    """Any statistic of a set of sweeps with a percentile bootstrap over objects.
+    """Return any statistic of sweeps with a percentile bootstrap over objects.
 
     Args:
-        statistic: of the sweeps with these indices (k,), some of which may come more than once; NaN
-            where they do not tell, as a draw without one of two kinds.
+        statistic: of the sweeps with given indices (k,), which may repeat; NaN where it is
+            undefined, as for a draw without one of two kinds.
         objects: (sweep,) object of each sweep.
     """
     _, which = np.unique(objects, return_inverse=True)
@@ -309,8 +307,8 @@ def macro_accuracy(correct: NDArray[np.bool_], labels: Labels, objects: Names) -
 
 
 def run_on(model: "TactileClassifier", output: str = "logits") -> Step:
-    """The function that `predict` wants, of a torch model; or one that gives another output."""
-    import torch  # here: a model file is measured without
+    """Wrap a torch model as a function for `predict`, or one with another output."""
+    import torch  # here: a model file is measured without it
 
     def run(*loads: Floats) -> Floats:
         model.eval()
@@ -327,11 +325,11 @@ def run_on(model: "TactileClassifier", output: str = "logits") -> Step:
 
 
 def run_steps(session: ort.InferenceSession, card: ModelCard, refusals: bool = False) -> Step:
-    """Make the function that `predict` wants of a model file, as `load_model` gives it.
+    """Wrap a model file, as `load_model` gives it, as a function for `predict`.
 
     Args:
-        refusals: whether the logits are to have those of the refusals, too. Without, a posterior is
-            what the model would say had it to name a class.
+        refusals: whether the logits include those of the refusals. Without them, a posterior is
+            conditional on the model naming a class.
 
     Returns:
         (samples, offset, sigma) of windows to (batch, step, class) logits, divided by the

@@ -1,7 +1,7 @@
-"""What a model file can do on objects that it never saw: the figures of `tactile-rt eval`.
+"""Figures of a model file on objects that it never saw, as `tactile-rt eval` shows them.
 
-The model runs as on a robot: the ONNX file itself, step by step, from where the contact detector
-finds its onset.
+The model runs as on a robot: the ONNX file itself, step by step, from the onset that the contact
+detector finds.
 """
 
 from dataclasses import replace
@@ -36,7 +36,7 @@ BARS = {
     24: {"top-1": ">= 82", "top-5": ">= 97", "fused": ">= 96", "noise": "<= 4"},
 }
 ECE_BAR = "<= 5"
-# The same sweeps under every condition of a long list: this many of each object are enough.
+# Sweeps of each object, enough for a long list of conditions on the same sweeps.
 ROBUSTNESS_SWEEPS, QUICK_SWEEPS = 4, 2
 
 
@@ -61,17 +61,17 @@ def evaluate_model(
     """
     session, card = load_model(model)
     run = run_steps(session, card)
-    test = _tested_on(data, card, model, quick)
+    test = _read_test(data, card, model, quick)
     labels, objects = test.sweeps.labels, test.sweeps.objects
-    if _met(card, test):
+    if _may_know_objects(card, test):
         raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
     sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
 
     clean = measures.predict(test, run)
-    # of objects of the kind that it was trained on
-    bars = {} if _from_elsewhere(test, card) else BARS.get(len(card.classes), {})
+    # bars are for objects of the training's source
+    bars = {} if _has_other_source(test, card) else BARS.get(len(card.classes), {})
 
     def top(name: str, posteriors: Floats, how: str = sample, top: int = 1) -> Record:
         right = measures.hits(posteriors, labels, top)
@@ -113,8 +113,8 @@ def evaluate_model(
         raw = measures.predict(test, run, float(np.sqrt(1.5 / 18)))
         how = f"{sample}; white noise {rated} on every 1 kHz sample, through the resampler"
         records.append(top("top-1 at rated noise of 1 kHz samples", raw[:, -1], how))
-    few = _first_of_each(test, ROBUSTNESS_SWEEPS)
-    records += measure_robustness(few, run, clean[_firsts(objects, ROBUSTNESS_SWEEPS), -1])
+    few = _take_first_sweeps(test, ROBUSTNESS_SWEEPS)
+    records += measure_robustness(few, run, clean[_first_sweeps(objects, ROBUSTNESS_SWEEPS), -1])
     records += _calibration(clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample)
     undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
     records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
@@ -122,7 +122,7 @@ def evaluate_model(
     if test.manifest.split.get(WITHHELD):
         unknown = replace(SweepSet.read(data, WITHHELD), window=test.window)
         if quick:
-            unknown = _first_of_each(unknown, QUICK_SWEEPS)
+            unknown = _take_first_sweeps(unknown, QUICK_SWEEPS)
         records.append(_measure_open_set(model, unknown, test))
     records += _measure_coverage(model, test, unknown, sample)
     records += _measure_names(model, test, sample)
@@ -142,8 +142,8 @@ def evaluate_model(
     return records
 
 
-def _tested_on(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSet:
-    """A set's test split with the labels that the model has for its categories, and its windows."""
+def _read_test(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSet:
+    """Read a set's test split with the labels and the window of a model."""
     test, known = SweepSet.read(data, "test"), card.classes
     differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
@@ -166,21 +166,21 @@ def _tested_on(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSe
     training = card.provenance.get("training")
     if isinstance(training, dict):
         test = replace(test, window=training.get("window", "onset"))
-    return _first_of_each(test, QUICK_SWEEPS) if quick else test
+    return _take_first_sweeps(test, QUICK_SWEEPS) if quick else test
 
 
-def _met(card: ModelCard, test: SweepSet) -> bool:
-    """Whether the model was, or may have been, trained on objects of the test."""
+def _may_know_objects(card: ModelCard, test: SweepSet) -> bool:
+    """Return whether the model was, or may have been, trained on objects of the test."""
     names = set(test.sweeps.objects.tolist())
     trained = card.provenance.get("trained_objects")
     if isinstance(trained, dict):
         return not names.isdisjoint(trained.get(test.manifest.source, ()))
     unseen = set(card.provenance.get("unseen_objects", ()))
-    return not _from_elsewhere(test, card) and bool(unseen) and not names <= unseen
+    return not _has_other_source(test, card) and bool(unseen) and not names <= unseen
 
 
-def _from_elsewhere(test: SweepSet, card: ModelCard) -> bool:
-    """Whether the objects are not of the source that the model was trained on."""
+def _has_other_source(test: SweepSet, card: ModelCard) -> bool:
+    """Return whether the objects come from another source than the model's training."""
     trained: Any = card.provenance.get("sweep_set", {})
     source = trained.get("objects", {}).get("from") if isinstance(trained, dict) else None
     return source is not None and test.manifest.recipe.get("objects", {}).get("from") != source
@@ -258,22 +258,22 @@ def _measure_open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record
     return record_share(name, estimate, "", how, "% AUROC", "; 50: chance")
 
 
-def _firsts(objects: Names, sweeps: int) -> Labels:
+def _first_sweeps(objects: Names, sweeps: int) -> Labels:
     mine = [np.flatnonzero(objects == name)[:sweeps] for name in dict.fromkeys(objects.tolist())]
     return np.concatenate(mine)
 
 
-def _first_of_each(data: SweepSet, sweeps: int) -> SweepSet:
-    return data[_firsts(data.sweeps.objects, sweeps)]
+def _take_first_sweeps(data: SweepSet, sweeps: int) -> SweepSet:
+    return data[_first_sweeps(data.sweeps.objects, sweeps)]
 
 
 def _compare_svm(
     data: Path, card: ModelCard, test: SweepSet, network: NDArray[np.bool_]
 ) -> list[Record]:
-    """A network (sweep,), right or not, beside an RBF SVM on the same windows."""
+    """Compare a network's hits (sweep,) with an RBF SVM on the same windows."""
     from tactile_rt.models.evaluation.svm import fit_svm  # scikit-learn takes a second to import
 
-    learnt_from = (  # by the labels that the test's have here, the model's
+    learnt_from = (  # with the model's labels, as the test has
         replace(relabelled(SweepSet.read(data, split), card.classes), window=test.window)
         for split in ("train", "validation")
     )

@@ -12,8 +12,8 @@ from tactile_rt.models.evaluation import measures
 def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path) -> None:
     """Draw a confusion matrix (true, decided) as percentages of each true class.
 
-    Only classes of which there were sweeps have a row, and a column only what is one of them or was
-    decided; the latter stand behind.
+    Rows are the classes with sweeps; columns are the same classes, then those that were decided but
+    have no sweeps.
     """
     there, decided = table.sum(axis=1) > 0, table.sum(axis=0) > 0
     rows = np.flatnonzero(there)

@@ -35,7 +35,7 @@ class Record:
 
     @property
     def met(self) -> bool | None:
-        """Whether the figure reaches its bar; None without one."""
+        """True if the figure meets its bar, False if not, None without a bar."""
         if not self.bar:
             return None
         sign, _, limit = self.bar.partition(" ")
@@ -45,19 +45,19 @@ class Record:
 def record_share(
     name: str, estimate: "Interval", bar: str, how: str, unit: str = "%", beside: str = ""
 ) -> Record:
-    """Give a share as a figure of a model in percent, with its interval."""
+    """Return a share as a figure of a model in percent, with its interval."""
     interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
     return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
 
 
 def record_count(name: str, estimate: "Interval", how: str) -> Record:
-    """Give a mean number as a figure of a model, with its interval."""
+    """Return a mean number as a figure of a model, with its interval."""
     interval = f"95 % interval {estimate.low:.1f} to {estimate.high:.1f}, by object"
     return Record(f"models.{name}", estimate.value, "", "", interval, how)
 
 
 def as_table(records: list[Record]) -> Table:
-    """Records as a table to print, each with how it was measured on the line below."""
+    """Return records as a table, each with its measurement's conditions on the line below."""
     table = Table("figure", "value", "bar", "met", leading=1)
     table.columns[0].overflow = "fold"  # a name is one long word
     for column in table.columns[1:]:
@@ -71,7 +71,7 @@ def as_table(records: list[Record]) -> Table:
 
 
 def as_dicts(records: list[Record]) -> list[dict[str, Any]]:
-    """Records as JSON has them, each with whether it meets its bar."""
+    """Return records as JSON values, each with whether it meets its bar."""
     return [{**asdict(r), "met": r.met} for r in records]
 
 

@@ -1,4 +1,4 @@
-"""A model with a sensor that is not what it was trained on: noisy, drifting, wrong, half dead."""
+"""Accuracy of a model with a degraded sensor: noisy, drifting, miswired, partly dead."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.records import Record, record_share
 
-REST = 80  # samples: 0.7 s of a mouse's, which a baseline can be taken from
+REST = 80  # samples at rest for the baseline, 0.7 s of a mouse's
 
 
 def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
-    """The rated noise per sample in words, or a multiple of it, e.g. 10 uN and 0.05 uN m."""
+    """Return the rated noise per sample, or a multiple, as text, e.g. 10 uN and 0.05 uN m."""
     largest: dict[str, float] = {}
     for unit, noise in zip(data.manifest.spec.units, data.noise.tolist(), strict=True):
         largest[unit] = max(largest.get(unit, 0.0), noise)
@@ -20,7 +20,7 @@ def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
 
 
 def conditions(data: SweepSet) -> dict[str, Disturbance]:
-    """What is tried, by name: amounts are those of the set's own sensor."""
+    """Return the disturbances to test, by name, in amounts of the set's own sensor."""
     rated, whiskers = rated_amount(data), len(data.manifest.spec.elements)
     found = {
         "noise at a quarter of the rated": Disturbance(noise=0.25),
@@ -41,7 +41,7 @@ def conditions(data: SweepSet) -> dict[str, Disturbance]:
     channels = data.manifest.spec.channels
     if any(name.endswith("x") and f"{name[:-1]}y" in channels for name in channels):
         found["x and y connected the wrong way round"] = Disturbance(swapped=True)
-    if data.manifest.recorded:  # with a noise that cannot be taken out of them
+    if data.manifest.recorded:  # recordings contain their sensor's noise
         return {name: d for name, d in found.items() if not 0 < d.noise <= 1}
     return found
 

@@ -1,11 +1,10 @@
-"""RBF support vector machines: the one place where one is fitted.
+"""RBF support vector machines, all of them fitted here, for two comparisons.
 
-Two questions want one. Does a network beat it on the very windows that it sees? `fit_svm` answers
-that: the machine takes the same onsets, baseline and compression, and validation chooses its
-penalty.
-And can a set be learnt from at all? The card of a sweep set asks that with features and a penalty
-of its own (`tactile_rt.sim_backend.datasets.card_survey`), and is handed `fit` by the command:
-simulation and networks do not know of each other.
+`fit_svm` gives a machine to compare a network with on the same windows: it takes the same onsets,
+baseline and compression, and the validation split chooses its penalty.
+The card of a sweep set shows whether the set can be learnt from at all, with features and a penalty
+of its own (`tactile_rt.sim_backend.datasets.card_survey`); the command passes `fit` to it, since
+simulation and networks do not import each other.
 
 Standardising the features only makes the machine worse, so nothing here does.
 """
@@ -43,28 +42,28 @@ class FittedSVM:
         return np.asarray(self.machine.predict(self.kernel(features)))
 
     def margins(self, features: Floats, classes: int) -> NDArray[np.float64]:
-        """Distances from the decision for each of `classes` numbers, against all others.
+        """Return each of `classes` classes' distances from its boundary with all others.
 
         Returns:
-            (sweep, class); -inf of a class that no sweep was of.
+            (sweep, class); -inf for a class without training sweeps.
         """
         found = np.full((len(features), classes), -np.inf)
         distance = self.machine.decision_function(self.kernel(features))
-        if distance.ndim == 1:  # of two classes: from the second
+        if distance.ndim == 1:  # two classes: that of the second
             distance = np.column_stack([-distance, distance])
         found[:, self.machine.classes_] = distance
         return found
 
     def hits(self, data: "SweepSet") -> NDArray[np.bool_]:
-        """(sweep,) whether each is right; one without an onset is not."""
+        """Return (sweep,) whether each decision is right; a sweep without onset counts as wrong."""
         x, usable = window_features(data)
         return np.asarray((self(x) == data.sweeps.labels) & usable)
 
 
 def fit(features: Floats, labels: NDArray[Any], penalty: float, how: str = "") -> FittedSVM:
     """Fit one machine to (sweep, feature) values and (sweep,) labels, at penalty C."""
-    # Of its own gamma, "scale". The kernel is a product of matrices, which libsvm by itself works
-    # out pair by pair: dozens of times slower where there are thousands of features.
+    # gamma is scikit-learn's "scale". The kernel is computed here as a matrix product: libsvm
+    # computes it pair by pair, dozens of times slower with thousands of features.
     gamma = 1.0 / (features.shape[1] * float(features.var()) or 1.0)
     if len(features) > MOST_PAIRED:
         machine = SVC(C=penalty, gamma=gamma).fit(features, labels)
@@ -91,8 +90,8 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
 def window_features(
     data: "SweepSet", disturbance: "Disturbance | None" = None
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """(sweep, step * element * channel) compressed loads, and whether there was an onset."""
-    # Imported here: it brings torch, which whoever only writes a set's card does without.
+    """Return (sweep, step * element * channel) compressed loads, and whether onsets were found."""
+    # Imported here: writing a set's card works without these.
     from tactile_rt.models.disturbances import CLEAN
     from tactile_rt.models.evaluation.measures import cut_windows, run_over
 

@@ -1,1 +1,1 @@
-"""Many networks under one budget: the paper's task-performance figure, trained beside random."""
+"""Grids of experiments: networks tuned alike, trained and untrained, as in the paper's figure."""

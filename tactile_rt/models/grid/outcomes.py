@@ -1,4 +1,4 @@
-"""What the tasks of a grid have found, as it is kept in the grid's folder. Needs no torch."""
+"""Outcomes of a grid's tasks, as stored in the grid's folder. Needs no torch."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -15,7 +15,7 @@ from tactile_rt.models.grid.plan import OF_UNTRAINED, SUPERVISED, Grid, Task
 from tactile_rt.models.training.config import TrainingConfig
 
 SUBSET, OUTCOMES, RUNS = "sweeps", "outcomes", "runs"  # folders of a grid
-TESTED = "tested.json"  # a file of it
+TESTED = "tested.json"  # a file of a grid
 POINT = "point.json"  # a file of one of its trainings
 CHANCE = 0.04  # of top-1: what is so near to chance may be chance
 
@@ -24,14 +24,14 @@ Hits = Annotated[str, msgspec.Meta(pattern="^[01]*$")]
 
 
 class Training(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One training and what the validation split says of it.
+    """One training and its score on the validation split.
 
     Attributes:
         score: Top-1 of the validation split, 0 to 1, the mean of clean and noisy; of a
             self-supervised network by its probe. 0 if it diverged.
-        seconds: The CPU time of its updates, and of what it was validated by, s; 0 if something
-            else than a CPU trained it, or it was interrupted.
-        key: The settings that it depends on, as JSON; in its own folder alone.
+        seconds: The CPU time of its updates and validations, s; 0 if it did not train on a CPU, or
+            was interrupted.
+        key: The settings that it depends on, as JSON; stored in its own folder alone.
     """
 
     learning_rate: float
@@ -44,7 +44,7 @@ class Training(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Tested(msgspec.Struct, frozen=True):
-    """What a grid's outcomes are of: enough to tell of them where its sweeps are not."""
+    """The test objects of a grid: enough to report its outcomes without its sweeps."""
 
     objects: tuple[tuple[str, int], ...]
     classes: int
@@ -58,7 +58,7 @@ class Tested(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What a task found.
+    """The outcome of a task.
 
     Attributes:
         key: The settings that the outcome depends on, as JSON; another key is another experiment.
@@ -67,7 +67,7 @@ class Outcome(msgspec.Struct, frozen=True):
         known: Hits on new sweeps of the objects that it was trained on; empty where the set holds
             none out.
         seconds: The CPU time of the training that was scored, s, as in `Training`.
-        trials, growth: What chose rate and warm-up, then the updates; of the first seed alone.
+        trials, growth: The trainings that chose rate and warm-up, then updates; first seed only.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Outcome(msgspec.Struct, frozen=True):
     failed: str = ""
 
     def right(self, which: str = "top1") -> NDArray[np.bool_]:
-        """(sweep,) of `top1`, `top5` or `noisy`."""
+        """Return (sweep,) hits of `top1`, `top5` or `noisy`."""
         return np.asarray(np.array(list(getattr(self, which)), dtype=np.str_) == "1")
 
 
@@ -98,7 +98,7 @@ def saw_nothing(trials: Sequence[Training], chance: float) -> bool:
 
 
 def outcome_path(folder: Path, task: Task) -> Path:
-    """Where a grid's folder keeps a task's outcome."""
+    """Return the path of a task's outcome in a grid's folder."""
     return folder / OUTCOMES / f"{task.slug}.json"
 
 
@@ -115,23 +115,23 @@ def write_tested(
 
 
 def read_tested(folder: Path) -> Tested:
-    """What a grid tests on."""
+    """Read the test objects of a grid."""
     path = folder / TESTED
     if not path.exists():
         raise ConfigError(f"no {path}: run the grid first")
-    return _decoded(path, Tested, "delete it and run the grid")
+    return _decode(path, Tested, "delete it and run the grid")
 
 
 def runs_of(folder: Path, task: Task) -> Path:
-    """Where a grid's folder keeps a task's trainings."""
+    """Return the folder of a task's trainings in a grid's folder."""
     return folder / RUNS / task.slug
 
 
 def read_point(path: Path, key: str) -> Training | None:
-    """What a training of these settings has found, if it is done."""
+    """Read the result of a training with these settings, if it is done."""
     if not path.exists():
         return None
-    found = _decoded(path, Training, f"delete {path.parent}")
+    found = _decode(path, Training, f"delete {path.parent}")
     if found.key != key:
         raise ConfigError(
             f"{path.parent} was trained with other settings: choose another folder for the grid, "
@@ -141,11 +141,11 @@ def read_point(path: Path, key: str) -> Training | None:
 
 
 def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
-    """What a task found, if it is done."""
+    """Read a task's outcome, if it is done."""
     path = outcome_path(folder, task)
     if not path.exists():
         return None
-    found = _decoded(path, Outcome, "delete it to do it again")
+    found = _decode(path, Outcome, "delete it to do it again")
     if len({len(hits) for hits in (found.top1, found.top5, found.noisy) if hits}) > 1:
         raise ConfigError(f"{path} is damaged (hits of other sweeps): delete it to do it again")
     if found.key != settings_of(grid, task):
@@ -156,7 +156,7 @@ def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
     return found
 
 
-def _decoded(path: Path, kind: type[Kept], advice: str) -> Kept:
+def _decode(path: Path, kind: type[Kept], advice: str) -> Kept:
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
@@ -164,7 +164,7 @@ def _decoded(path: Path, kind: type[Kept], advice: str) -> Kept:
 
 
 def settings_of(grid: Grid, task: Task) -> str:
-    """Everything that an outcome depends on, as JSON."""
+    """Return everything that an outcome depends on, as JSON."""
     settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(grid.sweeps), "data": grid.data}
     if task.cell is not None:
         config = training_settings(grid.config(task, Path()))
@@ -186,14 +186,14 @@ def settings_of(grid: Grid, task: Task) -> str:
 
 
 def training_settings(config: TrainingConfig) -> dict[str, Any]:
-    """What of a training's configuration is not as usual, as JSON has it.
+    """Return a training configuration's fields that differ from the defaults, as JSON values.
 
-    A key that was thought of later leaves what was done before as it is.
+    So a field that is added later leaves the settings of earlier outcomes as they are.
     """
     plain, usual = (msgspec.to_builtins(one) for one in (config, TrainingConfig("")))
     return {key: value for key, value in plain.items() if value != usual[key]}
 
 
 def waiting_tasks(grid: Grid, folder: Path) -> list[Task]:
-    """The tasks of a grid that are not done yet, in their order."""
+    """Return the tasks of a grid that are not done yet, in their order."""
     return [task for task in grid.tasks() if read_outcome(grid, folder, task) is None]

@@ -1,4 +1,4 @@
-"""The picture of a grid: who ends best, as in the paper."""
+"""The picture of a grid's results, as in the paper."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ ROW_INCH, BAR = 0.34, 0.4
 
 
 def draw_grid(results: GridResults, path: Path) -> None:
-    """Draw top-1 of every cell and of its untrained network, with 95 % intervals, as a PNG."""
+    """Draw top-1 of every cell and its untrained network, with 95 % intervals, as PNG."""
     svm = next((row.top1 for row in results.rows if row.name == SVM), None)
     networks = [row for row in results.rows if row.name != SVM]
     groups = {
@@ -39,7 +39,7 @@ def draw_grid(results: GridResults, path: Path) -> None:
     figure = Figure(figsize=(9.5, ROW_INCH * sum(heights) + 1.9), layout="constrained")
     all_axes = figure.subplots(len(groups), 1, sharex=True, height_ratios=heights, squeeze=False)
     for axes, (title, rows) in zip(all_axes[:, 0], groups.items(), strict=True):
-        _bars(axes, rows)
+        _draw_bars(axes, rows)
         axes.set_title(title, fontsize=10, loc="left")
         axes.axvline(100 / results.classes, color="0.3", linestyle=":")
         if svm is not None:
@@ -72,17 +72,17 @@ def draw_grid(results: GridResults, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _bars(axes: Axes, rows: list[Row]) -> None:
+def _draw_bars(axes: Axes, rows: list[Row]) -> None:
     for k, row in enumerate(rows):
         _, colour = _family(row)
         if row.random is not None:
-            _bar(axes, k - BAR / 2, row.random, colour, PALE)
+            _draw_bar(axes, k - BAR / 2, row.random, colour, PALE)
         if row.top1 is not None:
-            _bar(axes, k + BAR / 2, row.top1, colour, 0.9)
+            _draw_bar(axes, k + BAR / 2, row.top1, colour, 0.9)
             end = 100 * max(row.top1.high, row.top1.value) + 1
-            told = f"{100 * row.top1.value:.1f}{' +' if row.chosen and not row.flat else ''}"
+            text = f"{100 * row.top1.value:.1f}{' +' if row.chosen and not row.flat else ''}"
             axes.text(
-                end, k + BAR / 2, told, va="center", fontsize=7.5,
+                end, k + BAR / 2, text, va="center", fontsize=7.5,
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},  # on the SVM's line
             )  # fmt: skip
         elif row.failed:
@@ -94,9 +94,9 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
     axes.set_axisbelow(True)
 
 
-def _bar(axes: Axes, at: float, value: Interval, colour: str, alpha: float) -> None:
+def _draw_bar(axes: Axes, at: float, value: Interval, colour: str, alpha: float) -> None:
     axes.barh(at, 100 * value.value, BAR, color=colour, alpha=alpha, linewidth=0)
-    # A percentile interval need not hold its estimate, and matplotlib wants no negative bars.
+    # A percentile interval may not hold its estimate, and matplotlib rejects negative bars.
     sides = [[value.value - value.low], [value.high - value.value]]
     error = 100 * np.maximum(sides, 0.0)
     axes.errorbar(100 * value.value, at, xerr=error, fmt="none", ecolor="black", elinewidth=1)

@@ -1,4 +1,4 @@
-"""What a grid trains: a TOML file of encoder x attender x objective, each tuned alike.
+"""The plan of a grid: a TOML file of encoder x attender x objective, each tuned alike.
 
 Every cell is tuned by as many short trials as any other, then trained with more and more updates
 until more gain nothing, then with further seeds; a cell with a recipe is trained as that says:
@@ -22,12 +22,12 @@ from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 from tactile_rt.models.training.recipes import load_recipe
 
 SHIPPED = resources.files("tactile_rt.models.grid")
-# of a training's configuration, what a grid sets task by task
+# fields of a training's configuration that a grid sets task by task
 OWN = ("data", "also", "begin", "seed", "learning_rate", "warmup", "epochs", "updates")
 OF_CELL = ("encoder", "attender", "objective", "augmentation", "masking")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
-NAMING = ("pairs",)  # options that tell cells apart in their names
-# what of a training's configuration an untrained network and its probe depend on, too
+NAMING = ("pairs",)  # options that are part of a cell's name
+# fields of a training's configuration that an untrained network and its probe also depend on
 OF_UNTRAINED = (
     "decoder", "readout", "dropout", "graph", "norm_epsilon", "preprocessing", "first_weights",
     "window", "jitter", "faults",
@@ -70,7 +70,7 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def learning(self) -> str:
-        """Objective and views, what it began with, and of how much: ``simclr tactile+masking``."""
+        """Objective, views, beginning and share of objects: ``simclr tactile+masking``."""
         views = [self.augmentation] if self.augmentation != "none" else []
         views += ["masking"] if self.masking else []
         views += [str(self.options[key]) for key in NAMING if key in self.options]
@@ -81,12 +81,12 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def name(self) -> str:
-        """Unique in a grid; a supervised cell goes by its network, and what is not usual of it."""
+        """Name, unique in a grid; a supervised cell's is its network and unusual settings."""
         return f"{self.network} {self.learning.removeprefix(SUPERVISED).strip()}".strip()
 
 
 class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How many sweeps of each object are taken; 0: all."""
+    """Numbers of sweeps to take of each object; 0: all."""
 
     train: int = 0
     validation: int = 0
@@ -94,7 +94,7 @@ class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The trials that choose a cell's rate and warm-up by the validation split; of its first seed.
+    """The trials of a cell's first seed that choose rate and warm-up by validation.
 
     Attributes:
         learning_rate: The peaks that are tried, all with the first warm-up.
@@ -108,12 +108,12 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How long a cell is trained: twice as long each time, until that gains less than `gain`.
+    """The lengths of a cell's trainings: doubled until that gains less than `gain`.
 
     Each time it is trained from the beginning, with a whole schedule of its rate.
 
     Attributes:
-        first, most: The numbers of updates that it begins with and that are never passed.
+        first, most: The first and the largest number of updates.
         gain: The least gain in the score of the validation split, 0 to 1.
     """
 
@@ -137,7 +137,7 @@ class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Task(msgspec.Struct, frozen=True):
-    """One thing to do: a cell with a seed, a network's random initialisation, or the SVM.
+    """One task: a cell with a seed, a network's random initialisation, or the SVM.
 
     Attributes:
         name: The name of the cell, "random NETWORK" or "svm".
@@ -155,7 +155,7 @@ class Task(msgspec.Struct, frozen=True):
 
     @property
     def random(self) -> bool:
-        """Whether the network stays as it was initialised."""
+        """True if the network stays as it was initialised."""
         return self.name.startswith(RANDOM)
 
 
@@ -181,7 +181,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     questions: tuple[Question, ...] = msgspec.field(name="question", default=())
 
     def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
-        """How a task is trained on the sweep set at `data`."""
+        """Return a task's training configuration for the sweep set at `data`."""
         cell = task.cell
         assert cell is not None
         options: dict[str, Any] = {
@@ -194,11 +194,11 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             **chosen,
         }
         convert(make_node(options, f"cell {cell.name!r}", 0, Path()), TrainingConfig)
-        # As it is written: whole numbers stay whole in what is stored of a run.
+        # With the values as written: whole numbers stay whole in a run's stored configuration.
         return TrainingConfig(**options)
 
     def tasks(self) -> list[Task]:
-        """Everything to do, a cell after the other: a grid that is not done has whole rows."""
+        """List all tasks, cell by cell, so that an unfinished grid has whole rows."""
         tasks = {(SVM, 0): Task(SVM, 0, None)} if self.svm else {}
         for cell in self.cells:
             for seed in range(cell.seeds or self.seeds):
@@ -208,10 +208,10 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return list(tasks.values())
 
     def untrained(self, cell: Candidate) -> Candidate:
-        """What a cell's network is before it is trained, and how it is probed."""
+        """Return a cell's untrained network, with the settings of its probe, as a candidate."""
         own, usual = self._options(cell), TrainingConfig("")
-        told = (k for k in OF_UNTRAINED if k in own or k in self.supervised)
-        kept = {k: own.get(k, getattr(usual, k)) for k in told}
+        names = (k for k in OF_UNTRAINED if k in own or k in self.supervised)
+        kept = {k: own.get(k, getattr(usual, k)) for k in names}
         return Candidate(cell.encoder, cell.attender, width=cell.width, options=kept)
 
     def _options(self, cell: Candidate) -> dict[str, Any]:
@@ -222,13 +222,13 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return {**common, **cell.options}
 
     def begun(self, task: Task) -> Task:
-        """What a task's network begins with."""
+        """Return the task whose trained network a task begins with."""
         assert task.cell is not None
         (cell,) = (one for one in self.cells if one.name == task.cell.begin)
         return Task(cell.name, task.seed, cell)
 
     def needs(self, task: Task) -> tuple[str, ...]:
-        """Slugs of the tasks that come before: the first seed, which tunes, and a beginning."""
+        """Return slugs of the tasks that come before: the tuning first seed and the beginning."""
         cell = task.cell
         if cell is None or task.random:
             return ()
@@ -238,7 +238,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def shipped_grids() -> tuple[str, ...]:
-    """Names that `read_grid` takes in place of a path."""
+    """Return the names that `read_grid` takes in place of a path."""
     files = (entry.name for entry in SHIPPED.iterdir())
     return tuple(sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml")))
 
@@ -254,14 +254,14 @@ def read_grid(name: str | Path) -> Grid:
         raise ConfigError(f"no grid {name}: name a TOML file, or one of {known}")
     grid: Grid = convert(nodes, Grid)
     try:
-        _check(grid)
+        _check_grid(grid)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None
     return grid
 
 
-def _check(grid: Grid) -> None:
-    """Refuse what could only be told after hours of training, or never."""
+def _check_grid(grid: Grid) -> None:
+    """Check what would otherwise fail after hours of training, or never."""
     search, growth = grid.search, grid.growth
     if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
         raise ConfigError("a grid needs a cell, a seed and an update")
@@ -324,7 +324,7 @@ def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> No
     for rate in search.learning_rate if not cell.recipe else ():
         for warmup in search.warmup:
             config = grid.config(task, Path(grid.data), learning_rate=rate, warmup=warmup)
-    if config.encoder != "graph":  # whose frame is that of an array, which is not read here
+    if config.encoder != "graph":  # its frame is the array's, which is not read here
         try:
             config.network(2)
         except ConfigError as error:

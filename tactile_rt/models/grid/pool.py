@@ -1,7 +1,7 @@
-"""Do a grid: its sweeps once, then its tasks over processes.
+"""Running of a grid: its sweeps once, then its tasks over processes.
 
-All cells share one sweep set, a part of the grid's own. A task that is done is not done again,
-whenever the grid was killed.
+All cells share one sweep set, a part of the grid's own. Finished tasks are not repeated, whenever
+the grid was killed.
 """
 
 import multiprocessing
@@ -40,20 +40,20 @@ def run_grid(
     report: Report = lambda found, done, total: None,
     accelerator: str = "cpu",
 ) -> None:
-    """Do everything that a grid has not done yet.
+    """Run the tasks of a grid that are not done yet.
 
     Args:
-        processes: to share the tasks; one works in this process.
-        report: called with each outcome as it comes, and how many of all there are.
+        processes: number of processes to share the tasks; 1: this process.
+        report: called with each outcome, and the numbers of finished and of all tasks.
 
     Raises:
         ConfigError: the folder holds outcomes of another grid, or another process works in it.
     """
     with alone_in(folder):
-        _run(grid, folder, processes, report, accelerator)
+        _run_locked(grid, folder, processes, report, accelerator)
 
 
-def _run(grid: Grid, folder: Path, processes: int, report: Report, accelerator: str) -> None:
+def _run_locked(grid: Grid, folder: Path, processes: int, report: Report, accelerator: str) -> None:
     tasks = grid.tasks()
     folder.mkdir(parents=True, exist_ok=True)
     waiting = waiting_tasks(grid, folder)
@@ -63,7 +63,7 @@ def _run(grid: Grid, folder: Path, processes: int, report: Report, accelerator: 
     finished = {task.slug for task in tasks} - {task.slug for task in waiting}
 
     def ready() -> Task | None:
-        """The next task whose needs are done, no longer among those that wait."""
+        """Remove and return the next waiting task whose needs are done."""
         for task in waiting:
             if finished.issuperset(grid.needs(task)):
                 waiting.remove(task)
@@ -81,7 +81,7 @@ def _run(grid: Grid, folder: Path, processes: int, report: Report, accelerator: 
         return
     # Spawned: torch does not survive a fork in every state.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, _begin) as pool:
+    with ProcessPoolExecutor(processes, context, _begin_process) as pool:
         running: dict[Future[Outcome], Task] = {}
         try:
             while True:
@@ -91,7 +91,7 @@ def _run(grid: Grid, folder: Path, processes: int, report: Report, accelerator: 
                     return
                 for one in wait(running, return_when=FIRST_COMPLETED).done:
                     conclude(one.result(), running.pop(one))
-        except BrokenProcessPool:  # killed for memory, for one; its task is done again next time
+        except BrokenProcessPool:  # e.g. killed for memory; its task is repeated next time
             raise TactileError(
                 "a process of the grid ended: run the grid again to go on, with fewer processes if "
                 "memory ran out"
@@ -102,7 +102,7 @@ def _run(grid: Grid, folder: Path, processes: int, report: Report, accelerator: 
 
 
 def prepare(grid: Grid, folder: Path) -> None:
-    """Write, or go on writing, the sweeps of a grid and what of them it tests on."""
+    """Write, or go on writing, the sweeps of a grid and its test objects."""
     write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
     test = SweepSet.read(folder / SUBSET, "test")
     known = test.sweeps.objects[:0]
@@ -138,16 +138,16 @@ def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
 def _submit(
     pool: ProcessPoolExecutor, grid: Grid, folder: Path, accelerator: str, task: Task
 ) -> Future[Outcome]:
-    """Give a task to a process that does not hear Ctrl-C, even while it begins."""
+    """Submit a task to a process that ignores Ctrl-C, even while it begins."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return pool.submit(_do, grid, folder, accelerator, task)
+        return pool.submit(_do_task, grid, folder, accelerator, task)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _begin() -> None:
-    """Begin a process: one thread of torch, and no life after the parent's."""
+def _begin_process() -> None:
+    """Limit torch to one thread and end this process with its parent."""
     import torch
 
     torch.set_num_threads(1)
@@ -161,7 +161,7 @@ def _begin() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-def _do(grid: Grid, folder: Path, accelerator: str, task: Task) -> Outcome:
+def _do_task(grid: Grid, folder: Path, accelerator: str, task: Task) -> Outcome:
     global _bench
     if _bench is None:
         _bench = Workbench(grid, folder, accelerator)

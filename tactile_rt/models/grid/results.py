@@ -1,4 +1,4 @@
-"""What a grid found: accuracies with honest intervals, comparisons, and tables of both."""
+"""Results of a grid: accuracies with intervals, comparisons, and tables of both."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +30,8 @@ class Row:
             noise. None where there is no figure.
         known: Top-1 on new sweeps of the objects that it was trained on; None where there are none.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
-        seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
-        flat: Whether the last of these gained less than the grid asks for.
+        seconds: The mean CPU time of a seed's training, s, over seeds with a known time; else 0.
+        flat: Whether the last training of `growth` gained less than the grid asks for.
     """
 
     name: str
@@ -64,7 +64,7 @@ class Answer:
 
     @property
     def verdict(self) -> str:
-        """In a word."""
+        """Answer in words: "yes", "no" or "cannot tell"."""
         if self.difference.low > 0:
             return "yes"
         return "no" if self.difference.high < 0 else "cannot tell"
@@ -72,7 +72,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class GridResults:
-    """Everything that a grid has found so far."""
+    """All results that a grid has so far."""
 
     rows: tuple[Row, ...]
     answers: tuple[Answer, ...]
@@ -82,7 +82,7 @@ class GridResults:
 
 
 def gather(grid: Grid, folder: Path) -> GridResults:
-    """Read the outcomes that there are."""
+    """Gather the results of all outcomes so far."""
     found: dict[str, list[Outcome]] = {}
     for task in grid.tasks():
         outcome = read_outcome(grid, folder, task)
@@ -99,18 +99,18 @@ def gather(grid: Grid, folder: Path) -> GridResults:
                 f"{len(outcome.top1)} sweeps, of which there are {len(objects)}: delete its outcome"
             )
     cells = {SVM: None, **{cell.name: cell for cell in grid.cells}}
-    rows = [_row(grid, n, cell, found, tested) for n, cell in cells.items() if n in found]
+    rows = [_make_row(grid, n, cell, found, tested) for n, cell in cells.items() if n in found]
     answers = [
         Answer(question.text, pair.better, pair.than, difference)
         for question in grid.questions
         for pair in question.pairs
-        if (difference := _difference(found.get(pair.better), found.get(pair.than), objects))
+        if (difference := _compare_seeds(found.get(pair.better), found.get(pair.than), objects))
     ]
     kinds = len(set(objects.tolist()))
     return GridResults(tuple(rows), tuple(answers), kinds, len(objects), tested.classes)
 
 
-def _row(
+def _make_row(
     grid: Grid, name: str, cell: Candidate | None, found: dict[str, list[Outcome]], tested: Tested
 ) -> Row:
     def estimate(these: list[Outcome], which: str) -> Interval | None:
@@ -142,10 +142,10 @@ def _row(
     )
 
 
-def _difference(
+def _compare_seeds(
     better: list[Outcome] | None, than: list[Outcome] | None, objects: Names
 ) -> Interval | None:
-    """Of top-1, over the seeds that both have; the SVM has one for all."""
+    """Return the top-1 difference over common seeds; the SVM has one result for all."""
     mine = {one.seed: one.right() for one in better or () if one.top1}
     theirs = {one.seed: one.right() for one in than or () if one.top1}
     seeds = sorted(set(mine) & set(theirs))
@@ -157,7 +157,7 @@ def _difference(
 
 
 def table(results: GridResults) -> str:
-    """Markdown: every cell, then every comparison."""
+    """Return every cell, then every comparison, as Markdown."""
     lines = [
         f"Top-1 on {results.objects} objects that no network trained on ({results.sweeps} sweeps, "
         f"{results.classes} categories, chance {100 / results.classes:.1f} %); in brackets 95 %, "
@@ -179,8 +179,8 @@ def table(results: GridResults) -> str:
             if at
             else "",
             _updates(row),
-            _percent(row.top1) if row.top1 else "failed" if row.failed else "",
-            *(_percent(one) for one in (row.random, row.top5, row.noisy, row.known)),
+            _format_percent(row.top1) if row.top1 else "failed" if row.failed else "",
+            *(_format_percent(one) for one in (row.random, row.top5, row.noisy, row.known)),
             str(row.seeds),
             f"{row.seconds:.0f}" if row.seconds else "",
         ]
@@ -208,7 +208,7 @@ def _updates(row: Row) -> str:
     return f"{row.chosen.updates:,}{'' if row.flat else ' +'}" if row.chosen.updates else "recipe"
 
 
-def _percent(one: Interval | None) -> str:
+def _format_percent(one: Interval | None) -> str:
     if one is None:
         return ""
     return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"

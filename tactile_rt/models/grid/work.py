@@ -1,7 +1,7 @@
 """One task of a grid: tune, train, probe, and score on the test objects.
 
-What a cell is tuned and trained by is the validation split alone; the test split is looked at once,
-when the network is chosen.
+The validation split alone decides on tuning and training; the test split is used once, when the
+network is chosen.
 """
 
 import time
@@ -47,7 +47,7 @@ Report = Callable[..., None]
 
 
 class Workbench:
-    """What the tasks of one process share: the test windows as the robot would cut them."""
+    """The splits and test windows, cut as on a robot, that one process's tasks share."""
 
     def __init__(self, grid: Grid, folder: Path, accelerator: str = "cpu") -> None:
         self.grid, self.folder, self.accelerator = grid, folder, accelerator
@@ -61,10 +61,10 @@ class Workbench:
         check_sets(self.data, (*self.splits, self.test))
         self._shares: dict[float, tuple[SweepSet, SweepSet]] = {}
         self._cut: dict[str, tuple[list[CutWindows], list[CutWindows]]] = {}
-        self._check()
+        self._check_tasks()
 
-    def _check(self) -> None:
-        """Refuse now what this array, these sweeps or this machine cannot have."""
+    def _check_tasks(self) -> None:
+        """Check every task against this array, these sweeps and this machine."""
         manifest = self.test.manifest
         for task in self.grid.tasks():
             if task.cell is None:
@@ -79,15 +79,15 @@ class Workbench:
             pass
 
     def do(self, task: Task, report: Report = lambda _: None) -> Outcome:
-        """Do a task and keep its outcome; a network that diverges is an outcome too."""
+        """Do a task and write its outcome; a network that diverges is an outcome too."""
         found = Outcome(task.name, task.seed, outcomes.settings_of(self.grid, task))
         try:
             if task.cell is None:
-                found = self._svm(found)
+                found = self._do_svm(found)
             elif task.random:
-                found = self._untrained(found, task)
+                found = self._do_untrained(found, task)
             else:
-                found = self._trained(found, task, report)
+                found = self._do_cell(found, task, report)
         except DivergedError as error:
             found = msgspec.structs.replace(found, failed=str(error))
         path = outcomes.outcome_path(self.folder, task)
@@ -95,11 +95,11 @@ class Workbench:
         write_whole(path, lambda file: file.write(msgspec.json.encode(found)))
         return found
 
-    def _trained(self, found: Outcome, task: Task, report: Report) -> Outcome:
+    def _do_cell(self, found: Outcome, task: Task, report: Report) -> Outcome:
         assert task.cell is not None
         if task.cell.recipe:
-            told = self.grid.config(task, self.data)
-            once = Training(told.learning_rate, told.warmup, 0, 0.0, 0.0)
+            config = self.grid.config(task, self.data)
+            once = Training(config.learning_rate, config.warmup, 0, 0.0, 0.0)
             chosen = self._train(task, once, report)
         elif task.seed:
             first = outcomes.read_outcome(
@@ -115,13 +115,13 @@ class Workbench:
             chosen = max(growth, key=_score)
         if chosen.diverged:
             raise DivergedError("every training of it diverged")
-        run = self._run(task, chosen)
+        run = self._run_folder(task, chosen)
         best = run / ("" if task.cell.objective == SUPERVISED else "probe") / "best.pt"
-        if not best.exists():  # where only what its trainings scored was kept
+        if not best.exists():  # only the scores of its trainings were kept
             (run / outcomes.POINT).unlink()
             chosen = self._train(task, chosen, report)
         found = msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds)
-        return self._scored(found, best, self.grid.config(task, self.data))
+        return self._score_test(found, best, self.grid.config(task, self.data))
 
     def _search(self, task: Task, report: Report) -> tuple[Training, ...]:
         """Try every rate with the first warm-up, then the other warm-ups with the best.
@@ -155,7 +155,7 @@ class Workbench:
         return tuple(one for one in trials if one.updates == updates)
 
     def _grow(self, task: Task, best: Training, report: Report) -> tuple[Training, ...]:
-        """Trainings of twice as many updates each, until one gains too little."""
+        """Train with twice as many updates each time, until that gains too little."""
         growth = self.grid.growth
         points: list[Training] = []
         updates, before = growth.first, -inf
@@ -168,23 +168,23 @@ class Workbench:
         return tuple(points)
 
     def _train(self, task: Task, at: Training, report: Report) -> Training:
-        """One training, unless it is there; of a diverged one the score is 0."""
-        cell, run = task.cell, self._run(task, at)
+        """Train, or read an existing result; the score of a diverged training is 0."""
+        cell, run = task.cell, self._run_folder(task, at)
         assert cell is not None
         begin = ""
         if cell.begin:
             begun = outcomes.read_outcome(self.grid, self.folder, self.grid.begun(task))
             if begun is None or begun.chosen is None:
                 raise DivergedError(f"{cell.begin!r} diverged, and there is nothing to begin with")
-            begin = str(self._run(self.grid.begun(task), begun.chosen) / "best.pt")
+            begin = str(self._run_folder(self.grid.begun(task), begun.chosen) / "best.pt")
         config = self.grid.config(
             task, self.data, learning_rate=at.learning_rate, warmup=at.warmup, updates=at.updates,
             begin=begin,
         )  # fmt: skip
-        key = self._key(task, config)
+        key = self._settings_key(task, config)
         if (found := outcomes.read_point(run / outcomes.POINT, key)) is not None:
             return found
-        if cell.begin:  # where only its outcome was kept
+        if cell.begin:  # only the outcome of the beginning may have been kept
             assert begun is not None and begun.chosen is not None
             self._train(self.grid.begun(task), begun.chosen, report)
         timed = self.accelerator == "cpu" and not (run / "last.pt").exists()
@@ -205,12 +205,12 @@ class Workbench:
             seconds if timed else 0.0, diverged, key,
         )  # fmt: skip
         write_whole(run / outcomes.POINT, lambda file: file.write(msgspec.json.encode(done)))
-        for path in run.rglob("last.pt"):  # what is done needs not go on
+        for path in run.rglob("last.pt"):  # a finished training is not resumed
             path.unlink()
         return msgspec.structs.replace(done, key="")
 
-    def _key(self, task: Task, config: TrainingConfig) -> str:
-        """What a training's score depends on, wherever the grid lies."""
+    def _settings_key(self, task: Task, config: TrainingConfig) -> str:
+        """Return the settings that a training's score depends on, without the grid's folder."""
         settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(self.grid.sweeps)}
         settings["config"] = outcomes.training_settings(config)
         settings["config"].pop("data")
@@ -222,18 +222,18 @@ class Workbench:
             settings["probe"] = self.grid.probe
         return msgspec.json.encode(settings, order="sorted").decode()
 
-    def _run(self, task: Task, at: Training) -> Path:
+    def _run_folder(self, task: Task, at: Training) -> Path:
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
         return outcomes.runs_of(self.folder, task) / name
 
-    def _untrained(self, found: Outcome, task: Task) -> Outcome:
+    def _do_untrained(self, found: Outcome, task: Task) -> Outcome:
         run, config = outcomes.runs_of(self.folder, task), self.grid.config(task, self.data)
         best = initialise(config, run, self.splits)
         best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), splits=self.splits)
-        return self._scored(found, best, config)
+        return self._score_test(found, best, config)
 
     def splits_of(self, share: float) -> tuple[SweepSet, SweepSet]:
-        """The splits to train and to validate on, with some of the objects to train on."""
+        """Return training and validation splits, with a share of the training objects."""
         if share == 1:
             return self.splits
         if share not in self._shares:
@@ -248,18 +248,18 @@ class Workbench:
             self._shares[share] = some, validating
         return self._shares[share]
 
-    def _svm(self, found: Outcome) -> Outcome:
+    def _do_svm(self, found: Outcome) -> Outcome:
         began = time.process_time()
         right = fit_svm(*self.splits).hits(self.test)
         seconds = time.process_time() - began
         return msgspec.structs.replace(found, top1=_as_text(right), seconds=seconds)
 
-    def _scored(self, found: Outcome, best: Path, config: TrainingConfig) -> Outcome:
+    def _score_test(self, found: Outcome, best: Path, config: TrainingConfig) -> Outcome:
         model, _ = load_checkpoint(best)
         run, labels = run_on(model), self.test.sweeps.labels
         classes = len(self.test.manifest.categories)
-        # Had it to name one.
-        clean, noisy = (among(posteriors(c, run)[:, -1], classes) for c in self._windows(config))
+        # Given that the answer is a class.
+        clean, noisy = (among(posteriors(c, run)[:, -1], classes) for c in self._cut_test(config))
         known = np.zeros(0, np.bool_)
         if self.known is not None:
             drawn = drawn_as(self.known, {"window": config.window})
@@ -274,7 +274,7 @@ class Workbench:
             parameters=count_parameters(model.network),
         )
 
-    def _windows(self, config: TrainingConfig) -> tuple[list[CutWindows], list[CutWindows]]:
+    def _cut_test(self, config: TrainingConfig) -> tuple[list[CutWindows], list[CutWindows]]:
         if config.window not in self._cut:
             test = drawn_as(self.test, {"window": config.window})
             clean = list(cut_windows(test, batch=BATCH, disturbance=CLEAN))

@@ -1,4 +1,4 @@
-"""Train EAD networks: what to train (`config`, `recipes`), how (`loop`), and what comes of it.
+"""Training of EAD networks: configurations (`config`, `recipes`) and the training (`loop`).
 
     tactile-rt train data/default24 runs/mine
     tactile-rt train data/default24 runs/simclr --recipe paper-simclr --set width=0.125

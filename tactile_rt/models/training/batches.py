@@ -23,19 +23,19 @@ from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.datasets import NOISE_LEVELS, SweepSet, windows
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are drawn evenly
+CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others draw a uniform noise
 CPU = torch.device("cpu")
-AHEAD = 2  # batches that wait for the network: more only take memory
-AUGMENTED = 1  # tells the draws of frames from those of loads
-JITTER = 5  # samples either side of where a window begins, unless told otherwise
+AHEAD = 2  # batches that wait for the network: more would only take memory
+AUGMENTED = 1  # seeds the draws of frames apart from those of loads
+JITTER = 5  # samples by which a window may begin earlier or later, by default
 
 
 def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
-    """For each of some sweeps another one of the same object, any as likely; itself if alone.
+    """Draw for each sweep another one of the same object, uniformly; itself if alone.
 
     objects (n,), the object of each -> (n,) indices into it.
     """
-    order, begins = _by_object(objects, rng)
+    order, begins = _order_by_object(objects, rng)
     ends = np.r_[begins[1:], len(objects)] - 1
     following = np.arange(1, len(objects) + 1)
     following[ends] = begins  # the last of an object is followed by its first
@@ -49,16 +49,16 @@ def order_in_twos(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np
 
     objects (n,), the object of each -> (n,) indices into it; the last of an odd number is alone.
     """
-    order, begins = _by_object(objects, rng)
+    order, begins = _order_by_object(objects, rng)
     place = np.arange(len(objects)) - np.repeat(begins, np.diff(np.r_[begins, len(objects)]))
-    two = np.cumsum(place % 2 == 0) - 1  # which of all twos each belongs to
+    two = np.cumsum(place % 2 == 0) - 1  # number of the pair that each belongs to
     return np.asarray(order[np.argsort(rng.random(len(objects))[two], kind="stable")])
 
 
-def _by_object(
+def _order_by_object(
     objects: NDArray[Any], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Order sweeps by object, each one's shuffled, and say where each object begins."""
+    """Order sweeps by object, shuffled within each, and find where each object begins."""
     order = np.lexsort((rng.random(len(objects)), objects))
     in_order = objects[order]
     return order, np.flatnonzero(np.r_[True, in_order[1:] != in_order[:-1]])
@@ -67,7 +67,7 @@ def _by_object(
 def check_batches(
     objects: NDArray[np.str_], samples: int, batch: int, jitter: int, two_sweeps: bool
 ) -> None:
-    """Refuse batches that sweeps in which a touch was found, or all that there are, cannot fill.
+    """Check that the sweeps in which a touch was found can fill a batch.
 
     Args:
         objects: (sweep,) the object of each.
@@ -96,20 +96,20 @@ class TrainingBatches:
     """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
 
     A third of the windows are clean, a third carry the rated sensor noise, and a third any level;
-    what else is wrong with the sensor is drawn as the set's recipe says, or else as `SensorFaults`
-    does. A recorded sweep has the noise that it was recorded with and no other, and its own
-    baseline, as when a classifier meets it. Labels beyond the categories are those of the set's
+    other sensor faults are drawn by the amounts of the set's recipe or the defaults of
+    `SensorFaults`. A recorded sweep keeps its own noise and baseline, as a classifier would meet
+    it, and no noise is added. Labels beyond the categories are those of the set's
     `refusals`, in their order.
 
     Args:
         jitter: samples by which a window may begin earlier or later.
         two_sweeps: whether the second view of a window is of another sweep of its object.
-        kinds: those of each category; labels (batch, 3) are then of the class, the kind and the
+        kinds: the kinds of each category; labels (batch, 3) are then the class, the kind and the
             object, each -1 where a window has none, and two sweeps of an object follow each other.
         device: of the samples, offsets and sigmas; a GPU also draws the noise of the samples.
 
     Attributes:
-        easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
+        easy_epochs: The number of epochs in which noise, offset and drift rise to their amounts: a
             network that meets them at once takes far longer to learn.
     """
 
@@ -128,7 +128,7 @@ class TrainingBatches:
         self.easy_epochs = 0
         self._faults, self._refusals = data.manifest.faults, data.refusals
         starts = data.noisy_starts
-        # Too faint to be found at its noise level: learn it from where it is found without.
+        # Too faint to be found at its noise level: take the onset that is found without noise.
         self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
         self._usable = np.flatnonzero(self._starts[0] >= 0)
         touched, samples = data.sweeps.objects[self._usable], data.sweeps.values.shape[1]
@@ -143,11 +143,11 @@ class TrainingBatches:
         return len(self._usable) // self._batch
 
     def epoch(self, number: int, view: int = 0) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Batches of samples, offset, sigma (as `InputStage` takes them) and labels (batch,).
+        """Yield batches of samples, offset, sigma (as for `InputStage`) and labels (batch,).
 
         Every view of an epoch has the same sweeps in the same order, or others of the same objects
-        if `two_sweeps`, with an onset, noise, gains and dead whiskers of its own: by those alone
-        two views are not to be known as one sweep.
+        if `two_sweeps`. Each has an onset, noise, gains and dead whiskers of its own, which thus
+        cannot reveal that two views are of one sweep.
         """
         rng = np.random.default_rng([self._seed, number])
         if self._related is None:
@@ -169,7 +169,7 @@ class TrainingBatches:
         elements, channels = data.manifest.spec.shape
         faults = self._faults
         recorded = data.recorded[at]
-        level = np.float32(severity) * _noise_levels(n, faults.noise, rng)
+        level = np.float32(severity) * _draw_noise_levels(n, faults.noise, rng)
         level[recorded] = 0
         found_at = np.array(NOISE_LEVELS[: len(self._starts)])
         nearest = np.abs(level[:, None] - found_at).argmin(axis=1)
@@ -187,20 +187,20 @@ class TrainingBatches:
         if faults.dead_row:
             rows = np.array(data.manifest.spec.grid)[:, 0]
             alive &= (rng.random((n, rows.max() + 1)) >= faults.dead_row)[:, None, None, rows, None]
-        # (batch, step, sub-step, element, channel), all that is large, on the device from here on.
-        samples = self._there(windows(values, start, data.timing))
-        samples -= self._there(rest)[:, None, None]
-        samples *= self._there(gain * alive)
-        told = data.sweeps.labels[at]
-        told = np.where(told < 0, len(data.manifest.categories), told)  # the first refusal: unknown
-        labels = self._spoilt(samples, told, rng)
+        # (batch, step, sub-step, element, channel); large arrays are on the device from here on.
+        samples = self._to_device(windows(values, start, data.timing))
+        samples -= self._to_device(rest)[:, None, None]
+        samples *= self._to_device(gain * alive)
+        sound = data.sweeps.labels[at]
+        sound = np.where(sound < 0, len(data.manifest.categories), sound)  # first refusal: unknown
+        labels = self._spoil(samples, sound, rng)
         if self._related is not None:
-            related = np.where((labels == told)[:, None], self._related[at], -1)
+            related = np.where((labels == sound)[:, None], self._related[at], -1)
             labels = np.concatenate([labels[:, None], related], axis=1)
         if faults.offset or faults.drift:
-            self._wander(samples, rng, severity)
+            self._add_drift(samples, rng, severity)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
-        samples.addcmul_(self._normal(samples.shape, rng), self._there(noise)[:, None, None])
+        samples.addcmul_(self._normal(samples.shape, rng), self._to_device(noise)[:, None, None])
         # The baseline: a mean and a spread over the quiet samples that happened to come before.
         quiet = rng.integers(20, 60, (n, 1, 1))
         per_channel = (n, elements, channels)
@@ -208,10 +208,10 @@ class TrainingBatches:
         spread = 1 + rng.normal(size=per_channel) / np.sqrt(2 * (quiet - 1))
         sigma = np.maximum(noise * np.abs(spread), data.floor)
         sigma = np.where(recorded[:, None, None], baseline[1], sigma)
-        return samples, self._there(offset), self._there(sigma), torch.from_numpy(labels)
+        return samples, self._to_device(offset), self._to_device(sigma), torch.from_numpy(labels)
 
-    def _there(self, array: NDArray[Any]) -> Tensor:
-        """In single precision, on the device."""
+    def _to_device(self, array: NDArray[Any]) -> Tensor:
+        """Return an array in single precision, on the device."""
         tensor = torch.from_numpy(np.asarray(array, dtype=np.float32))
         if self._device == "cpu":
             return tensor
@@ -223,10 +223,10 @@ class TrainingBatches:
         generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**63)))
         return torch.randn(*shape, generator=generator, device=self._device)
 
-    def _spoilt(
+    def _spoil(
         self, samples: Tensor, labels: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Make some of the samples implausible, in place; (n,) the labels that all then have."""
+        """Make some of the samples implausible, in place; return the new labels (n,) of all."""
         spec, first = self._data.manifest.spec, len(self._data.manifest.categories)
         labels = labels.copy()
         names = [name for name in self._refusals if name in IMPLAUSIBLE]
@@ -236,12 +236,12 @@ class TrainingBatches:
             for number, name in enumerate(names):
                 at = np.flatnonzero(bad & (which == number))
                 spoilt = IMPLAUSIBLE[name](samples[at].cpu().numpy(), spec, rng)
-                samples[at] = self._there(spoilt)
+                samples[at] = self._to_device(spoilt)
                 labels[at] = first + self._refusals.index(name)
         return labels
 
-    def _wander(self, samples: Tensor, rng: np.random.Generator, severity: float) -> None:
-        """Add, in place, what has come to the readings since their baseline."""
+    def _add_drift(self, samples: Tensor, rng: np.random.Generator, severity: float) -> None:
+        """Add, in place, offset and drift of the readings since their baseline."""
         data, timing, n = self._data, self._data.timing, len(samples)
         course = np.arange(1, timing.samples + 1) / timing.samples
         faults = self._faults
@@ -249,13 +249,13 @@ class TrainingBatches:
             # half of the sweeps have none
             share = severity * np.maximum(rng.uniform(-1, 1, (n, 1, 1)), 0)
             size = most * share * data.noise
-            reached = self._there(size * rng.normal(size=(n, *data.manifest.spec.shape)))
+            reached = self._to_device(size * rng.normal(size=(n, *data.manifest.spec.shape)))
             # (batch, sample, element, channel)
-            samples.flatten(1, 2).addcmul_(reached[:, None], self._there(over)[:, None, None])
+            samples.flatten(1, 2).addcmul_(reached[:, None], self._to_device(over)[:, None, None])
 
 
-def _noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """(n,) noise in units of the rated: exactly none, exactly the rated, or uniform."""
+def _draw_noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Draw (n,) noise in units of the rated: exactly none, exactly the rated, or uniform."""
     which, levels = rng.random(n), largest * rng.random(n)
     levels = np.where(which < CLEAN_SHARE + RATED_SHARE, min(largest, 1.0), levels)
     levels = np.where(which < CLEAN_SHARE, 0.0, levels)
@@ -278,14 +278,13 @@ class Share:
 
 @dataclass(frozen=True)
 class Batch:
-    """What an update needs.
+    """The input of one update.
 
     Attributes:
-        views: The loads, one or two batches of them, as `InputStage` takes them, each drawn by
-            itself.
-        labels: (batch,) The index of the category of each window, or as `TrainingBatches` has
-            them of kinds.
-        generator: What the augmentation of the frames is drawn from.
+        views: One or two batches of loads, as `InputStage` takes them, each drawn by itself.
+        labels: (batch,) The index of the category of each window, or (batch, 3) as
+            `TrainingBatches` gives them with kinds.
+        generator: The generator that the augmentation of the frames draws from.
     """
 
     views: list[Loads]
@@ -307,13 +306,13 @@ class BatchFeed:
     ) -> None:
         self._batches, self._augmentation = batches, augmentation
         self._views, self._seed, self._share, self._device = views, seed, share, device
-        self.waited = 0.0  # s, by the network for the present epoch's batches
+        self.waited = 0.0  # s that the network has waited for the present epoch's batches
 
     def __len__(self) -> int:
         return len(self._batches)
 
     def epoch(self, number: int) -> Yields[Batch, None, None]:
-        """The batches of an epoch."""
+        """Yield the batches of an epoch."""
         self.waited = 0.0
         with closing(prefetched(lambda: self._draw(number))) as ready:
             while True:
@@ -339,7 +338,7 @@ class BatchFeed:
 
 
 def generator_of(device: torch.device, *seed: int) -> Generator:
-    """A generator that any numbers seed."""
+    """Make a generator seeded by any numbers."""
     word = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> np.uint64(1))
     return Generator(device).manual_seed(word)
 
@@ -347,14 +346,14 @@ def generator_of(device: torch.device, *seed: int) -> Generator:
 def prefetched(
     draw: Callable[[], Iterator[Batch]], ahead: int = AHEAD
 ) -> Yields[Batch, None, None]:
-    """The items of `draw()`, made in a thread of their own, at most so many ahead.
+    """Yield the items of `draw()`, made in another thread at most `ahead` in advance.
 
-    What is raised there is raised here; the thread ends when the iteration is left.
+    Exceptions of the thread are raised here; it ends when the iteration is left.
     """
     ready: queue.Queue[Batch | BaseException | None] = queue.Queue(ahead)
     left = threading.Event()
 
-    def put(item: Batch | BaseException | None) -> None:
+    def enqueue(item: Batch | BaseException | None) -> None:
         while not left.is_set():
             with suppress(queue.Full):
                 ready.put(item, timeout=0.1)
@@ -363,12 +362,12 @@ def prefetched(
     def work() -> None:
         try:
             for item in draw():
-                put(item)
+                enqueue(item)
                 if left.is_set():
                     return
-            put(None)
+            enqueue(None)
         except BaseException as error:
-            put(error)
+            enqueue(error)
 
     thread = threading.Thread(target=work, name="batches", daemon=True)
     thread.start()

@@ -1,6 +1,6 @@
-"""What to train and how, the whole of a run's `config.json`; and how to probe what was trained.
+"""Configurations of a training, which is all of a run's `config.json`, and of a probe.
 
-Needs no torch, so that what cannot be is refused before it is loaded.
+Needs no torch, so that invalid values are refused before torch is loaded.
 """
 
 from collections.abc import Mapping
@@ -35,39 +35,38 @@ LARGEST = 1e38  # numbers of single precision end there
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """What to train and how; the defaults are the shipped model's recipe.
+    """The configuration of a training; the defaults are the shipped model's recipe.
 
     Attributes:
-        also: The folders of further sweep sets of the same array, which are learnt from together;
-            what is wrong with the sensor is drawn as the first set's recipe says.
-        begin: A checkpoint to begin with, of the same array and network; what it tells apart that
-            is not to be told apart now is forgotten, and what is new learnt from nothing. Empty: a
-            network that knows nothing.
+        also: The folders of further sweep sets of the same array to train on together; sensor
+            faults are drawn by the first set's recipe.
+        begin: A checkpoint to begin with, of the same array and network; its labels that are not
+            trained now are dropped, and new labels begin untrained. Empty: an untrained network.
         encoder, attender, decoder, width, readout, dropout, graph, norm_epsilon, preprocessing:
             Fields of the network, as in `EADConfig`.
         first_weights: The weights that a graph's training begins with: "kaiming", or "paper", as
             `graph_encoder.draw_as_published` draws them.
-        window: The first sample of a window: "onset", where the runtime's detector hears the touch,
-            or "sweep", where the object sets out (the paper).
+        window: The first sample of a window: "onset", where the runtime's detector finds contact,
+            or "sweep", where the object starts to move (the paper).
         jitter: The number of samples by which a window may begin earlier or later.
-        faults: The sensor's faults that are drawn each time that a sweep is taken; None: those that
-            the set's recipe says.
+        faults: The sensor faults that are drawn each time that a sweep is taken; None: those of the
+            set's recipe.
         objective: The objective: "supervised", or self-supervised "simclr", "simsiam",
             "autoencoder", "predictive".
         loss: The loss of the supervised objective: "anytime" (half of it on the last step, half on
-            all steps that can know anything) or "last" (the paper's: the last step alone).
+            all steps that an input has reached) or "last" (the paper's: the last step alone).
         augmentation: The augmentation, a name that `augmentation.build` takes; two views of a
-            window differ by this, by onset and by what is wrong with the sensor.
-        pairs: What the two views of "simclr" and "simsiam" are of: "one-sweep", the same window
+            window differ by this, by onset and by sensor faults.
+        pairs: The source of the two views of "simclr" and "simsiam": "one-sweep", the same window
             twice, or "two-sweeps", windows of two sweeps of the same object, as a robot has them
-            that touches a thing twice.
-        temperature: The temperature of "simclr" and of `identity`: a similarity counts divided by
-            it. 0.1 in the paper; where two views are hard to tell as a pair, as two sweeps are, a
-            higher one.
+            that touches an object twice.
+        temperature: The temperature of "simclr" and of `identity`, by which similarities are
+            divided: 0.1 in the paper; higher where pairs of views are hard to match, as those of
+            two sweeps are.
         names: The weight of the cross-entropy over the kinds of a sweep's class, of objects that
             have a kind, beside that over classes (supervised).
-        identity: The weight of a supervised contrast between objects, of which any two sweeps are
-            a pair, that trains an embedding (supervised).
+        identity: The weight of a supervised contrast between objects, which trains an embedding;
+            any two sweeps of an object are a pair (supervised).
         masking: The share of the steps of a window that is blanked, from 0 to less than 1.
         optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
             `updates`.
@@ -80,8 +79,8 @@ class TrainingConfig:
             0.1.
         drop_every: The share of all updates between tenfold drops of the schedule "step";
             StepLR(30) of 100 epochs is 0.3.
-        easy: The share of all epochs in which noise, offset and drift rise from nothing to what the
-            set's recipe says.
+        easy: The share of all epochs in which noise, offset and drift rise from 0 to the amounts of
+            the set's recipe.
         updates: The number of updates to stop after, whatever `epochs` says; 0 leaves it to
             `epochs`.
         batch: The number of sweeps per update, of all devices together.
@@ -92,7 +91,7 @@ class TrainingConfig:
         seed: The seed of the weights, the windows, the noise and the augmentation.
 
     Raises:
-        ConfigError: a value that cannot be.
+        ConfigError: an invalid value.
     """
 
     data: str
@@ -175,26 +174,26 @@ class TrainingConfig:
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """Where the sets lie that are learnt from."""
+        """Folders of the sets to train on."""
         return tuple(map(Path, (self.data, *self.also)))
 
     @property
     def labelled(self) -> bool:
-        """Whether it is learnt from labels."""
+        """True if the training uses labels."""
         return self.objective == "supervised"
 
     @property
     def related(self) -> bool:
-        """True if kinds or objects are learnt, beside classes."""
+        """True if kinds or objects are learnt beside classes."""
         return self.names > 0 or self.identity > 0
 
     def check_sets(self) -> None:
-        """Refuse sets that cannot be learnt from so, before anything of them is read.
+        """Check that the sets can be trained on, before their sweeps are read.
 
         Raises:
-            ConfigError: it names no network, its sets cannot be joined, or one has no labels to
-                learn from.
-            RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+            ConfigError: there is no such network, the sets cannot be joined, or one has no labels
+                to learn from.
+            RecordingError: a set is missing, is no sweep set, or has an invalid split.
         """
         _, whole = read_manifests(self.folders, self.labelled)
         self.network(len(whole.categories), whole.frame)
@@ -202,7 +201,7 @@ class TrainingConfig:
     def network(
         self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME, names: int = 0
     ) -> EADConfig:
-        """The network's configuration for so many classes and names and for frames of a size.
+        """Return the network's configuration for numbers of classes and names and a frame size.
 
         Raises:
             ConfigError: there is no such network.
@@ -213,20 +212,20 @@ class TrainingConfig:
 
 
 def as_json(config: TrainingConfig) -> dict[str, Any]:
-    """Turn it into what a file has, which knows no tuples."""
+    """Return a configuration as JSON values, which have no tuples."""
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(config)))
     return plain
 
 
 def begin_run(config: TrainingConfig, folder: Path) -> None:
-    """Make the folder of a run, or check that the one that is there is of this very run.
+    """Make a run's folder, or check that the existing one is of this run.
 
     Raises:
-        ConfigError: it is of another configuration, or of none that is known.
+        ConfigError: the folder is of another configuration, or of an unknown one.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path, mine = folder / "config.json", as_json(config)
-    # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
+    # Before its first epoch is finished, a run has nothing to lose: its options may change.
     if not (folder / "last.pt").exists():
         text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
         write_whole(path, lambda file: file.write(text))
@@ -241,15 +240,15 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
     keys = {**mine, **theirs}
-    if differing := [key for key in keys if not _same(key, theirs.get(key), mine.get(key))]:
+    if differing := [key for key in keys if not _equal(key, theirs.get(key), mine.get(key))]:
         raise ConfigError(
             f"{folder} holds a run of another configuration (other {name_some(differing)}): choose "
             "another folder, or repeat the options that began it"
         )
 
 
-def _same(key: str, one: Any, other: Any) -> bool:
-    """Compare two values of a key; a path may be spelt in several ways."""
+def _equal(key: str, one: Any, other: Any) -> bool:
+    """Return whether two values of a key are equal; paths may be spelt differently."""
     if key in PATHS and one and other:
         names = [[value] if isinstance(value, str) else value for value in (one, other)]
         one, other = ([str(Path(name).resolve()) for name in some] for some in names)
@@ -258,7 +257,7 @@ def _same(key: str, one: Any, other: Any) -> bool:
 
 @dataclass(frozen=True)
 class ProbeConfig:
-    """The paper's probe, but for `standardise`.
+    """The configuration of a probe: the paper's, except for `standardise`.
 
     Attributes:
         data: The folder of the sweep set; empty takes the one that the network was trained on.
@@ -266,7 +265,7 @@ class ProbeConfig:
         standardise: Whether to fit on features of zero mean and unit variance, folded into the
             layer afterwards; the paper does not, and features that are small then hardly train.
         readout: The steps to fit on: "last" takes the last step (the paper), "mean" the mean of all
-            steps that can know anything, which is the only fair one for a network without memory.
+            steps that an input has reached, the only fair choice for a network without memory.
         seed: The seed of the layer, the windows and their order.
     """
 
@@ -303,15 +302,15 @@ def _check_seed(seed: int) -> None:
 
 
 class DivergedError(ModelError):
-    """A training whose gradients are no numbers any more: a lower rate may help."""
+    """A diverged training, whose gradients are not finite: a lower rate may help."""
 
 
 @dataclass
 class Progress:
-    """What a run reports after every update and every epoch.
+    """The report of a run after every update and every epoch.
 
-    `metrics`, after an epoch: what a line of `history.csv` holds, and `waiting`, the share of the
-    epoch that was spent waiting for data.
+    `metrics`, after an epoch: the values of its line of `history.csv`, and `waiting`, the share of
+    the epoch that was spent waiting for data.
     """
 
     epoch: int

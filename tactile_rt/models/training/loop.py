@@ -1,7 +1,7 @@
-"""Train an EAD network on a sweep set, from top to bottom.
+"""Training of an EAD network on a sweep set.
 
-A run that is killed goes on from its last finished epoch and ends with the same numbers as one
-that was not. Under torchrun every process has a share of each batch:
+A run that was killed resumes after its last finished epoch and ends with the same numbers as an
+uninterrupted one. Under torchrun every process has a share of each batch:
 
     torchrun --nproc-per-node 2 --no-python tactile-rt train data/default24 runs/mine
 """
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
-VIEWS, FRAMES = 2**32, 2**32 + 1  # epochs that no training reaches: their draws are others
+VIEWS, FRAMES = 2**32, 2**32 + 1  # epochs that no training reaches: other draws
 Score = tuple[dict[str, float], float]
 
 
@@ -65,11 +65,11 @@ def train(
     device: str = "auto",
     splits: Splits | None = None,
 ) -> Path:
-    """Train, or go on with a run that was interrupted; returns the best checkpoint.
+    """Train, or resume a run that was interrupted; return the path of the best checkpoint.
 
     Args:
         device: "auto" (an accelerator if there is one), "cpu", "cuda", ...
-        splits: what `read_splits` gives, where many runs share it.
+        splits: the result of `read_splits`, if several runs share it.
 
     Raises:
         ConfigError: the folder holds a run of another configuration, another process trains in it,
@@ -110,7 +110,7 @@ def _train(
     run = RunState(objective, config, len(batches))
     settings = as_json(config)
     if fabric.is_global_zero:
-        begin_run(config, folder)  # when all that may be refused has been
+        begin_run(config, folder)  # after all checks
     fabric.barrier()
     run.resume(folder)
     wrapped, _ = fabric.setup(objective, run.optimizer)
@@ -130,7 +130,7 @@ def _train(
                 norm = fabric.clip_gradients(
                     wrapped, run.optimizer, max_norm=most, error_if_nonfinite=False
                 )
-                # Clipping would turn it into silence or NaN.
+                # Clipping would turn it into zeros or NaN.
                 if norm is None or not torch.isfinite(norm):
                     raise DivergedError(
                         f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
@@ -146,14 +146,14 @@ def _train(
             for buffer in objective.buffers():  # batch norm's means are each device's own
                 torch.distributed.broadcast(buffer, 0)
         found, score = fabric.broadcast(validate(objective))
-        if not isfinite(score):  # nothing would ever be better
+        if not isfinite(score):  # no later score would be higher
             raise DivergedError(
                 f"{folder}: training diverged in epoch {epoch + 1} (validation {score}); try a "
                 f"learning rate below {config.learning_rate:g}"
             )
         metrics = {
             "epoch": epoch + 1,
-            "loss": _mean(fabric, losses),
+            "loss": _mean_loss(fabric, losses),
             **found,
             "seconds": time.monotonic() - began,
         }
@@ -172,7 +172,7 @@ def _train(
 
 
 def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:
-    """A run's network as it is before its first update, as a `best.pt`; of the same seed."""
+    """Write a run's network before its first update as a `best.pt`; return the path."""
     torch.manual_seed(config.seed)
     training, _ = _take_splits(config, splits)
     model = build_objective(config, training).model
@@ -184,14 +184,14 @@ def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = Non
 
 
 def _take_splits(config: TrainingConfig, splits: Splits | None) -> Splits:
-    """The splits to train and to validate on, as a configuration draws them."""
+    """Return training and validation splits with a configuration's window and faults."""
     training, validating = splits or read_splits(config.folders, config.labelled)
     drawn = asdict(config)
     return drawn_as(training, drawn), drawn_as(validating, drawn)
 
 
-def _mean(fabric: "Fabric", losses: list[float]) -> float:
-    """Over an epoch's updates and all devices, each of which has its share of every batch."""
+def _mean_loss(fabric: "Fabric", losses: list[float]) -> float:
+    """Return the mean loss over an epoch's updates and all devices, which share every batch."""
     mean = float(np.mean(losses))
     if fabric.world_size == 1:
         return mean
@@ -202,7 +202,7 @@ def _mean(fabric: "Fabric", losses: list[float]) -> float:
 
 @contextmanager
 def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
-    """The devices of a run, together until the block ends.
+    """Launch the devices of a run, which stay together until the block ends.
 
     Args:
         device: "auto", "cpu", "cuda", ...
@@ -210,7 +210,7 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
     Raises:
         ConfigError: a batch is too small to be shared, or there is no such device here.
     """
-    # Imported here: seconds that whoever only loads a checkpoint need not spend.
+    # Imported here: it takes seconds, which loading a checkpoint need not spend.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from lightning.fabric import Fabric
@@ -220,20 +220,20 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
     local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if (config.batch < 2 * size and config.objective != "supervised") or config.batch < size:
         raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
-    for name in ("lightning.fabric", "lightning.pytorch"):  # a run says enough itself
+    for name in ("lightning.fabric", "lightning.pytorch"):  # a run reports enough itself
         logging.getLogger(name).setLevel(logging.WARNING)
-    # Of kernels of 1 x 1, whose numbers lie alike whichever strides they are told to have.
+    # From 1 x 1 kernels, whose numbers lie alike under both strides.
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
     try:
         fabric = Fabric(
             accelerator=device,
             devices=local,
             num_nodes=size // local,
-            # Static: some layers of some networks (a position never reached) have no part in a
+            # Static: some layers of some networks (a position never reached) are not used in a
             # window, and always the same ones.
             strategy=DDPStrategy(static_graph=True) if size > 1 else "auto",
         )
-    # no such kind; none of it in this machine; none of what it needs
+    # no such kind; none in this machine; a package that it needs is missing
     except (ValueError, RuntimeError, ModuleNotFoundError) as error:
         raise ConfigError(f"accelerator is {device!r}: {error}") from None
     joined = torch.distributed.is_available() and torch.distributed.is_initialized()
@@ -246,14 +246,14 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
 
 
 class Validation:
-    """Measures an objective on the validation split.
+    """Measurement of an objective on the validation split.
 
     Supervised: top-1 without and with rated noise; the score is their mean, since a robot's
     sensor is somewhere between, or the former alone where training draws no noise. Self-supervised:
-    the loss, augmented alike every time; the score is its negative.
+    the loss, with the same augmentation every time; the score is its negative.
 
     Args:
-        share: this device's of every batch.
+        share: this device's share of every batch.
     """
 
     def __init__(
@@ -278,13 +278,13 @@ class Validation:
             usable = self._usable = np.flatnonzero(self._found.start >= 0)
             if not len(usable):
                 raise ConfigError("in no validation sweep was a touch found: make more sweeps")
-            self._other = np.arange(len(data.sweeps))  # what the second view is of
+            self._other = np.arange(len(data.sweeps))  # the sweep of the second view
             if config.pairs == TWO_SWEEPS:
                 rng = np.random.default_rng([config.seed, VIEWS])
                 self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
 
     def __call__(self, objective: Objective) -> Score:
-        """Metrics by name, and the score: the higher the better; NaN if it answers no numbers."""
+        """Return metrics by name and a score to maximise; NaN if outputs are not finite."""
         objective.eval()
         return self._measure(objective)
 
@@ -296,15 +296,15 @@ class Validation:
             answers = posteriors(cut, run)[:, -1]
             touched = np.concatenate([one.detected for one in cut])
             if not np.isfinite(answers[touched]).all():
-                return {}, nan  # it overflows: no gradient says so, if training's windows do not
-            # Whether a model may refuse to decide is another question.
+                return {}, nan  # overflow; gradients show it only in training's windows
+            # Refusals are left out: they are measured elsewhere.
             shares.append(hits(among(answers, classes), labels).mean())
         clean, noisy = shares
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
         return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
 
-    def _cut(self, at: NDArray[np.int64]) -> Loads:
-        """This device's share of some sweeps' windows, as `InputStage` takes them."""
+    def _cut_share(self, at: NDArray[np.int64]) -> Loads:
+        """Cut this device's share of some sweeps' windows, as `InputStage` takes them."""
         cut = windows(self._data.sweeps.values[at], self._found.start[at], self._data.timing)
         arrays = cut, self._found.offset[at], self._found.sigma[at]
         samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
@@ -313,14 +313,14 @@ class Validation:
     @torch.inference_mode()
     def _loss(self, objective: Objective) -> Score:
         data, config = self._data, self._config
-        # Whole batches, as far as there are any: a contrast is as hard as its batch is large.
+        # Whole batches if possible: a contrast is harder in a larger batch.
         parts = max(len(self._usable) // config.batch, 1)
         total = torch.zeros((), device=self._device)
         for index, at in enumerate(np.array_split(self._usable, parts)):
             place = index, self._share.rank
             drawn = generator_of(torch.device("cpu"), config.seed, VIEWS, *place)
             views = [
-                self._augmentation.loads(self._cut(one), drawn)
+                self._augmentation.loads(self._cut_share(one), drawn)
                 for one in (at, self._other[at])[: objective.views]
             ]
             views = [

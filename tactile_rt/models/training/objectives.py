@@ -1,22 +1,22 @@
-"""What a network is trained for: categories, contrasts of two views, or rebuilding the window.
+"""Objectives of a training: categories, contrasts of two views, or rebuilding the window.
 
-An objective is a module that holds the network and its own heads, which are thrown away after the
+An objective is a module that holds the network and its own heads, which are discarded after the
 training.
 
     objective(views, labels, generator) -> loss
 
-`views` are one or two batches of loads (samples, offset, sigma) as `TactileClassifier` takes them,
-`Objective.views` says how many; labels (batch,) count for the supervised objective alone, which
-takes those of kind and object, too (batch, 3). It is done in two: `see` makes the frames, whose
+`views` are `Objective.views` batches of loads (samples, offset, sigma), one or two, as
+`TactileClassifier` takes them; labels (batch,) matter to the supervised objective alone, which also
+takes those of kind and object (batch, 3). Two methods share the work: `see` makes the frames, whose
 augmentation it draws from the generator, and `loss` draws nothing but dropout.
 
 - `Supervised`: cross-entropy with the category, with the kind inside of it, and a supervised
   contrast between objects (Khosla et al. 2020).
-- `SimCLR` (Chen et al. 2020): two views of a window are to be found among all others' views.
-- `SimSiam` (Chen and He 2021): one view predicts the other, which does not look back.
+- `SimCLR` (Chen et al. 2020): each view of a window is to be matched to the other among all.
+- `SimSiam` (Chen and He 2021): one view predicts the other, whose gradient is stopped.
 - `Autoencoder` (Olshausen and Field 1996): sparse features of each step rebuild its frame.
-- `Predictive` (autoregressive predictive coding, Chung et al. 2019): the features of each step tell
-  the frames of steps that are still to come.
+- `Predictive` (autoregressive predictive coding, Chung et al. 2019): the features of each step
+  predict the frames of later steps.
 
 At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
 2025-tactile-whisking).
@@ -38,18 +38,18 @@ from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_publi
 from tactile_rt.models.training.config import TrainingConfig
 
 # Sizes of the heads, at width 1.
-CONTRASTED = (2048, 128)  # SimCLR's neck: inside, and what comes out
-LEAST = 32  # the neck's output at any width: fewer directions cannot tell a batch apart
+CONTRASTED = (2048, 128)  # SimCLR's neck: hidden and output
+LEAST = 32  # the neck's output at any width: fewer directions cannot separate a batch
 PROJECTED, BOTTLENECK = 2048, 512  # SimSiam's projector and predictor
 NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
 DECONVOLUTIONS = 3
-PREDICTED = 4  # steps from each on that `Predictive` tells
-OUTSIDE = -1e4  # the logit of a kind that is none of the class
+PREDICTED = 4  # steps ahead that `Predictive` predicts
+OUTSIDE = -1e4  # the logit of a kind of another class
 SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
 
 
 def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
-    """Build the network of a configuration and what it is trained for.
+    """Build the network of a configuration with its objective.
 
     Raises:
         ConfigError: there is no such network, or the array cannot be augmented so.
@@ -74,7 +74,7 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
             model, augmentation, config.loss, config.label_smoothing, class_of,
             config.names, config.identity, config.temperature,
         )  # fmt: skip
-    model.network.decoder.requires_grad_(False)  # it has no part in these
+    model.network.decoder.requires_grad_(False)  # self-supervised objectives do not use it
     if config.objective == "simclr":
         return SimCLR(model, augmentation, config.temperature)
     others = {"simsiam": SimSiam, "autoencoder": Autoencoder, "predictive": Predictive}
@@ -82,7 +82,7 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
 
 
 class Objective(nn.Module):
-    """A network and what it is trained for.
+    """A network and the loss that it is trained by.
 
     Attributes:
         views: The number of times that an update sees each window, each time augmented afresh.
@@ -96,14 +96,14 @@ class Objective(nn.Module):
         self.augmentation = augmentation
 
     def frames(self, loads: Loads, generator: Generator) -> Tensor:
-        """Augmented frames of a batch, (batch, step, sub-step * channel, row, column)."""
+        """Return augmented frames of a batch, (batch, step, sub-step * channel, row, column)."""
         return self.augmentation.frames(self.model.inputs(*loads), generator)
 
     def embedding(self, frames: Tensor) -> Tensor:
-        """(batch, feature): what encoder and attender make of windows (batch, step, ...).
+        """Return features (batch, feature) of windows (batch, step, ...), after the attender.
 
-        By the last step, or, where the network's readout is "mean", on average over all steps
-        that can know anything.
+        Those of the last step or, if the network's readout is "mean", the mean over all steps
+        that an input has reached.
         """
         features = self.model.features(frames)
         network = self.model.network
@@ -112,7 +112,7 @@ class Objective(nn.Module):
         return features[:, -1]
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
-        """Make what `loss` takes of a batch: the augmented frames of every view.
+        """Return the input of `loss`: the augmented frames of every view.
 
         Args:
             views: `self.views` batches of loads, SI.
@@ -121,16 +121,16 @@ class Objective(nn.Module):
         return [mask(self.frames(view, generator), generator) for view in views]
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
-        """The loss of a batch of what `see` gave and labels (batch,)."""
+        """Return the loss of a batch from the result of `see` and labels (batch,)."""
         raise NotImplementedError
 
     def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        """The loss of a batch; arguments as `see` and `loss` take them."""
+        """Return the loss of a batch; arguments as for `see` and `loss`."""
         return self.loss(self.see(views, generator), labels)
 
 
 def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> Tensor:
-    """Half the cross-entropy of the last step, half the mean of all steps that can know anything.
+    """Average the last step's cross-entropy and the mean of all steps after the lag.
 
     logits (batch, step, class), labels (batch,) -> scalar. The first `lag` steps, before any input
     has reached the output, would only teach the prior. A label of -1 counts as no loss.
@@ -148,7 +148,7 @@ def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> 
 
 
 def last_loss(logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
-    """The cross-entropy of the last step, as published; shapes as above."""
+    """Return the cross-entropy of the last step, as published; shapes as above."""
     each = F.cross_entropy(
         logits[:, -1].float(), labels, reduction="none", ignore_index=-1, label_smoothing=smoothing
     )
@@ -156,10 +156,10 @@ def last_loss(logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
 
 
 def identity_loss(embedding: Tensor, objects: Tensor, temperature: float) -> Tensor:
-    """Contrast embeddings: those of one object are to be found among all (Khosla et al. 2020).
+    """Contrast embeddings of one object with those of all others (Khosla et al. 2020).
 
     embedding (n, unit) of length 1, objects (n,), -1: of none -> scalar, the mean over all that
-    have another of their object. Their cosines count divided by the temperature.
+    have another of their object. Cosines are divided by the temperature.
     """
     itself = torch.eye(len(objects), dtype=torch.bool, device=objects.device)
     same = (objects[:, None] == objects) & (objects >= 0) & ~itself
@@ -170,13 +170,13 @@ def identity_loss(embedding: Tensor, objects: Tensor, temperature: float) -> Ten
 
 
 class Supervised(Objective):
-    """Categories, and of labels (batch, 3) kinds and objects.
+    """Classification of categories and, with labels (batch, 3), of kinds and objects.
 
     Args:
         loss: "anytime" or "last".
-        class_of: (name,) the class of each kind; a kind is sought among those of its class alone.
+        class_of: (name,) the class of each kind; a kind competes only with those of its class.
         names, identity: weights of the losses of kinds and of objects.
-        temperature: of the latter.
+        temperature: of the loss of objects.
     """
 
     class_of: Tensor
@@ -214,7 +214,7 @@ class Supervised(Objective):
                 loss = loss + self._names * self._entropy(own, names, 0.0) / share
             if self._identity:
                 rows = torch.cat([found["embedding"][:, -1], objects[:, None].float()], dim=1)
-                rows = _of_all_devices(rows)
+                rows = _gather_rows(rows)
                 contrast = identity_loss(rows[:, :-1], rows[:, -1], self._temperature)
                 loss = loss + self._identity * contrast
             return loss
@@ -226,10 +226,10 @@ class Supervised(Objective):
 
 
 def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:
-    """Normalised temperature-scaled cross-entropy: of 2 n views, which is the other of the pair?
+    """Return the normalised temperature-scaled cross-entropy of matching 2 n views in pairs.
 
-    first, second (n, feature): the two views of each of n windows -> scalar. Their cosines count
-    divided by the temperature.
+    first, second (n, feature): the two views of each of n windows -> scalar. Cosines are divided by
+    the temperature.
     """
     z = F.normalize(torch.cat([first, second]).float(), dim=1)
     n = len(first)
@@ -239,9 +239,9 @@ def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:
 
 
 class SimCLR(Objective):
-    """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is thrown away afterwards.
+    """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is discarded afterwards.
 
-    Both views are one batch, to batch norms in the network, too.
+    Both views are one batch, also for batch norms in the network.
     """
 
     views = 2
@@ -252,8 +252,8 @@ class SimCLR(Objective):
         super().__init__(model, augmentation)
         self._temperature = temperature
         width, features = model.network.config.width, model.network.feature_size
-        hidden, out = _scaled(CONTRASTED[0], width), _scaled(CONTRASTED[1], width, LEAST)
-        self.neck = _normed(features, hidden, out, bias=False)
+        hidden, out = _scale(CONTRASTED[0], width), _scale(CONTRASTED[1], width, LEAST)
+        self.neck = _stack(features, hidden, out, bias=False)
         for layer in self.neck:
             if isinstance(layer, nn.Linear):
                 nn.init.normal_(layer.weight, std=NECK_SPREAD)
@@ -261,19 +261,19 @@ class SimCLR(Objective):
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         first, second = self.neck(self.embedding(torch.cat(list(seen)))).chunk(2)
         with _in_single_precision(first):
-            return nt_xent(_of_all_devices(first), _of_all_devices(second), self._temperature)
+            return nt_xent(_gather_rows(first), _gather_rows(second), self._temperature)
 
 
-def _of_all_devices(rows: Tensor) -> Tensor:
-    """The rows of every device's share of the batch: more negatives than one's own."""
+def _gather_rows(rows: Tensor) -> Tensor:
+    """Gather the rows of all devices' shares of the batch, for more negatives."""
     if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
         return rows
-    gathered: Tensor = _Gathered.apply(rows)  # type: ignore[no-untyped-call]
+    gathered: Tensor = _GatheredRows.apply(rows)  # type: ignore[no-untyped-call]
     return gathered
 
 
-class _Gathered(torch.autograd.Function):
-    """Every device's rows, of which each learns from the losses of all."""
+class _GatheredRows(torch.autograd.Function):
+    """The rows of all devices; the gradient of each sums the losses of all."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor) -> Tensor:
@@ -296,9 +296,9 @@ class SimSiam(Objective):
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
         super().__init__(model, augmentation)
         width, features = model.network.config.width, model.network.feature_size
-        out, hidden = _scaled(PROJECTED, width), _scaled(BOTTLENECK, width)
-        self.projector = _normed(features, out, out, out)
-        self.predictor = nn.Sequential(*_normed(out, hidden), nn.ReLU(), nn.Linear(hidden, out))
+        out, hidden = _scale(PROJECTED, width), _scale(BOTTLENECK, width)
+        self.projector = _stack(features, out, out, out)
+        self.predictor = nn.Sequential(*_stack(out, hidden), nn.ReLU(), nn.Linear(hidden, out))
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         first, second = (self.projector(self.embedding(frames)) for frames in seen)
@@ -308,12 +308,12 @@ class SimSiam(Objective):
 
 
 def _distance(prediction: Tensor, target: Tensor) -> Tensor:
-    """Negative cosine similarity, the target taken as given; (batch, feature) each -> scalar."""
+    """Return the negative cosine similarity to a fixed target; (batch, feature) -> scalar."""
     return -F.cosine_similarity(prediction.float(), target.detach().float(), dim=1).mean()
 
 
 class Autoencoder(Objective):
-    """A linear layer to the grid and three 3 x 3 deconvolutions rebuild each step's frame.
+    """Reconstruction of each step's frame by a linear layer and three 3 x 3 deconvolutions.
 
     loss = 0.5 mean squared error of the (normalised) frames + 1e-4 mean |features|
     """
@@ -340,12 +340,11 @@ class Autoencoder(Objective):
 
 
 class Predictive(Objective):
-    """From what each step has felt, a linear layer tells the frames of the next four steps.
+    """Prediction of the next four steps' frames from each step's features by a linear layer.
 
-    A network never sees later steps, so all that is to come is hidden from it at every step at
-    once, and steps that are masked are predicted all the same. The loss is the mean squared error
-    of the normalised frames, over all that the steps that can know anything tell of later ones in
-    the window.
+    A network never sees later steps, so they are hidden from every step at once; masked steps are
+    predicted all the same. The loss is the mean squared error of the normalised frames, over all
+    predictions of later steps in the window by steps that an input has reached.
     """
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
@@ -354,35 +353,35 @@ class Predictive(Objective):
         self.head = nn.Linear(model.network.feature_size, PREDICTED * channels * rows * columns)
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
-        """The frames that are to be told, and those that the network sees."""
+        """Return the frames to predict, and those that the network sees."""
         (frames,) = (self.frames(view, generator) for view in views)
         return [frames, self.augmentation.mask(frames, generator)]
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         frames, shown = seen  # (batch, step, channel, row, column) each
-        told = self.head(self.model.features(shown)).unflatten(-1, (PREDICTED, -1))
+        predicted = self.head(self.model.features(shown)).unflatten(-1, (PREDICTED, -1))
         flat, first = frames.flatten(2), self.model.network.lag
         with _in_single_precision(frames):
             errors = [
-                (told[:, first:-n, n - 1].float() - flat[:, first + n :].float()).square()
+                (predicted[:, first:-n, n - 1].float() - flat[:, first + n :].float()).square()
                 for n in range(1, PREDICTED + 1)
             ]
             return torch.cat(errors, dim=1).mean()
 
 
 def _in_single_precision(like: Tensor) -> torch.autocast:
-    """Compute losses in it: mixed precision ends at the network's output."""
+    """Return a single-precision context: mixed precision ends at the network's output."""
     return torch.autocast(like.device.type, enabled=False)
 
 
-def _normed(*sizes: int, bias: bool = True) -> nn.Sequential:
-    """Linear layers of these sizes, each with a batch norm, and a ReLU between two."""
+def _stack(*sizes: int, bias: bool = True) -> nn.Sequential:
+    """Build linear layers of these sizes, each with a batch norm, and ReLUs between."""
     layers: list[nn.Module] = []
     for of, to in pairwise(sizes):
         layers += [nn.Linear(of, to, bias), nn.BatchNorm1d(to), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 
 
-def _scaled(size: int, width: float, least: int = 1) -> int:
-    """A layer's size at the network's width."""
+def _scale(size: int, width: float, least: int = 1) -> int:
+    """Return a layer's size at the network's width."""
     return max(round(size * width), least)

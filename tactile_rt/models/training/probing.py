@@ -33,12 +33,12 @@ def probe(
     report: Callable[[Progress], None] = lambda _: None,
     splits: tuple[SweepSet, SweepSet] | None = None,
 ) -> Path:
-    """Fit a linear layer on a frozen network's features; returns a classifier's `best.pt`.
+    """Fit a linear layer on a frozen network's features; return a classifier's `best.pt`.
 
     The layer of the best epoch by the validation split is kept.
 
     Args:
-        splits: what `read_splits` gives, where many runs share it.
+        splits: the result of `read_splits`, if several runs share it.
 
     Raises:
         ModelError: no checkpoint.
@@ -54,16 +54,16 @@ def probe(
             check_split(path, manifest)
             splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
             check_sets(path, splits)
-        # a layer over categories learns nothing of what is refused
+        # the layer is over categories alone, without refusals
         data, validation = (of_categories(drawn_as(one, saved["config"])) for one in splits)
         torch.manual_seed(config.seed)
         jitter = saved["config"].get("jitter", JITTER)
-        touched = int((data.noisy_starts[0] >= 0).sum())  # a few of few sweeps may be silent
+        touched = int((data.noisy_starts[0] >= 0).sum())  # in a small set some sweeps may be silent
         batches = TrainingBatches(data, max(min(WINDOWS, touched), 1), config.seed, jitter)
         begin = trained.network.encoder.lag if config.readout == "mean" else -1
-        drawn = [(_features(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
+        drawn = [(_extract(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
         features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
-        classes, held_out = len(manifest.categories), _validation(trained, begin, validation)
+        classes, held_out = len(manifest.categories), _extract_clean(trained, begin, validation)
         layer, history = linear_probe(features, labels, *held_out, classes, config)
         network = replace(
             trained.network.config, classes=classes, decoder="linear", readout=config.readout,
@@ -86,11 +86,11 @@ def probe(
         folder.mkdir(parents=True, exist_ok=True)
         for line in history:
             log_epoch(folder / "history.csv", line)
-        told = {
+        settings = {
             **saved["config"], "data": str(path), "also": (), "begin": "", "probe": asdict(config)
         }  # fmt: skip
         met = trained_objects([manifest], saved)
-        save_whole(folder / "best.pt", fill_checkpoint(model, manifest, (), told, met, metrics))
+        save_whole(folder / "best.pt", fill_checkpoint(model, manifest, (), settings, met, metrics))
         report(Progress(config.epochs, config.epochs, 1, 1, metrics["loss"], metrics))
         return folder / "best.pt"
 
@@ -103,7 +103,7 @@ def linear_probe(
     classes: int,
     config: ProbeConfig,
 ) -> tuple[nn.Linear, list[dict[str, float]]]:
-    """Fit a linear layer.
+    """Fit a linear layer, and choose its best epoch by validation.
 
     Args:
         features, labels: (window, feature), (window,) to fit on.
@@ -140,17 +140,17 @@ def linear_probe(
     return layer, history
 
 
-def _features(
+def _extract(
     model: TactileClassifier, begin: int, samples: Tensor, offset: Tensor, sigma: Tensor
 ) -> Tensor:
-    """(window, feature), the mean of the steps from `begin` on."""
+    """Return (window, feature), the mean over the steps from `begin` on."""
     with torch.inference_mode():
         steps = model.features(model.inputs(samples, offset, sigma))[:, begin:]
         return steps.float().mean(dim=1)
 
 
-def _validation(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[Tensor, Tensor]:
-    """Features and labels of the clean sweeps in which contact is found."""
+def _extract_clean(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[Tensor, Tensor]:
+    """Return features and labels of the clean sweeps in which contact is found."""
     found = data.onsets(data.sweeps.values)
     usable = torch.from_numpy(found.start >= 0).nonzero().flatten()
     if not len(usable):
@@ -163,5 +163,5 @@ def _validation(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[T
             found.offset[k],
             found.sigma[k],
         )
-        parts.append(_features(model, begin, *(torch.from_numpy(a) for a in arrays)))
+        parts.append(_extract(model, begin, *(torch.from_numpy(a) for a in arrays)))
     return torch.cat(parts), torch.from_numpy(data.sweeps.labels)[usable]

@@ -40,14 +40,14 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     search: dict[str, list[Any]] = {}
 
     def config(self, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
-        """The configuration, with what is asked for otherwise.
+        """Return the configuration, with some values replaced.
 
         Args:
             sets: ``key=value`` each, as on a command line.
             overrides: fields of `TrainingConfig`.
 
         Raises:
-            ConfigError: a key that there is not, or a value that cannot be.
+            ConfigError: an unknown key, or an invalid value.
         """
         nodes = settings.make_node({**self.train, **overrides, "data": data}, "training", 0, Path())
         settings.set_keys(nodes, sets, TrainingConfig, KEYS)
@@ -56,7 +56,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def shipped_recipes() -> tuple[str, ...]:
-    """Names of the recipes that ship."""
+    """Return the names of the recipes that ship."""
     files = resources.files("tactile_rt.models").joinpath("recipes").iterdir()
     return tuple(sorted(f.name[: -len(".toml")] for f in files if f.name.endswith(".toml")))
 
@@ -65,7 +65,7 @@ def load_recipe(name: str) -> Recipe:
     """Read a recipe.
 
     Raises:
-        ConfigError: there is none, or it is damaged; the message names the key.
+        ConfigError: it is missing or damaged; the message names the key.
     """
     if name.endswith(".toml"):
         nodes = settings.read_toml(Path(name))
@@ -83,20 +83,20 @@ def load_recipe(name: str) -> Recipe:
                 raise ConfigError(
                     f"{node.where}: {what} has no key {key!r}; {settings.hint(key, KEYS)}"
                 )
-    _check(nodes, train)
-    # The first of the values to be tried is not the only one that must be possible.
+    _check_fields(nodes, train)
+    # All values to try must be valid, not only the first.
     for values in product(*(node.value for node in search.value.values())) if search.value else ():
         fields = {**train.value, **dict(zip(search.value, values, strict=True))}
-        _check(nodes, replace(search, value=fields))
+        _check_fields(nodes, replace(search, value=fields))
     return recipe
 
 
-def _check(nodes: settings.SettingNode, fields: settings.SettingNode) -> None:
-    """Refuse fields of a training that cannot be, with where they stand."""
+def _check_fields(nodes: settings.SettingNode, fields: settings.SettingNode) -> None:
+    """Check the fields of a training; errors name where they stand."""
     data = settings.make_node("", nodes.file, 0, nodes.folder)
     tree = replace(nodes, value={"train": replace(fields, value={**fields.value, "data": data})})
     config: TrainingConfig = settings.convert(tree, TrainingConfig, ["train"])
-    if config.encoder == "graph":  # whose frame is that of an array, which is not known here
+    if config.encoder == "graph":  # its frame is the array's, which is not known here
         return
     try:
         config.network(2)
@@ -105,12 +105,12 @@ def _check(nodes: settings.SettingNode, fields: settings.SettingNode) -> None:
 
 
 def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
-    """The training configuration of a recipe.
+    """Read the training configuration of a recipe.
 
     Args:
-        sets: ``key=value`` each, which are to be otherwise.
+        sets: ``key=value`` each, to replace values.
 
     Raises:
-        ConfigError: there is none, it is damaged, or a value cannot be.
+        ConfigError: it is missing or damaged, or a value is invalid.
     """
     return load_recipe(name).config(data, sets, **overrides)

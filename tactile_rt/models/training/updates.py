@@ -7,8 +7,8 @@ models want them), as in ``parameter._optim = {"lr_scale": 0.1, "weight_decay": 
 settings share a group. With ``"stacked"`` each of its rows is a norm's, and would be a tensor of
 its own elsewhere.
 
-A run's folder holds `last.pt` and a line of `history.csv`, written after each epoch: a run that is
-killed goes on from there and ends with the same numbers.
+A run's folder holds `last.pt` and `history.csv`, a line per epoch, both written after each epoch: a
+run that was killed resumes there and ends with the same numbers.
 """
 
 import csv
@@ -43,7 +43,7 @@ TRUST = 1e-3  # LARS's coefficient (You et al. 2017)
 
 @dataclass
 class RunState:
-    """How far a run is, and all that it takes to go on.
+    """The progress of a run, and all that is needed to resume it.
 
     Attributes:
         epoch, done: The numbers of epochs and of updates that are done.
@@ -68,12 +68,12 @@ class RunState:
         }  # fmt: skip
 
     def state(self) -> dict[str, Any]:
-        """Gather what `last.pt` holds."""
+        """Return the contents of `last.pt`."""
         kept = {name: part.state_dict() for name, part in self._parts.items()}
         return kept | {"epoch": self.epoch, "done": self.done, "best": self.best}
 
     def resume(self, folder: Path) -> None:
-        """Go on from the `last.pt` of a folder, if there is one.
+        """Resume from the `last.pt` of a folder, if it exists.
 
         Raises:
             ModelError: it, `best.pt` or `history.csv` is damaged, or the best network is gone.
@@ -94,7 +94,7 @@ class RunState:
             describe_checkpoint(folder / "best.pt")
         except ModelError as error:
             raise ModelError(f"{error}: delete {last} to begin the run anew") from None
-        logged_epochs(folder / "history.csv", until=self.epoch + 1)  # else told after an epoch
+        logged_epochs(folder / "history.csv", until=self.epoch + 1)  # fail now, not after an epoch
 
 
 def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
@@ -123,7 +123,7 @@ def log_epoch(path: Path, metrics: dict[str, float]) -> None:
     Raises:
         OSError: the medium is full, or failed.
     """
-    # A line that was logged before the run was killed, but not yet saved, is written again.
+    # The line of an epoch that was logged, but not saved before the run was killed, is replaced.
     old = logged_epochs(path, metrics["epoch"])
     text = io.StringIO()
     writer = csv.DictWriter(text, list(metrics))
@@ -157,7 +157,7 @@ class LARS(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """One update; `closure`, if given, evaluates the loss anew."""
+        """Make one update; `closure`, if given, evaluates the loss anew."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -175,7 +175,7 @@ class LARS(torch.optim.Optimizer):
         decay = group["weight_decay"] if layer else 0.0
         rate = p.new_ones(())
         if layer:
-            size, slope = _size(p, stacked), _size(p.grad, stacked)
+            size, slope = _norm(p, stacked), _norm(p.grad, stacked)
             ratio = TRUST * size / (slope + decay * size).clamp(min=1e-12)
             plain = torch.zeros_like(ratio) if self._published else rate
             rate = torch.where((size > 0) & (slope > 0), ratio, plain)
@@ -188,8 +188,8 @@ class LARS(torch.optim.Optimizer):
         p.sub_(state["momentum"])
 
 
-def _size(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
-    """A tensor's norm, or that of each of its rows, to multiply the tensor with."""
+def _norm(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
+    """Return a tensor's norm, or each row's, in a shape to multiply the tensor with."""
     size: torch.Tensor = torch.linalg.vector_norm(
         tensor, dim=-1 if stacked else None, keepdim=stacked
     )
@@ -199,10 +199,10 @@ def _size(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
 def parameter_groups(
     model: nn.Module, learning_rate: float, weight_decay: float, own_rates: bool = True
 ) -> list[Any]:
-    """Groups of the parameters that are trained, by what their ``_optim`` asks for.
+    """Group the trained parameters by the settings in their ``_optim``.
 
     Args:
-        learning_rate, weight_decay: of those that ask for none of their own.
+        learning_rate, weight_decay: of parameters that have none of their own.
     """
     groups: dict[tuple[float, float, bool], list[nn.Parameter]] = {}
     for parameter in model.parameters():
@@ -219,7 +219,7 @@ def parameter_groups(
 
 
 def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
-    """The optimizer of a configuration: Table A2 has a weight decay of 1e-4 for all."""
+    """Build the optimizer of a configuration. Table A2 has a weight decay of 1e-4 for all."""
     rate, decay = config.learning_rate, config.weight_decay
     groups = parameter_groups(model, rate, decay, config.own_rates)
     if config.optimizer == "sgd":
@@ -234,7 +234,7 @@ def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Opt
 def build_schedule(
     optimizer: torch.optim.Optimizer, config: TrainingConfig, updates: int, per_epoch: int = 1
 ) -> LRScheduler:
-    """The schedule of a configuration, to be stepped after every one of so many updates.
+    """Build the schedule of a configuration, to be stepped after each of `updates`.
 
     Time is counted in updates, or, with `rate_per` "epoch", in epochs of `per_epoch` updates, as
     the paper does.
@@ -250,7 +250,7 @@ def build_schedule(
             optimizer,
             [group["lr"] for group in optimizer.param_groups],
             total_steps=updates,
-            # of a warm-up of one update torch makes a division by zero
+            # with a warm-up of one update torch divides by zero
             pct_start=config.warmup if config.warmup * updates != 1 else 0.0,
             cycle_momentum=False,
         )
@@ -286,7 +286,7 @@ def batch_loss(
     feed: BatchFeed,
     bf16: bool,
 ) -> Callable[[Batch], Tensor]:
-    """Make the function that gives the loss of a batch, ready for `backward`.
+    """Make the function that returns the loss of a batch, ready for `backward`.
 
     Args:
         wrapped: the objective, as `fabric` has set it up.
@@ -318,7 +318,7 @@ def batch_loss(
 
 
 class _Loss(nn.Module):
-    """An objective's loss of tensors alone, which is what can be captured."""
+    """An objective's loss with tensors alone as arguments, as a capture needs."""
 
     def __init__(self, objective: Objective) -> None:
         super().__init__()
@@ -332,9 +332,9 @@ class _Loss(nn.Module):
 def replayed(
     objective: Objective, seen: Sequence[Tensor], labels: Tensor, bf16: bool
 ) -> Callable[..., Tensor] | None:
-    """The objective's loss as a function of (*seen, labels), all of the shapes of those given.
+    """Capture the objective's loss as a function of (*seen, labels) of fixed shapes.
 
-    The objective is left as it was, its running means, too. While the function is made, no other
+    The objective stays as it was, with its running means. While the function is made, no other
     thread may use the GPU.
 
     Args:
@@ -342,8 +342,8 @@ def replayed(
         seen, labels: of any batch, as `Objective.loss` takes them.
 
     Returns:
-        The function; None, which is logged, if there is something in the objective that cannot be
-        captured, such as what another package adds and decides by values.
+        The function; None, with a logged warning, if the objective cannot be captured, e.g.
+        because a part that another package adds branches on values.
     """
     before = {name: buffer.clone() for name, buffer in objective.named_buffers()}
     loss = _Loss(objective).train()
