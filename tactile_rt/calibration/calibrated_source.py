@@ -48,7 +48,7 @@ def declare(source: Source, array: ArraySpec) -> Source:
     the array that the device was built into, and keeps its own rate; see `Calibration.array`.
 
     Returns:
-        The source itself, if it is of that array already; else a source to be closed instead of it.
+        The source itself, if it is of that array already; else a source whose closing closes it.
 
     Raises:
         SpecMismatch: the source has another number of elements, or lacks a channel.

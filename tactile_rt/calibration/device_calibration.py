@@ -31,8 +31,8 @@ HISTORY = 20  # entries kept, so that the file of a robot that tares every morni
 class Mirror:
     """Mirror image of an array, as of a left array for a right array's model.
 
-    Bases are reflected along an axis n of the mount frame, S = 1 - 2 n n^T. The reflected frame R
-    of an element is left-handed; flipping an axis a of its own, T = 1 - 2 a a^T, makes it
+    Bases are reflected along an axis n of the mount frame, S = 1 - 2 n n^T. This makes the frame R
+    of an element left-handed; flipping an axis a of its own, T = 1 - 2 a a^T, makes it
     right-handed again: p' = S p, R' = S R T. A force is a vector, a moment a pseudovector: in the
     element's frame f' = T f and m' = -T m. The mirror image of the mirror image is the array
     itself.
@@ -258,7 +258,7 @@ class Calibration:
         values, valid = chunk.values, chunk.valid
         if plan.moves:
             values, valid = values.take(plan.index, axis=1), valid.take(plan.index, axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):  # of invalid elements
+        with np.errstate(over="ignore", invalid="ignore"):  # in elements that are or become invalid
             values = values - plan.tare
             if plan.gain is not None:
                 # Selected, not multiplied by zeros: channels that are left out need not be finite.

@@ -7,7 +7,7 @@ step between two readings: the resolution, for a converter that is quieter than 
 
 An element is refused if it was touched (a block's median differs from the overall median by more
 than 3 times the noise, or 5 consecutive samples do by more than 8 times) or if it drifts (its last
-quarter differs from its first by more than 2 times). A constant load cannot be noticed.
+quarter differs from its first by more than 2 times). A constant load reads as no load.
 """
 
 import time

@@ -71,7 +71,7 @@ def live_model(
         name: of the model; empty: the only one, or the one whose file is `model`.
 
     Raises:
-        ConfigError: no model has that name, or several models come into question.
+        ConfigError: no model has that name, or several models match.
     """
     models = recorded_models(about)
     names = ", ".join(m.name for m in models)

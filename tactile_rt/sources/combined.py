@@ -1,4 +1,4 @@
-"""Combination of several arrays to one, with one clock and one spec.
+"""Combination of several arrays into one, with one clock and one spec.
 
 combined:robot_head.toml, which reads
 
@@ -84,8 +84,8 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
     if fields:
         raise ConfigError(f"combined:{path} takes no options: they are in the file")
     nodes = read_toml(Path(path))
-    listed: _File = convert(nodes, _File)
-    if not listed.source:
+    file: _File = convert(nodes, _File)
+    if not file.source:
         raise ConfigError(f"{path}: no [[source]] to combine")
     place, above = os.path.realpath(path), _READING.get()
     if place in above:
@@ -93,7 +93,7 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
     within = _READING.set((*above, place))
     specs = []
     try:
-        for i, part in enumerate(listed.source):
+        for i, part in enumerate(file.source):
             try:
                 specs.append(check_source(part.url))
             except TactileError as error:
@@ -103,21 +103,21 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
 
     def open_all() -> Source:
         with contextlib.ExitStack() as stack:
-            sources = [stack.enter_context(open_source(part.url)) for part in listed.source]
-            made = CombinedSource(sources, listed.source, listed.name, listed.rate_hz)
+            sources = [stack.enter_context(open_source(part.url)) for part in file.source]
+            made = CombinedSource(sources, file.source, file.name, file.rate_hz)
             stack.pop_all()
             return made
 
     known = [spec for spec in specs if spec is not None]
     if len(known) < len(specs):
         return Prepared(None, open_all)
-    return Prepared(combine_specs(known, listed.source, listed.name, listed.rate_hz), open_all)
+    return Prepared(combine_specs(known, file.source, file.name, file.rate_hz), open_all)
 
 
 def combine_specs(
     specs: list[ArraySpec], parts: Sequence[MemberArray], name: str, rate_hz: float
 ) -> ArraySpec:
-    """Combine specs to one of all elements, with each array's rows below the previous array's.
+    """Combine specs into one, with each array's rows below those of the previous array.
 
     Raises:
         ConfigError: the arrays do not measure the same channels, or two have one name.

@@ -277,7 +277,7 @@ def check_line(wire: str, codec: str, options: dict[str, str]) -> None:
 
 
 def named_right(passes: Sequence[tuple[int, str]], decisions: Sequence[Classification]) -> int:
-    """Count the objects that are named rightly by the last decision of their first touch.
+    """Count the objects that the last decision of their first touch names correctly.
 
     Args:
         passes: start of each object's pass, stream time in ns, and its category; in order.

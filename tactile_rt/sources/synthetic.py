@@ -58,7 +58,7 @@ class SyntheticOptions:
 
 
 def synthetic_spec(elements: int, channels: int, rate_hz: float) -> ArraySpec:
-    """Make a spec of whiskers in rows of seven, 2 mm apart. Channels begin with the forces."""
+    """Make a spec of whiskers in rows of seven, 2 mm apart. Channels: forces, then moments."""
     grid = tuple(divmod(i, COLUMNS) for i in range(elements))
     return ArraySpec(
         name="synthetic",
@@ -96,7 +96,7 @@ class SyntheticSource(Source):
         self._sent, self._start_ns, self._closed = 0, -1, False
 
     def like(self, spec: ArraySpec) -> "SyntheticSource":
-        """Return a source of like bumps on another array, at its rate and typical loads."""
+        """Return a source of similar bumps on another array, at its rate and typical loads."""
         source = SyntheticSource("", replace(self._options, rate_hz=spec.rate_hz))
         Source.__init__(source, spec)
         source._peak = np.array([LOADS.get(unit, 1.0) for unit in spec.units])
