@@ -95,7 +95,7 @@ def intervals_by_name(recordings: Sequence[Path]) -> Intervals:
 
 
 def intervals_of_all(recordings: Sequence[Path]) -> Intervals:
-    """Return one interval per recording, which covers all of it and has no label."""
+    """Return one unlabelled interval per recording, which covers all its samples."""
     return {one: [LabelledInterval(label=UNLABELLED)] for one in recordings}
 
 

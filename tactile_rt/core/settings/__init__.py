@@ -1,8 +1,8 @@
 """Conversion of a user's settings to typed structs, with uniform error messages.
 
 TOML files, ``--set key=value``, the ``?option=value`` of a URL and the rows of a CSV file all
-become a tree of `SettingNode`, in which every value has its place in the text; `convert` makes a
-struct or a dataclass of it. An error is one line::
+become a tree of `SettingNode`, in which every value has its place in the text; `convert` turns it
+into a struct or a dataclass. An error is one line::
 
     robot.toml:5: page.port: expected a whole number <= 65535, got 70000
     serial:/dev/ttyUSB0 has no option 'boud'; did you mean baud?

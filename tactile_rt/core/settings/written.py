@@ -125,10 +125,10 @@ def _find_item(node: SettingNode, step: str, origin: str, where: str) -> int:
 
 
 def split_url(url: str) -> tuple[str, str, dict[str, str]]:
-    """Take ``scheme:target?option=value&option=value`` apart.
+    """Split a URL, ``scheme:target?option=value&option=value``.
 
     Returns:
-        Scheme (empty: there is none), target, and the options as written.
+        Scheme (empty: none), target, and the options as written.
 
     Raises:
         ConfigError: the text has unprintable characters, is too long, is no URL, or gives an option

@@ -82,7 +82,7 @@ def bag_topics(path: Path) -> list[BagTopic]:
 
 
 def is_recording(path: Path) -> bool:
-    """Tell whether an MCAP file is a recording of ours."""
+    """Return whether an MCAP file is a recording of tactile-rt."""
     try:
         return path.is_file() and path.suffix == ".mcap" and bool(Recording(path).description)
     except (RecordingError, ConfigError):

@@ -46,7 +46,7 @@ class Import:
     # rate by the codec or the user; None: only the times give a rate
     said_hz: float | None = None
     first_missing: int | None = None  # number of the sample before the first missing one
-    invalid: int = 0  # number of samples of which an element is invalid
+    invalid: int = 0  # number of samples with an invalid element
     units: dict[str, str] = field(default_factory=dict)  # SI unit of each channel
     # smallest and largest valid value of each column, SI, by ELEMENT.CHANNEL
     ranges: dict[str, tuple[float, float] | None] = field(default_factory=dict)
