@@ -7,8 +7,8 @@
             for chunk, decisions in session:
                 print([(decision.step, decision.label) for decision in decisions])
 
-What is imported from here is loaded when it is first used, so that a program pays only for what it
-takes: the sources need no ONNX Runtime, and reading a recording needs no serial port.
+Each name of this module is imported when it is first used, so that a program loads only what it
+needs: the sources need no ONNX Runtime, and reading a recording needs no serial port.
 """
 
 import os
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from tactile_rt.core.packages import VERSION as __version__
 
-# From 1.29 on ONNX Runtime reports what runs to its maker unless told not to before it loads.
+# From 1.29 on ONNX Runtime sends usage data to its maker, unless this is set before it loads.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:

@@ -1,12 +1,12 @@
-"""From what a device sends to the SI loads that a model knows, element by element.
+"""Calibration: conversion of a device's raw samples to SI loads of an array that a model knows.
 
 output = mirror(map(matrix @ (raw - tare)))
 
-device_calibration  what one device needs, applied to its chunks: tare, matrix, mapping, mirror
-calibrated_source   the same on a whole source, which may be declared to be another array's
-files               stored per device id, as TOML that people can read
+device_calibration  calibration of one device, applied to chunks: tare, matrix, mapping, mirror
+calibrated_source   calibration of a whole source, which may be declared to be of another array
+files               storage by device id, as TOML that people can read
 tare_measurement    offsets and noise, measured while nothing is touched
-calibration_fit     tables of known loads, and the matrix that they give
+calibration_fit     fit of the matrix to a table of known loads
 """
 
 from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declared

@@ -1,4 +1,4 @@
-"""A source whose samples are corrected on their way, and may be declared to be another array's."""
+"""Sources whose samples are calibrated as they are read, and may be declared to be of an array."""
 
 import re
 from dataclasses import replace
@@ -9,17 +9,17 @@ from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 
 class CalibratedSource(Source):
-    """A source whose samples are corrected; all else (statistics, health, commands) is its own.
+    """Source with calibrated samples. Statistics, health and commands are those of the raw source.
 
     Args:
-        source: of raw samples; closed with this one.
+        source: the source of raw samples; closed with this one.
 
     Raises:
-        SpecMismatch: it is for another array.
+        SpecMismatch: the calibration is for another array.
     """
 
     def __init__(self, source: Source, calibration: Calibration) -> None:
-        # No `stats` of our own: like all that is not here, they are looked up in the source.
+        # No own `stats`: like all other missing attributes, they are looked up in the source.
         self.source, self.calibration = source, calibration
         self.spec = calibration.output_spec(source.spec)
         self.live = source.live
@@ -35,23 +35,23 @@ class CalibratedSource(Source):
         return self.source.fileno()
 
     def __getattr__(self, name: str) -> Any:
-        # While it is copied or unpickled there is no source yet to ask.
+        # While the object is copied or unpickled, it has no source yet.
         if name == "source" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.source, name)
 
 
 def declare(source: Source, array: ArraySpec) -> Source:
-    """The source as that of an array whose elements and channels it has, by whatever names.
+    """Declare that a source is of an array, which gives its elements names and places.
 
-    What a codec says of its device are names and places of its own. Declared, the stream has those
-    of the array that the device was built into, and its own rate; see `Calibration.array`.
+    A codec describes its device by generic names and places. Once declared, the stream has those of
+    the array that the device was built into, and keeps its own rate; see `Calibration.array`.
 
     Returns:
-        The source itself, if it is of that array already; else a source that is closed with it.
+        The source itself, if it is of that array already; else a source whose closing closes it.
 
     Raises:
-        SpecMismatch: it has not as many elements, or lacks a channel.
+        SpecMismatch: the source has another number of elements, or lacks a channel.
     """
     if not array.differences(source.spec, ignore=("rate_hz",)):
         return source
@@ -61,6 +61,6 @@ def declare(source: Source, array: ArraySpec) -> Source:
 
 
 def declared(spec: ArraySpec, array: ArraySpec) -> Calibration:
-    """A change of elements and channels from one array to another."""
+    """Make the calibration that only declares samples of one array to be of another."""
     device = re.sub(r"[^\w.:+-]+", "-", spec.name, flags=re.ASCII).strip(".-") or "device"
     return replace(Calibration.of(device, spec), array=array)

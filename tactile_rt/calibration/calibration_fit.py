@@ -1,14 +1,13 @@
-"""Known loads, and the calibration matrix that they give an element by least squares.
+"""Fit of an element's calibration matrix to known loads by least squares.
 
-A table is a .csv whose lines each say a load and what the sensor read under it. Loads are columns
-fx, fy, fz (N), mx, my, mz (N m), as many of them as were applied. The readings are columns
-``raw_CHANNEL``, one per raw channel, or are taken from a recording between the seconds ``start_s``
-and ``end_s``.
+A table is a .csv with a known load and the sensor's reading in each line. Loads are columns fx, fy,
+fz (N), mx, my, mz (N m), only those that were applied. The readings are columns ``raw_CHANNEL``,
+one per raw channel, or are taken from a recording between the seconds ``start_s`` and ``end_s``.
 
 The model is load = M (raw - tare): an affine map, fitted as load = M raw + b, so that neither the
-loads nor the readings need a common zero. The tare is the raw reading of no load, -M^+ b. Raw
+loads nor the readings need a common zero. The tare is the raw reading at no load, -M^+ b. Raw
 channels and loads are scaled to unit standard deviation for the solution, so that newtons and
-newton metres, volts and counts weigh alike.
+newton metres, volts and counts have equal weight.
 """
 
 from collections.abc import Sequence
@@ -25,13 +24,13 @@ from tactile_rt.core.stream import ArraySpec, Chunk
 AXES = {"fx": "N", "fy": "N", "fz": "N", "mx": "N m", "my": "N m", "mz": "N m"}
 RAW = "raw_"
 TIMES = ("start_s", "end_s")
-WORST = 5
-WEAK = 0.01  # least share of load that an axis must have of its own; conditions go with 1 / WEAK
+WORST = 5  # rows that `Fit.worst` lists
+WEAK = 0.01  # least singular value of loads, relative to the largest; 1 / the largest condition
 
 
 @dataclass(frozen=True, eq=False)
 class LoadTable:
-    """Known loads, one a row.
+    """Table of known loads, one per row.
 
     Attributes:
         axes: Names of the axes that were loaded, in the order of `AXES`.
@@ -57,7 +56,7 @@ class LoadTable:
 
 
 def read_loads(path: Path) -> LoadTable:
-    """Read a table of loads."""
+    """Read a table of known loads from a .csv file."""
     table = read_csv(path)
     if not table.rows:
         raise ConfigError(f"{path}: needs a line of column names, and lines of loads")
@@ -85,13 +84,13 @@ def read_loads(path: Path) -> LoadTable:
 def raw_readings(
     table: LoadTable, recorded: Chunk, spec: ArraySpec, element: str
 ) -> NDArray[np.float64]:
-    """Return the (row, channel) medians of an element under each load of a table.
+    """Return the (row, channel) median readings of an element under each load of a table.
 
     Args:
-        recorded: of raw samples; the table's second 0 is its first sample's.
+        recorded: raw samples; the table's times count from the first sample.
 
     Raises:
-        ConfigError: no such element, or no valid sample in one of the ranges (which line).
+        ConfigError: no such element, or no valid sample in one of the ranges; names the line.
     """
     if element not in spec.elements:
         raise ConfigError(f"no element {element!r}; {nearest(element, spec.elements)}")
@@ -131,7 +130,7 @@ def _check_header(where: str, header: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A matrix and how well it does.
+    """Fitted calibration matrix, with its quality.
 
     Attributes:
         matrix: (axis, channel) load per raw unit.
@@ -140,11 +139,11 @@ class Fit:
         rms: (axis,) root mean square of the residuals, N and N m.
         full_scale: (axis,) largest known load on each axis, N and N m.
         r_squared: (axis,) share of the known loads' variance that the matrix explains.
-        condition: Condition number of the scaled readings: how much errors in them can be
-            magnified.
-        load_condition: Condition number of the scaled loads: 1 if every axis is loaded apart from
-            the others.
-        worst: Rows with the largest residuals for their full scale, the worst first.
+        condition: Condition number of the scaled readings: the largest factor by which errors in
+            them are magnified.
+        load_condition: Condition number of the scaled loads: 1 if every axis is loaded
+            independently of the others.
+        worst: Rows with the largest residuals relative to full scale, the worst first.
         warnings: Reasons to doubt the matrix, a sentence each.
     """
 
@@ -167,7 +166,7 @@ def calibrate(
     axes: Sequence[str] = ("fx", "fy", "fz", "mx", "my", "mz"),
     channels: Sequence[str] = (),
 ) -> Fit:
-    """Fit the matrix of one element.
+    """Fit the calibration matrix of one element to known loads.
 
     Args:
         raw: (row, channel) readings.
@@ -191,7 +190,7 @@ def calibrate(
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise ConfigError("readings and loads must be finite")
     x0, y0 = x.mean(axis=0), y.mean(axis=0)
-    x_scale, y_scale = _spread(x), _spread(y)
+    x_scale, y_scale = _column_std(x), _column_std(y)
     for name, scale in zip(names, x_scale, strict=True):
         if scale == 0:
             raise ConfigError(f"channel {name} never changes: is it connected?")
@@ -206,7 +205,7 @@ def calibrate(
     shares = np.abs(residuals) / np.where(full_scale > 0, full_scale, 1.0)
     worst = np.argsort(-shares.max(axis=1), kind="stable")[:WORST]
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
-    load_condition, warnings = _span(y, tuple(axes))
+    load_condition, warnings = _check_span(y, tuple(axes))
     if condition > 1 / WEAK:
         warnings.append(
             f"readings are nearly dependent (condition {condition:.3g}): errors in them are "
@@ -236,14 +235,14 @@ def calibrate(
     )
 
 
-def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation per column; exactly 0 of a constant one, whatever rounding says."""
+def _column_std(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the standard deviation of each column, exactly 0 if the column is constant."""
     return np.where(np.ptp(values, axis=0) > 0, values.std(axis=0), 0.0)
 
 
-def _span(loads: NDArray[np.float64], axes: tuple[str, ...]) -> tuple[float, list[str]]:
-    """Condition of the scaled loads, and what is wrong with the directions they span."""
-    scale = _spread(loads)
+def _check_span(loads: NDArray[np.float64], axes: tuple[str, ...]) -> tuple[float, list[str]]:
+    """Return the condition number of the scaled loads, and warnings on missing directions."""
+    scale = _column_std(loads)
     still = [a for a, s in zip(axes, scale, strict=True) if s == 0]
     warnings = [f"{a} is never loaded: it will read 0 whatever comes" for a in still]
     moving = scale > 0

@@ -1,4 +1,4 @@
-"""What one device's samples need to become SI loads of the array that a model knows."""
+"""Calibration of one device, which converts its samples to SI loads of an array."""
 
 import math
 import re
@@ -17,23 +17,23 @@ from tactile_rt.core.stream import ArraySpec, Chunk, quaternion_product
 Quaternion = tuple[float, float, float, float]
 
 AXES = ("x", "y", "z")
-# A component of a vector, as in fx, x, acc_x, bx2; and of what kind a vector of this unit is.
+# Names of a vector's component, as fx, x, acc_x, bx2; units of polar and axial vectors.
 COMPONENT = re.compile(r"(?:[A-Za-z]?|.*[_.\- ])([xyz])\d*")
 POLAR = ("N", "m", "m/s", "m/s^2", "m/s2")
 AXIAL = ("N m", "T", "rad/s")
-UNTOLD = ("rad", "1", "")  # angles about who knows what, counts of who knows what
+UNTOLD = ("rad", "1", "")  # units that do not determine the sign: angles, counts
 Row = tuple[float, ...]
-DEVICE = re.compile(r"[A-Za-z0-9_+-][\w.:+-]*")  # it names a file
-HISTORY = 20  # entries kept: a robot that tares every morning must not grow a file for ever
+DEVICE = re.compile(r"[A-Za-z0-9_+-][\w.:+-]*")  # valid in the name of a file
+HISTORY = 20  # entries kept, so that the file of a robot that tares every morning stays small
 
 
 @dataclass(frozen=True)
 class Mirror:
-    """The array's mirror image, as of a left array for a right one's model.
+    """Mirror image of an array, as of a left array for a right array's model.
 
-    Bases are reflected along an axis n of the mount frame, S = 1 - 2 n n^T. What is left of an
-    element's frame R is turned into a right-handed one again by an axis a of its own,
-    T = 1 - 2 a a^T: p' = S p, R' = S R T. A force is a vector, a moment a pseudovector: in the
+    Bases are reflected along an axis n of the mount frame, S = 1 - 2 n n^T. This makes the frame R
+    of an element left-handed; flipping an axis a of its own, T = 1 - 2 a a^T, makes it
+    right-handed again: p' = S p, R' = S R T. A force is a vector, a moment a pseudovector: in the
     element's frame f' = T f and m' = -T m. The mirror image of the mirror image is the array
     itself.
 
@@ -41,8 +41,8 @@ class Mirror:
         axis: Axis of the mount frame, x, y or z, that points from side to side.
         element_axis: Axis of the element's frame that is flipped: for whiskers z, across the plane
             of their curvature; where elements have the mount's axes, the same as `axis`.
-        signs: Factor 1 or -1 by output channel, where its name and unit do not tell (an angle, a
-            count).
+        signs: Factor 1 or -1 by output channel, where name and unit do not determine it (an angle,
+            a count).
     """
 
     axis: str = "x"
@@ -61,7 +61,7 @@ class Mirror:
         """Return the factor, 1 or -1, of a channel's values.
 
         Raises:
-            ConfigError: neither its name and unit nor `signs` tell.
+            ConfigError: neither name and unit nor `signs` determine the factor.
         """
         if channel in self.signs:
             return self.signs[channel]
@@ -83,7 +83,7 @@ class Mirror:
         # S and T are half turns about their axes times -1, and the two -1 cancel in S R T.
         turned = quaternion_product(_half_turn(self.axis), orientation)
         w, *v = quaternion_product(turned, _half_turn(self.element_axis)).tolist()
-        # The first that is not zero is positive: two quaternions of one rotation are then equal.
+        # The first non-zero component is positive, so that equal rotations have equal quaternions.
         flip = next((q < 0 for q in (w, *v) if q), False)
         a, b, c, d = ((0.0 - q if flip else q) + 0.0 for q in (w, *v))
         return (x, y, z), (a, b, c, d)
@@ -96,33 +96,33 @@ def _half_turn(axis: str) -> Quaternion:
 
 @dataclass(frozen=True)
 class Calibration:
-    """From a device's raw samples to the output of its array, in SI units.
+    """Conversion of a device's raw samples to the output of its array, in SI units.
 
-    Of each element, output = M (raw - tare). M is its own matrix; else the gain of each channel;
-    else nothing is changed, if the output has the raw channels and units. Otherwise the element is
-    uncalibrated, and never valid. Then elements are mapped, then mirrored. What comes out may be
-    declared to be an array: then it has that array's names and places.
+    For each element, output = M (raw - tare). M is the element's matrix, else the diagonal gain,
+    else the identity if the output has the raw channels and units. Otherwise the element is
+    uncalibrated, and never valid. Then elements are mapped, then mirrored. The output may be
+    declared to be of an array: then it has that array's names and places.
 
     Attributes:
         device: Id of the device, which names the file: letters, digits, and ``_ . : + -``.
         units: Units of the raw channels, which may be counts (``1``).
-        output_channels: Names of the channels that come out; empty for the raw ones.
-        output_units: Units of the channels that come out; empty for the raw ones.
-        gain: (channel,) output unit per raw unit, of elements without a matrix; empty: none.
-        tare: (channel,) offset in raw units by raw element; none: 0.
-        noise: (channel,) standard deviation in raw units by raw element, when tared.
-        changes: share of readings that differed from the one before then; see `Tare`.
+        output_channels: Names of the output channels; empty for the raw ones.
+        output_units: Units of the output channels; empty for the raw ones.
+        gain: (channel,) output unit per raw unit, for elements without a matrix; empty: none.
+        tare: (channel,) offset in raw units, by raw element; 0 for elements without an entry.
+        noise: (channel,) standard deviation in raw units, by raw element, during the tare.
+        changes: share of readings that differed from the one before, during the tare; see `Tare`.
         matrices: (output channel, channel) output unit per raw unit, by raw element.
-        mapping: Raw element by output element, in the order of the output; empty if the elements
-            come out as the device sends them.
-        mirror: Reflection that makes the output the array's mirror image; None for none.
-        array: Array that the output is declared to be; None for the device's own. Its elements are
-            those of the same names or, if the names are not all the same, those in the same place
-            of the order. Its channels are those of the same name and unit; others are left out.
+        mapping: Raw element by output element, in the order of the output; empty: elements are
+            output as the device sends them.
+        mirror: Reflection that makes the output the array's mirror image; None: no reflection.
+        array: Array that the output is declared to be of; None for the device's own. Its elements
+            are matched by name or, if the names are not all the same, by order. Its channels are
+            matched by name and unit; others are left out.
 
     Raises:
         ConfigError: sizes disagree, a name is unknown, or a number is not finite.
-        SpecMismatch: the output has not as many elements as `array`, or lacks a channel of it.
+        SpecMismatch: the output has another number of elements than `array`, or lacks a channel.
     """
 
     device: str
@@ -143,7 +143,7 @@ class Calibration:
 
     @classmethod
     def of(cls, device: str, spec: ArraySpec) -> "Calibration":
-        """One that changes nothing yet, of this device."""
+        """Make a calibration of a device that changes nothing yet."""
         return cls(device, spec.elements, spec.channels, spec.units)
 
     def __post_init__(self) -> None:
@@ -155,34 +155,34 @@ class Calibration:
                 raise ConfigError(f"raw.{what}: name at least one, and none twice")
         if len(set(channels)) < outputs:
             raise ConfigError("output.channels: none may be there twice")
-        _sized("raw.units", self.units, inputs, "raw channels")
-        _sized("output.units", units, outputs, "output channels")
+        _check_size("raw.units", self.units, inputs, "raw channels")
+        _check_size("output.units", units, outputs, "output channels")
         if self.gain:
-            _sized("gain", self.gain, inputs, "raw channels")
+            _check_size("gain", self.gain, inputs, "raw channels")
             if outputs != inputs:
                 raise ConfigError(
                     f"gain: makes {inputs} channels of {inputs}, but output.channels has {outputs};"
                     f" give every element a matrix instead"
                 )
-            _finite("gain", self.gain)
+            _check_finite("gain", self.gain)
         for what, rows in (("tare", self.tare), ("noise", self.noise)):
             for element, row in rows.items():
-                _known(f"{what}.{element}", element, self.elements, "raw element")
-                _sized(f"{what}.{element}", row, inputs, "raw channels")
-                _finite(f"{what}.{element}", row)
+                _check_known(f"{what}.{element}", element, self.elements, "raw element")
+                _check_size(f"{what}.{element}", row, inputs, "raw channels")
+                _check_finite(f"{what}.{element}", row)
         for element, matrix in self.matrices.items():
-            _known(f"matrix.{element}", element, self.elements, "raw element")
-            _sized(f"matrix.{element}", matrix, outputs, "output channels", "rows")
+            _check_known(f"matrix.{element}", element, self.elements, "raw element")
+            _check_size(f"matrix.{element}", matrix, outputs, "output channels", "rows")
             for channel, row in zip(channels, matrix, strict=True):
-                _sized(f"matrix.{element}, row {channel}", row, inputs, "raw channels")
-                _finite(f"matrix.{element}, row {channel}", row)
+                _check_size(f"matrix.{element}, row {channel}", row, inputs, "raw channels")
+                _check_finite(f"matrix.{element}, row {channel}", row)
         for element, source in self.mapping.items():
-            _known(f"mapping.{element}", source, self.elements, "raw element")
+            _check_known(f"mapping.{element}", source, self.elements, "raw element")
         if len(set(self.mapping.values())) < len(self.mapping):
             raise ConfigError("mapping: one raw element is mapped twice")
         for channel in self.mirror.signs if self.mirror else ():
-            _known(f"mirror.signs.{channel}", channel, channels, "output channel")
-        _ = self.signs  # a mirror that cannot be must fail here, not on the robot's first sample
+            _check_known(f"mirror.signs.{channel}", channel, channels, "output channel")
+        _ = self.signs  # an invalid mirror must fail here, not on the robot's first sample
         if self.array is not None:
             self._check_array(self.array)
 
@@ -193,31 +193,31 @@ class Calibration:
 
     @property
     def signs(self) -> Row:
-        """(output channel,) 1 or -1: what mirroring multiplies by."""
+        """Factors of the reflection, (output channel,), each 1 or -1."""
         if self.mirror is None:
             return (1.0,) * len(self.output[0])
         return tuple(float(self.mirror.sign(c, u)) for c, u in zip(*self.output, strict=True))
 
     @cached_property
     def uncalibrated(self) -> tuple[str, ...]:
-        """Raw elements that never give a valid value, for want of a matrix or gain."""
+        """Raw elements that are never valid, as they have neither matrix nor gain."""
         if self.gain or self.output == (self.channels, self.units):
             return ()
         used = self.mapping.values() if self.mapping else self.elements
         return tuple(e for e in used if e not in self.matrices)
 
     def output_spec(self, raw: ArraySpec) -> ArraySpec:
-        """What comes out for a device that describes itself so.
+        """Return the spec of the output for a device's raw spec.
 
         Raises:
-            SpecMismatch: it is not the device that this is for.
+            SpecMismatch: the calibration is for another device.
         """
         for what in ("elements", "channels", "units"):
             mine, theirs = getattr(self, what), getattr(raw, what)
             if mine != theirs:
                 raise SpecMismatch(
-                    f"calibration of {self.device} is for {what} {_listed(mine)}; "
-                    f"{raw.name} has {_listed(theirs)}"
+                    f"calibration of {self.device} is for {what} {_join(mine)}; "
+                    f"{raw.name} has {_join(theirs)}"
                 )
         if self.array is not None:
             return replace(self.array, rate_hz=raw.rate_hz)
@@ -237,17 +237,17 @@ class Calibration:
         )
 
     def apply(self, chunk: Chunk) -> Chunk:
-        """Correct n samples.
+        """Calibrate a chunk of samples.
 
         Args:
-            chunk: of the raw spec; it is left as it is.
+            chunk: of the raw spec; it is not modified.
 
         Returns:
-            A chunk of `output_spec`. An element that is not valid stays so; one whose output is
-            not finite becomes so.
+            A chunk of `output_spec`. An invalid element stays invalid; one whose output is not
+            finite becomes invalid.
 
         Raises:
-            SpecMismatch: it has not as many elements or channels.
+            SpecMismatch: the chunk has another number of elements or channels.
         """
         plan = self._plan
         if chunk.values.shape[1:] != plan.shape:
@@ -258,10 +258,10 @@ class Calibration:
         values, valid = chunk.values, chunk.valid
         if plan.moves:
             values, valid = values.take(plan.index, axis=1), valid.take(plan.index, axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):  # of what is not valid, or becomes so
+        with np.errstate(over="ignore", invalid="ignore"):  # in elements that are or become invalid
             values = values - plan.tare
             if plan.gain is not None:
-                # By number, not by a product with zeros: what is left out need not be finite.
+                # Selected, not multiplied by zeros: channels that are left out need not be finite.
                 values = values[..., plan.channels] * plan.gain
             else:
                 values = np.matmul(values.transpose(1, 0, 2), plan.matrix).transpose(1, 0, 2)
@@ -276,16 +276,16 @@ class Calibration:
         if len(names) != len(array.elements):
             raise SpecMismatch(
                 f"elements: the array {array.name!r} has {len(array.elements)} "
-                f"({_listed(array.elements)}), {self.device} {len(names)} ({_listed(names)})"
+                f"({_join(array.elements)}), {self.device} {len(names)} ({_join(names)})"
             )
-        given, wanted = (
+        given, needed = (
             [f"{channel} ({unit})" for channel, unit in zip(*both, strict=True)]
             for both in (self.output, (array.channels, array.units))
         )
-        if lacking := [channel for channel in wanted if channel not in given]:
+        if lacking := [channel for channel in needed if channel not in given]:
             raise SpecMismatch(
-                f"channels: the array {array.name!r} has {_listed(lacking)}, {self.device} gives "
-                f"{_listed(given)}: a calibration can rename and convert them"
+                f"channels: the array {array.name!r} has {_join(lacking)}, {self.device} gives "
+                f"{_join(given)}: a calibration can rename and convert them"
             )
 
     @cached_property
@@ -306,7 +306,7 @@ class Calibration:
         zero = (0.0,) * shape[1]
         tare = np.array([self.tare.get(e, zero) for e in used])
         lacking = np.array([e not in self.uncalibrated for e in used])
-        one = np.abs(matrix).max(axis=0).argmax(axis=1)  # (output,) the channel, if it is one
+        one = np.abs(matrix).max(axis=0).argmax(axis=1)  # (output,) dominant input channel
         gain = np.take_along_axis(matrix, one[None, :, None], axis=2)
         alone = np.array_equal(matrix, gain * np.eye(shape[1])[one])
         return _Plan(
@@ -321,16 +321,16 @@ class Calibration:
         )
 
     def noted(self, line: str, **changes: Any) -> "Calibration":
-        """This one with other attributes, and a line more of history."""
+        """Return a copy with changed attributes, and one more line of history."""
         return replace(self, history=(*self.history, line)[-HISTORY:], **changes)
 
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A calibration as arrays, by output element; `matrix` is (element, channel, output).
+    """Arrays of a calibration, by output element; `matrix` is (element, channel, output).
 
-    Where each output is a multiple of one channel, that is `channels` (output,) and `gain`
-    (element, output).
+    If each output is a multiple of one channel, `channels` (output,) and `gain` (element, output)
+    are these channels and factors; else `gain` is None.
     """
 
     shape: tuple[int, int]
@@ -344,26 +344,26 @@ class _Plan:
 
 
 def check_device(device: str) -> None:
-    """Refuse an id that could not name a file."""
+    """Refuse a device id that cannot name a file."""
     if not DEVICE.fullmatch(device):
         raise ConfigError(f"device id {device!r}: use letters, digits, '_', '.', ':', '+' and '-'")
 
 
-def _known(key: str, name: str, known: tuple[str, ...], what: str) -> None:
+def _check_known(key: str, name: str, known: tuple[str, ...], what: str) -> None:
     if name not in known:
         raise ConfigError(f"{key}: {no_such(what, name, known)}")
 
 
-def _sized(key: str, items: tuple[Any, ...], n: int, of: str, what: str = "values") -> None:
+def _check_size(key: str, items: tuple[Any, ...], n: int, of: str, what: str = "values") -> None:
     if len(items) != n:
         raise ConfigError(f"{key} has {len(items)} {what} for {n} {of}")
 
 
-def _finite(key: str, row: Row) -> None:
+def _check_finite(key: str, row: Row) -> None:
     if not all(map(math.isfinite, row)):
         raise ConfigError(f"{key} must be finite numbers")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _join(names: Sequence[str]) -> str:
     more = f" ... ({len(names)})" if len(names) > 12 else ""
     return ", ".join(names[:12]) + more

@@ -1,8 +1,8 @@
-"""Calibrations at rest: one TOML file per device, which people read and mend.
+"""Storage of calibrations: one TOML file per device, which people can read and edit.
 
     $XDG_CONFIG_HOME/tactile_rt/calibration/DEVICE.toml     (~/.config if that is not set)
 
-A file is written whole or not at all. It carries a version; one of another version is refused.
+A file is written whole or not at all. It has a version; a file of another version is refused.
 """
 
 import json
@@ -51,58 +51,58 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def calibration_path(device: str) -> Path:
-    """Where the calibration of a device is kept unless one says otherwise."""
+    """Return the default path of a device's calibration."""
     check_device(device)
-    return _folder() / f"{device}.toml"
+    return _find_folder() / f"{device}.toml"
 
 
 def load_calibration(which: str | Path) -> Calibration:
     """Read the calibration of a device by its id, or from a file.
 
     Args:
-        which: a path if it ends in ``.toml`` or has a folder in it; else a device's id.
+        which: a path if it ends in ``.toml`` or contains a folder; else a device's id.
     """
     named = str(which)
     path = Path(which)
     if not (isinstance(which, Path) or path.suffix == ".toml" or os.sep in named):
         path = calibration_path(named)
         if not path.is_file():
-            there = sorted(p.stem for p in _folder().glob("[!.]*.toml"))
+            known = sorted(p.stem for p in _find_folder().glob("[!.]*.toml"))
             raise ConfigError(
-                f"no calibration of device {named!r} in {_folder()}; {nearest(named, there)}"
+                f"no calibration of device {named!r} in {_find_folder()}; {nearest(named, known)}"
             )
-    return _calibration(read_toml(path))
+    return _parse_calibration(read_toml(path))
 
 
 def save_calibration(calibration: Calibration, path: Path | None = None) -> Path:
-    """Write it where `load_calibration` finds it, or to a file of your own.
+    """Write a calibration to its default path, or to a given file; return the path.
 
     Raises:
-        ConfigError: the folder of `path` is not there.
+        ConfigError: the folder of `path` does not exist.
     """
     if path is None:
         path = calibration_path(calibration.device)
         path.parent.mkdir(parents=True, exist_ok=True)
     elif not path.parent.is_dir():
         raise ConfigError(f"no folder {path.parent} to write {path.name} in")
-    text = _written(calibration).encode()
+    text = _format_file(calibration).encode()
     write_whole(path, lambda file: file.write(text))
     return path
 
 
-def _folder() -> Path:
+def _find_folder() -> Path:
     configured = os.environ.get("XDG_CONFIG_HOME", "")
-    # The specification has relative paths ignored.
+    # The XDG specification requires that relative paths are ignored.
     try:
         home = Path(configured) if os.path.isabs(configured) else Path.home() / ".config"
-    except RuntimeError:  # neither HOME nor a line in /etc/passwd
+    except RuntimeError:  # neither HOME is set nor a line in /etc/passwd exists
         raise ConfigError(
             "this user has no home to keep calibrations in: set XDG_CONFIG_HOME, or name a file"
         ) from None
     return home / "tactile_rt" / "calibration"
 
 
-def _calibration(nodes: SettingNode) -> Calibration:
+def _parse_calibration(nodes: SettingNode) -> Calibration:
     version = nodes.value.get("version")
     if version is None or version.value != VERSION:
         found = None if version is None else version.plain()
@@ -117,11 +117,11 @@ def _calibration(nodes: SettingNode) -> Calibration:
         return Calibration(
             file.device, **raw, output_channels=out.channels, output_units=out.units, **rest
         )
-    except ConfigError as error:  # how its parts fit together
+    except ConfigError as error:  # the parts do not fit together
         raise ConfigError(f"{nodes.where}: {error}") from None
 
 
-def _written(c: Calibration) -> str:
+def _format_file(c: Calibration) -> str:
     outputs = list(zip(*c.output, strict=True))
     lines = [
         f"# Calibration of the tactile sensor {c.device}, for tactile-rt.",
@@ -152,14 +152,14 @@ def _written(c: Calibration) -> str:
         ("noise", c.noise, "standard deviation of the raw reading at no load"),
     ):
         if rows:
-            lines += ["", f"[{what}]  # {meaning}: {_listed(c.channels)}"]
+            lines += ["", f"[{what}]  # {meaning}: {_join(c.channels)}"]
             lines += [f"{_key(element)} = {_toml(row)}" for element, row in rows.items()]
     if c.matrices:
         lines += ["", "[matrix]  # a row per output channel: output unit per raw unit"]
     for element, matrix in c.matrices.items():
-        lines += [f"{_key(element)} = [  # columns: {_listed(c.channels)}"]
+        lines += [f"{_key(element)} = [  # columns: {_join(c.channels)}"]
         lines += [
-            f"  {_toml(row)},  # {_listed(of)}" for of, row in zip(outputs, matrix, strict=True)
+            f"  {_toml(row)},  # {_join(of)}" for of, row in zip(outputs, matrix, strict=True)
         ]
         lines += ["]"]
     if c.mirror:
@@ -173,19 +173,19 @@ def _written(c: Calibration) -> str:
             lines += ["[mirror.signs]  # of channels whose name and unit do not tell"]
             lines += [f"{_key(channel)} = {sign}" for channel, sign in c.mirror.signs.items()]
     if c.gain:
-        gain = f"gain = {_toml(c.gain)}  # of elements without a matrix: {_listed(c.channels)}"
+        gain = f"gain = {_toml(c.gain)}  # of elements without a matrix: {_join(c.channels)}"
         lines.insert(lines.index("history = ["), gain)
     return "\n".join(lines) + "\n"
 
 
 def _toml(value: object) -> str:
-    # JSON's strings, numbers and lists are TOML's, but for the one control character that JSON
-    # leaves as it is. Numbers are the shortest text that reads back as the same.
+    # JSON's strings, numbers and lists are valid TOML, except for one control character that JSON
+    # does not escape. Numbers are the shortest text that reads back as the same.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _listed(names: Iterable[str]) -> str:
-    # for a comment: a device that describes itself may have a line's end in a name
+def _join(names: Iterable[str]) -> str:
+    # for a comment: a name that a device sends may contain a line break
     return ", ".join(_toml(name)[1:-1] for name in names)
 
 

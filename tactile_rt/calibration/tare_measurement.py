@@ -1,13 +1,13 @@
-"""Tare: what an array reads while nothing touches it, and how noisy that is.
+"""Measurement of a tare: the readings of an untouched array, and their noise.
 
-All statistics are medians, so that a spike moves none of them. Noise is 1.4826 times the median
+All statistics are medians, so that single spikes have no effect. Noise is 1.4826 times the median
 absolute deviation from the median of a sample's own block, an eighth of the recording (for normal
-noise that is its standard deviation; slow changes do not count). It is no smaller than the
-smallest step between two readings, the resolution of a converter quieter than its last digit.
+noise this is the standard deviation; slow changes do not count). It is no smaller than the smallest
+step between two readings: the resolution, for a converter that is quieter than its last digit.
 
-An element is refused that was touched (a block's median is off the median of all by more than 3
-noise, or 5 samples running are by more than 8) or that drifts (its last quarter is off its first
-by more than 2). What leans on an array all the time from before the tare reads as no load.
+An element is refused if it was touched (a block's median differs from the overall median by more
+than 3 times the noise, or 5 consecutive samples do by more than 8 times) or if it drifts (its last
+quarter differs from its first by more than 2 times). A constant load reads as no load.
 """
 
 import time
@@ -23,23 +23,23 @@ from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, concat
 Floats = NDArray[np.float64]
 
 BLOCKS = 8
-LEAST_SAMPLES = 8 * BLOCKS  # a block's median must be surer than the limits below
+LEAST_SAMPLES = 8 * BLOCKS  # a block's median must be more accurate than the limits below
 TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
-TOUCH, DRIFT = 3.0, 2.0  # of block and quarter medians, in noise
-TAP, TAP_SAMPLES = 8.0, 5  # of single samples
-PATIENCE_S = 3.0  # beyond the seconds asked for
+TOUCH, DRIFT = 3.0, 2.0  # largest differences of block and quarter medians, in units of noise
+TAP, TAP_SAMPLES = 8.0, 5  # likewise of single samples, and how many in a row
+PATIENCE_S = 3.0  # wait in addition to the requested seconds
 SLICE_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Tare:
-    """What a quiet array reads.
+    """Readings of an untouched array.
 
     Attributes:
-        offset: (element, channel) median, raw units; 0 of an element without enough valid samples.
+        offset: (element, channel) median, raw units; 0 for an element with too few valid samples.
         noise: (element, channel) standard deviation of a sample, raw units; 0 likewise.
-        changes: share of readings unlike the one before, where an element's channels repeat most.
-        samples: (element,) valid samples that these rest on.
+        changes: share of readings unlike the one before, of the element that repeats most.
+        samples: (element,) number of valid samples.
         seconds: Time from the first sample to the last one, s.
     """
 
@@ -59,14 +59,14 @@ class Tare:
 
 
 def tare(source: Source, seconds: float = 2.0) -> Tare:
-    """Read a source for some seconds, while nothing touches its array.
+    """Measure the tare of an array while nothing touches it.
 
     Args:
-        source: of raw samples; of a calibrated source those below it are read.
-        seconds: of the stream's own time.
+        source: of raw samples; if it is calibrated, its raw source is read.
+        seconds: duration by the stream's own time.
 
     Raises:
-        ConfigError: the array is touched or drifts (which element, which channel, when), or too few
+        ConfigError: the array is touched or drifts (names element, channel and time), or too few
             samples came.
         SourceError: the source is silent, or broke.
     """
@@ -90,9 +90,9 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
             continue
         quiet = whole.valid[:, i]
         values = whole.values[quiet, i].astype(np.float64)
-        offset[i], noise[i] = _rest(values)
+        offset[i], noise[i] = _measure_rest(values)
         changes = min(changes, float((values[1:] != values[:-1]).mean(axis=0).max()))
-        if trouble := _trouble(values, offset[i], noise[i], t_s[quiet], source.spec):
+        if trouble := _diagnose(values, offset[i], noise[i], t_s[quiet], source.spec):
             troubles.append(f"element {element} {trouble}")
     if troubles:
         more = f" (and {len(troubles) - 1} more elements)" if len(troubles) > 1 else ""
@@ -101,7 +101,7 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
 
 
 def record(source: Source, seconds: float) -> list[Chunk]:
-    """The first so many seconds of a stream, by its own time; at least a chunk."""
+    """Read the first seconds of a stream by its own time, at least one chunk."""
     chunks: list[Chunk] = []
     end = None
     patience = time.monotonic() + seconds + PATIENCE_S
@@ -120,23 +120,23 @@ def record(source: Source, seconds: float) -> list[Chunk]:
     return chunks
 
 
-def _blocks(values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def _split_blocks(values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     return np.array_split(values, BLOCKS)
 
 
-def _rest(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Offset and noise of an element, each (channel,), from its valid samples (n, channel)."""
-    off = np.concatenate([np.abs(b - np.median(b, axis=0)) for b in _blocks(values)])
+def _measure_rest(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return offset and noise of an element, each (channel,), from valid samples (n, channel)."""
+    off = np.concatenate([np.abs(b - np.median(b, axis=0)) for b in _split_blocks(values)])
     steps = np.diff(np.sort(values, axis=0), axis=0)
     step = np.where(steps > 0, steps, np.inf).min(axis=0)
     noise = np.maximum(TO_SIGMA * np.median(off, axis=0), np.where(np.isfinite(step), step, 0.0))
     return np.median(values, axis=0), noise
 
 
-def _trouble(values: Floats, offset: Floats, noise: Floats, t_s: Floats, spec: ArraySpec) -> str:
-    """What kept an element from rest, if anything did; of its worst channel."""
-    scale = np.where(noise > 0, noise, 1.0)  # where there is none, nothing has changed either
-    medians = np.stack([np.median(b, axis=0) for b in _blocks(values)])
+def _diagnose(values: Floats, offset: Floats, noise: Floats, t_s: Floats, spec: ArraySpec) -> str:
+    """Describe a touch or drift of an element, on its worst channel; empty: at rest."""
+    scale = np.where(noise > 0, noise, 1.0)  # without noise, no reading has changed, either
+    medians = np.stack([np.median(b, axis=0) for b in _split_blocks(values)])
     quarter = len(values) // 4
     quarters = [np.median(part, axis=0) for part in (values[:quarter], values[-quarter:])]
     away = np.abs(medians - offset) / scale

@@ -1,1 +1,1 @@
-"""What every room stands on: streams, settings, files and errors; no touch, no device, no model."""
+"""Base of all packages: streams, settings, files, errors; nothing of touch, devices or models."""

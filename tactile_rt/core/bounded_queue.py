@@ -1,18 +1,18 @@
-"""A queue between two parts: whoever puts never waits, the oldest goes, all is counted.
+"""Bounded queue between two parts: `put` never waits, the oldest items are dropped and counted.
 
     put  -->  | oldest ... newest |  -->  get, take
                   |
                   v dropped: when there are too many items, or too many bytes
 
-The goal is a stream that stays recent behind a slow reader, and an account of it that adds up. Each
-item is of a kind and counts for so many, e.g. 9 samples; at every moment, for each kind,
+The goal is a stream that stays recent behind a slow reader, and counts that add up. Each item has a
+kind and a count, e.g. 9 samples; at every moment, for each kind,
 
     put = taken + dropped + waiting
 
-One lock guards all of it. Nothing that takes long is done under it, so that whoever puts is held up
-by no reader. A reader takes one item (`get`) or all that wait (`take`). To be woken for every item
-costs more than the item where many come; so `take` may gather for a while, unless something urgent
-comes. Whoever must lose nothing waits for room before it puts.
+One lock guards all. Nothing slow is done under it, so that no reader delays a writer. A reader
+takes one item (`get`) or all that wait (`take`). If many items come, waking up for each costs more
+than the item itself; so `take` may gather items for a while, unless an urgent one comes. A writer
+that must not lose anything waits for room before it puts.
 
 Many threads may put; one reads. In an event loop the loop's own thread may do both, and wakes its
 reader by itself.
@@ -26,17 +26,17 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-LOOK_S = 0.2  # how long to wait for the counts
+LOOK_S = 0.2  # longest wait for the lock to read the counts
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class QueueState:
-    """What became of all that was put into a queue, by kind: put = taken + dropped + waiting.
+    """Counts of a queue's items by kind. For each, put = taken + dropped + waiting.
 
     Attributes:
-        oldest_s: The time that the oldest of all that waits has waited, s; 0 if nothing waits.
+        oldest_s: The time that the oldest waiting item has waited, s; 0 if none waits.
     """
 
     waiting: dict[str, int] = field(default_factory=dict)
@@ -47,23 +47,23 @@ class QueueState:
     oldest_s: float = 0.0
 
 
-def _one(item: Any) -> tuple[str, int, int]:
+def _count_one(item: Any) -> tuple[str, int, int]:
     return "items", 1, 0
 
 
 class BoundedQueue(Generic[T]):
-    """Items that wait for one reader.
+    """Queue of items that wait for one reader.
 
     Args:
-        size: how many bytes may wait; a single item may be larger.
-        measure: gives kind, count and bytes of an item, or None: it is left out, uncounted. By
-            default all are ``items`` of no size.
-        kinds: all that `measure` gives.
-        urgent: kinds that `take` does not gather for.
-        gather_s: how long `take` lets items that are not urgent come together, s.
+        size: largest number of waiting bytes; a single item may be larger.
+        measure: returns kind, count and bytes of an item; None: the item is ignored, uncounted. By
+            default every item is one of ``items``, of no size.
+        kinds: all kinds that `measure` returns.
+        urgent: kinds for which `take` returns at once.
+        gather_s: time for which `take` gathers items that are not urgent, s.
 
     Attributes:
-        taking: Whether there is a reader to wait for; `wait_for_room` returns at once if not.
+        taking: Whether a reader takes items; if not, `wait_for_room` returns at once.
     """
 
     def __init__(
@@ -71,28 +71,28 @@ class BoundedQueue(Generic[T]):
         items: int = sys.maxsize,
         size: int = sys.maxsize,
         *,
-        measure: Callable[[T], tuple[str, int, int] | None] = _one,
+        measure: Callable[[T], tuple[str, int, int] | None] = _count_one,
         kinds: Sequence[str] = ("items",),
         urgent: Collection[str] = (),
         gather_s: float = 0.0,
     ) -> None:
         self._items, self._half, self._size = items, items // 2, size
-        self._measured = measure
+        self._measure = measure
         self._urgent, self._gather_s = frozenset(urgent), gather_s
-        # item, kind, count, bytes, since when
+        # item, kind, count, bytes, time of `put`
         self._queue: deque[tuple[T, str, int, int, float]] = deque()
         self._bytes = self._urgent_ones = 0
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
-        self._waiting = 0  # threads
+        self._waiting = 0  # number of waiting threads
         self._closed = False
         self.taking = True
         self._put, self._taken, self._dropped = (dict.fromkeys(kinds, 0) for _ in range(3))
         self._seen = self._counts()
 
     def put(self, item: T) -> None:
-        """Add an item; the oldest are dropped for it if need be."""
-        found = self._measured(item)
+        """Add an item; drop the oldest items if necessary."""
+        found = self._measure(item)
         if found is None:
             return
         kind, n, size = found
@@ -109,12 +109,12 @@ class BoundedQueue(Generic[T]):
                 self._urgent_ones += 1
             while len(queue) > self._items or (self._bytes > self._size and len(queue) > 1):
                 self._drop()
-            # To tell nobody costs as much as all else here.
+            # Notifying without a waiting thread would cost as much as all else here.
             if self._waiting and (urgent or len(queue) == 1 or len(queue) >= self._half):
                 self._changed.notify_all()
 
     def get(self, timeout: float | None = None) -> T | None:
-        """The oldest item, as soon as there is one; None when the time is over, or closed."""
+        """Take the oldest item, waiting for one if necessary; None: timeout or closed."""
         with self._lock:
             if not self._queue:
                 self._wait(lambda: self._queue or self._closed, timeout)
@@ -130,7 +130,7 @@ class BoundedQueue(Generic[T]):
             return item
 
     def take(self, timeout: float | None = None) -> list[T]:
-        """All that wait, as soon as there are any; empty when the time is over, or closed."""
+        """Take all waiting items, waiting for one if necessary; empty: timeout or closed."""
         with self._lock:
             if not self._queue:
                 self._wait(lambda: self._queue or self._closed, timeout)
@@ -150,16 +150,16 @@ class BoundedQueue(Generic[T]):
             return items
 
     def wait_for_room(self, timeout: float | None = None) -> None:
-        """Wait until at most half of it is full, nobody takes from it, or the time is over."""
-        if not self._has_room():  # a look without the lock: who puts much is not held up by it
+        """Wait until the queue is at most half full, not read, closed, or timed out."""
+        if not self._has_room():  # checked without the lock, so as not to delay busy writers
             with self._lock:
                 self._wait(self._has_room, timeout)
 
     def close(self, drop: bool = False) -> None:
-        """Let nothing more in; `get` and `take` wait no more.
+        """Accept no more items; `get` and `take` wait no more.
 
         Args:
-            drop: whether what waits is dropped, too; else it can still be taken.
+            drop: whether to drop the waiting items, too; else they can still be taken.
         """
         with self._lock:
             self._closed = True
@@ -169,18 +169,18 @@ class BoundedQueue(Generic[T]):
 
     @property
     def closed(self) -> bool:
-        """Whether it takes no more."""
+        """True if the queue accepts no more items."""
         return self._closed
 
     @property
     def dropped(self) -> dict[str, int]:
-        """How many of each kind were dropped so far."""
+        """Counts of the dropped items so far, by kind."""
         with self._lock:
             return dict(self._dropped)
 
     @property
     def state(self) -> QueueState:
-        """Counts now; those of the last look if a thread hangs in here, so that it can be told."""
+        """Present counts. If a thread hangs with the lock, those of the last call are given."""
         if self._lock.acquire(timeout=LOOK_S):
             try:
                 self._seen = self._counts()
@@ -198,7 +198,7 @@ class BoundedQueue(Generic[T]):
         )
 
     def _wait(self, until: Callable[[], object], timeout: float | None) -> None:
-        """Wait, and be known to: nobody else is told of a change."""
+        """Wait for a condition, as one of the threads that `put` and others notify."""
         self._waiting += 1
         try:
             self._changed.wait_for(until, timeout)
@@ -206,7 +206,7 @@ class BoundedQueue(Generic[T]):
             self._waiting -= 1
 
     def _drop(self) -> None:
-        """Let the oldest go."""
+        """Drop the oldest item."""
         _, kind, n, size, _ = self._queue.popleft()
         self._dropped[kind] += n
         self._bytes -= size

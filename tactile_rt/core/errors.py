@@ -7,29 +7,29 @@
       +-- RecordingError    a stored stream is damaged or of another version
       +-- ModelError        a model file is damaged or of another version
 
-They are apart from `stream`, which needs numpy, so that a command starts quickly.
+This module is separate from `stream`, which needs NumPy, so that a command starts quickly.
 """
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-LONGEST, WORD = 200, 80  # characters of a message, and of a word of it that is no path
+LONGEST, WORD = 200, 80  # characters of a message, and of a word in it that is no path
 
 
 def name_some(items: Iterable[str], most: int = 3, between: str = ", ") -> str:
-    """Join the first items for a message, and count the rest: ``a, b, c and 17 more``."""
+    """Join the first items for a message, count the rest: ``a, b and 17 more``."""
     names = list(items)
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return between.join(names[:most]) + more
 
 
 def length(message: str) -> int:
-    """Count the characters of a message; of a URL or the like 40 at most, of a path none."""
+    """Count the characters of a message: at most 40 per word, none for a path."""
     return sum(min(len(word), WORD // 2) + 1 for word in message.split(" ") if "/" not in word)
 
 
 def shorten(message: str) -> str:
-    """Cut what is too long out of a message: of a word that is no path, then of the whole."""
+    """Shorten a message that is too long: first words that are no paths, then all."""
     words = [
         word if len(word) <= WORD or "/" in word else f"{word[:30]}...{word[-20:]}"
         for word in message.split(" ")
@@ -39,11 +39,11 @@ def shorten(message: str) -> str:
 
 
 class TactileError(Exception):
-    """Base of all errors that a caller may want to handle; the message is one clear line."""
+    """Base of all errors that a caller may want to handle. The message is one line."""
 
 
 class ConfigError(TactileError):
-    """The user asked for something that cannot be: the message names it and what to do."""
+    """The user asked for something impossible; the message names it and what to do."""
 
 
 class SourceError(TactileError):
@@ -63,10 +63,10 @@ class ModelError(TactileError):
 
 
 def describe_error(error: BaseException, most: int | None = None) -> str:
-    """Describe an error by its words in one line; without any, by its type.
+    """Describe an error in one line: by its message, or by its type if without.
 
     Args:
-        most: Number of characters of its words.
+        most: Largest number of characters of the message.
     """
     return " ".join(str(error).split())[:most] or type(error).__name__
 
@@ -75,10 +75,10 @@ def describe_error(error: BaseException, most: int | None = None) -> str:
 def explain_errors(
     kind: type[TactileError], before: str, after: str = ")", most: int | None = None
 ) -> Iterator[None]:
-    """Raise what a parser raises as one error of ours, its words within a text.
+    """Turn any error in the block into `kind`, with its message between two texts.
 
     Args:
-        most: Number of characters of its words.
+        most: Largest number of characters of the message.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Files and folders that are there whole or not at all, and files that are none."""
+"""Atomic writing of files and folders, and refusal of paths that are no regular files."""
 
 import errno
 import os
@@ -17,31 +17,31 @@ _LFS: Final = b"version https://git-lfs.github.com/spec/"
 
 
 def is_pointer(begins: bytes) -> bool:
-    """Return whether a Git LFS pointer, which names content stored elsewhere, begins so."""
+    """Return whether a file's first bytes make it a Git LFS pointer to content elsewhere."""
     return begins.startswith(_LFS)
 
 
 def check_no_pointer(path: Path) -> None:
-    """Refuse a Git LFS pointer; what cannot be read is left to the reader.
+    """Refuse a Git LFS pointer; ignore a file that cannot be read.
 
     Raises:
-        ConfigError: it is one.
+        ConfigError: the file is a pointer.
     """
     with suppress(OSError):
         open_regular(path).close()
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file to read. A pipe, socket or device is refused, and never waited for.
+    """Open a regular file to read. Refuse a pipe, socket or device without waiting.
 
     Raises:
-        ConfigError: it is a Git LFS pointer.
-        OSError: it is no file, or cannot be read.
+        ConfigError: the file is a Git LFS pointer.
+        OSError: the path is no regular file, or cannot be read.
     """
-    _check_regular(path, os.stat(path))  # opening a device may do something to it
+    _check_regular(path, os.stat(path))  # before opening, which may have effects on a device
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
     try:
-        _check_regular(path, os.fstat(file.fileno()))  # nor what has come in its place since
+        _check_regular(path, os.fstat(file.fileno()))  # again: it may have been replaced since
         if is_pointer(os.pread(file.fileno(), len(_LFS), 0)):
             raise ConfigError(f"{path} {POINTER}")
     except (OSError, ConfigError):
@@ -58,83 +58,83 @@ def _check_regular(path: Path, status: os.stat_result) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Put the names of a folder's files on the medium; without it a power cut may take them.
+    """Sync a folder to the medium, so that its files' names survive a power cut.
 
     Raises:
-        OSError: the medium failed, or there is no such folder.
+        OSError: the medium failed, or no such folder exists.
     """
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except PermissionError:  # who may write into a folder need not be allowed to read it
+    except PermissionError:  # a folder may be writable but not readable
         return
     try:
         os.fsync(handle)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # a file system that knows no such thing
+        if error.errno != errno.EINVAL:  # the file system cannot sync folders
             raise
     finally:
         os.close(handle)
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write(file)` fill a file that appears under its name only when complete.
+    """Write a file by `write(file)`; it gets its name only when complete.
 
-    Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder. If it fails, nothing has
-    changed. What is no file, as ``/dev/null`` or a pipe, is written into.
+    Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder. After a failure nothing has
+    changed. A path that is no regular file, as ``/dev/null`` or a pipe, is written to directly.
 
     Raises:
-        OSError: naming `path`: its folder cannot be written into, or the medium is full.
+        OSError: names `path`: its folder cannot be written into, or the medium is full.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         try:
             with path.open("wb") as file:
                 write(file)
         except OSError as error:
-            _name(error, path, path)
+            _raise_for(error, path, path)
             raise
         return
-    with _complete(path, _hidden(path), "x+b") as file:
+    with _write_hidden(path, _hide_name(path), "x+b") as file:
         write(file)
 
 
 @contextmanager
-def _complete(path: Path, hidden: Path, mode: str) -> Iterator[BinaryIO]:
-    """A file that takes its name when the block ends; if that fails, nothing has changed."""
+def _write_hidden(path: Path, hidden: Path, mode: str) -> Iterator[BinaryIO]:
+    """Yield a hidden file that takes its name when the block ends without an error."""
     try:
         with cast(BinaryIO, hidden.open(mode)) as file:
             yield file
         os.replace(hidden, path)
     except BaseException as error:
-        with suppress(OSError):  # where nothing may be written it may not be removed either
+        with suppress(OSError):  # in a read-only folder it cannot be removed, either
             hidden.unlink(missing_ok=True)
-        _name(error, hidden, path)
+        _raise_for(error, hidden, path)
         raise
 
 
-def _hidden(path: Path) -> Path:
+def _hide_name(path: Path) -> Path:
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
 
 
-def _name(error: BaseException, hidden: Path, path: Path) -> None:
-    """Let a failure of what is hidden, or of no file that is named, be one of `path`."""
+def _raise_for(error: BaseException, hidden: Path, path: Path) -> None:
+    """Raise an error of a hidden or unnamed file as one of `path`. Ignore any other."""
     if not isinstance(error, OSError) or not error.errno:
         return
-    named = error.filename  # a number, where the file was opened by one
+    named = error.filename  # a number if the file was opened by its descriptor
     if named is None or (isinstance(named, str) and Path(named).is_relative_to(hidden)):
         raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
 
 
 @contextmanager
 def replaced(path: Path) -> Iterator[BinaryIO]:
-    """A file to fill that takes its name when the block ends, and is on the medium by then.
+    """Yield a file that is synced and takes its name when the block ends.
 
-    Until then it is ``STEM.partial`` beside it, so that a process that was killed leaves one at
-    most; the folder must be one's own (`locks.alone_in`). If the block fails, nothing has changed.
+    Until then it is ``STEM.partial`` beside it, so that killed processes leave at most one; the
+    folder must be locked (`locks.alone_in`). If the block fails, nothing has changed.
 
     Raises:
-        OSError: naming `path`: the medium is full, or failed.
+        OSError: names `path`: the medium is full, or failed.
     """
-    with _complete(path, path.with_suffix(".partial"), "wb") as file:
+    with _write_hidden(path, path.with_suffix(".partial"), "wb") as file:
         yield file
         file.flush()
         os.fsync(file.fileno())
@@ -142,19 +142,19 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """A folder to fill, which takes its name, and the place of what had it, when the block ends.
+    """Yield a folder to fill, which replaces the one at `path` when the block ends.
 
     Until then it is hidden: ``.NAME.XXXXXXXX`` beside it. If the block fails, nothing has changed.
 
     Raises:
-        OSError: naming `path`, where it is of no file in it: the medium is full, for one.
+        OSError: names `path` or a file in it; for example, the medium is full.
     """
-    made = _hidden(path)
+    made = _hide_name(path)
     try:
         made.mkdir()
         yield made
         if path.exists():
-            old = _hidden(path)
+            old = _hide_name(path)
             path.rename(old)
             made.rename(path)
             shutil.rmtree(old)
@@ -162,5 +162,5 @@ def whole_folder(path: Path) -> Iterator[Path]:
             made.rename(path)
     except BaseException as error:
         shutil.rmtree(made, ignore_errors=True)
-        _name(error, made, path)
+        _raise_for(error, made, path)
         raise

@@ -1,8 +1,8 @@
-"""One process per configuration, device and folder: a second is refused, by the first one's pid.
+"""Locks that allow one process per configuration, device and folder, and name its pid to others.
 
-A lock is a name in the kernel's abstract namespace of Unix sockets (unix(7)), which ends with the
-process that has it. No file is written, so that neither the environment, nor a read-only system,
-nor what another user left behind decides who is alone.
+A lock is a name in the kernel's abstract namespace of Unix sockets (unix(7)), which is released
+when its process ends. No file is written, so environment variables, a read-only file system or
+leftover files of another user have no influence.
 """
 
 import errno
@@ -19,25 +19,25 @@ from urllib.parse import unquote, urlsplit
 from tactile_rt.core.errors import ConfigError, TactileError
 
 DEVICES = ("serial", "can")
-TRIES = 20  # at a name whose holder does not answer: it has just begun, or has just ended
+TRIES = 20  # to lock a name whose holder does not answer: it has just begun, or has just ended
 PAUSE_S = 0.01
 CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
-WAITING = 4096  # who has asked for the pid stays in a queue that nobody empties
+WAITING = 4096  # length of the queue of processes that asked for the pid: it is never emptied
 
 
 class AlreadyRunning(TactileError):
-    """Another process has the configuration, or the device; the message names it."""
+    """Another process has locked the configuration or device; the message names it."""
 
 
 def lock_keys(config: Path, urls: list[str]) -> list[str]:
-    """What a daemon must have to itself: its configuration, and every device."""
-    # As it is named, too: a link may lead to another file by the time a second one starts.
+    """List the locks of a daemon: its configuration, and every device."""
+    # By its given name, too: a link may lead to another file when a second daemon starts.
     paths = [os.path.realpath(config), os.path.abspath(config)]
     return list(dict.fromkeys([*(f"configuration {p}" for p in paths), *device_keys(urls)]))
 
 
 def device_keys(urls: list[str]) -> list[str]:
-    """The devices of some sources; two names of one port are one device."""
+    """List the locks of the devices of some sources. Two names of a port are one device."""
     keys = []
     for url in urls:
         parts = urlsplit(url, allow_fragments=False)
@@ -45,21 +45,21 @@ def device_keys(urls: list[str]) -> list[str]:
             continue
         target = unquote(parts.netloc + parts.path)
         port = target.removeprefix("slcan:") if target.startswith("slcan:") else target
-        # A bus of CAN has a name; a serial line is a file, which may be named from the folder here.
+        # A CAN bus has a name; a serial line is a file, maybe relative to the working folder.
         line = port != target or parts.scheme == "serial"
-        there = port.startswith("/") or (line and os.path.exists(port))
-        keys.append(f"device {os.path.realpath(port) if there else target}")
+        is_file = port.startswith("/") or (line and os.path.exists(port))
+        keys.append(f"device {os.path.realpath(port) if is_file else target}")
     return list(dict.fromkeys(keys))
 
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Have a folder to oneself while the block runs; by all its names, and before it is there.
+    """Lock a folder for this process while the block runs.
 
-    Only processes of one computer see each other.
+    It need not exist yet, and links to it are resolved. Only processes of one computer see locks.
 
     Raises:
-        ConfigError: another process has it.
+        ConfigError: another process has locked the folder.
         TactileError: as `Locks.hold`.
     """
     locks = Locks()
@@ -74,17 +74,17 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 class Locks:
-    """Locks that the process holds until it ends, however it ends."""
+    """Locks that are held until they are closed, or the process ends in any way."""
 
     def __init__(self) -> None:
         self._held: dict[str, socket.socket] = {}
 
     def hold(self, keys: list[str]) -> None:
-        """Hold exactly these: get what is missing, then let go of the others.
+        """Hold exactly these locks: acquire the missing ones, then release all others.
 
         Raises:
-            AlreadyRunning: another process has one; what was held is still held.
-            TactileError: the kernel gives none, which is so where Unix sockets are forbidden.
+            AlreadyRunning: another process has one; the locks held before are still held.
+            TactileError: the kernel refuses a lock, for example because it forbids Unix sockets.
         """
         got: dict[str, socket.socket] = {}
         try:
@@ -100,12 +100,12 @@ class Locks:
         self._held.update(got)
 
     def close(self) -> None:
-        """Let go of all."""
+        """Release all locks."""
         self.hold([])
 
 
 def _lock(key: str) -> socket.socket:
-    name = _name(key)
+    name = _make_name(key)
     for _ in range(TRIES):
         handle = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -117,7 +117,7 @@ def _lock(key: str) -> socket.socket:
             if error.errno != errno.EADDRINUSE:
                 raise TactileError(f"no lock for {key}: {error.strerror}") from None
         try:
-            who = _holder(name)
+            who = _describe_holder(name)
         except ConnectionRefusedError:
             time.sleep(PAUSE_S)
             continue
@@ -125,20 +125,20 @@ def _lock(key: str) -> socket.socket:
     raise AlreadyRunning(f"{key} is in use by a process that does not tell who it is")
 
 
-def _name(key: str) -> bytes:
-    """The same wherever it is asked for, but in a container: its paths are others."""
+def _make_name(key: str) -> bytes:
+    """Make a lock's socket name; it differs in a container, where paths differ, too."""
     root = os.stat("/")
-    told = f"{root.st_dev} {root.st_ino} {key}"
-    return b"\0tactile-rt/" + hashlib.sha256(os.fsencode(told)).hexdigest()[:32].encode()
+    text = f"{root.st_dev} {root.st_ino} {key}"
+    return b"\0tactile-rt/" + hashlib.sha256(os.fsencode(text)).hexdigest()[:32].encode()
 
 
-def _holder(name: bytes) -> str:
-    """Who listens at a name; the kernel says so, nobody can say it of another."""
+def _describe_holder(name: bytes) -> str:
+    """Describe the process that listens at a name, by the kernel's credentials."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         try:
             asking.connect(name)
-        except BlockingIOError:  # very many have asked
+        except BlockingIOError:  # the queue is full
             return "another process"
         found = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size)
     pid, uid, _ = CREDENTIALS.unpack(found)

@@ -1,15 +1,15 @@
-"""Packages: the version of this one, what others add to it, and how to install a missing one.
+"""Packages: the version of this package, plugins of others, and installation of missing ones.
 
-A package says in its pyproject.toml what it adds, by the entry points of a group:
+A plugin declares what it adds in its pyproject.toml, by the entry points of a group:
 
     [project.entry-points."tactile_rt.sources"]
     weather = "tactile_weather:WeatherSource"
 
-Once it is installed, ``weather:`` is a source everywhere. Ours are looked up first, so a package
-adds names and replaces none; what it names is imported when it is asked for.
+Once it is installed, ``weather:`` is a source everywhere. Built-in names are looked up first, so a
+plugin adds names and replaces none; its object is imported when it is requested.
 
-An extra is added by the same road by which tactile_rt came, into the same environment: from a
-checkout by its folder; otherwise to what is installed, which pip then need not find anywhere.
+An extra is installed as tactile_rt itself was, into the same environment: from a checkout by its
+folder; otherwise by adding to the installed package, which pip need not find again.
 """
 
 import shlex
@@ -24,28 +24,28 @@ from typing import Any
 
 from tactile_rt.core.errors import ConfigError
 
-VERSION = "0.2.0"  # which recordings, sweep sets and model files carry
+VERSION = "0.2.0"  # stored in recordings, sweep sets and model files
 ROOT = Path(__file__).parents[2]  # of a checkout or an unpacked source archive
+# Groups of entry points, and what their names stand for.
 ARRAYS = "tactile_rt.arrays"  # paths of .csv or .toml files
-CELLS = "tactile_rt.cells"  # classes, of `encoders.cells.Cell`
-CODECS = "tactile_rt.codecs"  # classes, of `drivers.codec.Codec`, as serial.NAME or can.NAME
-OBJECTS = "tactile_rt.objects"  # functions of a random generator, to convex pieces
-PUBLISHERS = "tactile_rt.publishers"  # classes, of `daemon.consumer.Consumer`
-# Classes of the target and their `Options`, or functions of the target and the options as written,
-# which return the source.
+CELLS = "tactile_rt.cells"  # subclasses of `encoders.cells.Cell`
+CODECS = "tactile_rt.codecs"  # subclasses of `drivers.codec.Codec`, as serial.NAME or can.NAME
+OBJECTS = "tactile_rt.objects"  # functions from a random generator to convex pieces
+PUBLISHERS = "tactile_rt.publishers"  # subclasses of `daemon.consumer.Consumer`
+# Source classes, made of target and `Options`; or functions of target and options as text.
 SOURCES = "tactile_rt.sources"
 
 
 def added_names(group: str) -> tuple[str, ...]:
-    """The names that other packages add to a group, in alphabetical order; nothing is imported."""
+    """List the names that other packages add to a group, sorted. Nothing is imported."""
     return tuple(sorted(metadata.entry_points(group=group).names))
 
 
 def added(group: str, name: str) -> Any:
-    """What another package adds by this name; None if none does.
+    """Import what another package adds to a group by this name; None if none does.
 
     Raises:
-        ConfigError: It cannot be imported; the message names the package.
+        ConfigError: The import fails; the message names the package.
     """
     for point in metadata.entry_points(group=group).select(name=name):
         try:
@@ -58,23 +58,23 @@ def added(group: str, name: str) -> Any:
 
 
 def install_extra(extra: str) -> str:
-    """The command that adds an extra to this very tactile_rt, such as ``sim`` or ``sim,view``."""
+    """Return the command that adds an extra to this installation, such as ``sim,view``."""
     if (ROOT / "pyproject.toml").is_file():
         return install_line(f"{ROOT}[{extra}]", "--editable ")
     return install_line(f"tactile-rt[{extra}]")
 
 
 def install_line(requirement: str, option: str = "") -> str:
-    """The command that installs a package for the Python that is running.
+    """Return the command that installs a package for the running Python.
 
-    In an environment that uv made there is no pip: there it is uv that installs.
+    It is one of uv where the environment has no pip, as one that uv made.
     """
     python = Path(sys.executable)
     if find_spec("pip") is None:
         return (
             f"uv pip install --python {shlex.quote(str(python))} {option}{shlex.quote(requirement)}"
         )
-    # Where the environment is not activated, `pip` is another's.
+    # If the environment is not activated, `pip` belongs to another one.
     ours = shutil.which("pip") == str(python.with_name("pip"))
     pip = "pip" if ours else f"{shlex.quote(str(python))} -m pip"
     return f"{pip} install {option}{shlex.quote(requirement)}"
@@ -82,7 +82,7 @@ def install_line(requirement: str, option: str = "") -> str:
 
 @contextmanager
 def require_extra(what: str, extra: str) -> Iterator[None]:
-    """Raise `lacking` if an import in the block fails."""
+    """Raise the error of `lacking` if an import in the block fails."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -90,13 +90,13 @@ def require_extra(what: str, extra: str) -> Iterator[None]:
 
 
 def lacking(what: str, extra: str, error: ModuleNotFoundError) -> ConfigError:
-    """The error to raise when an import fails: what needs which package, and how it is installed.
+    """Make an error for a failed import that names the package and its installation.
 
     Args:
         what: The words before the package's name, such as "recordings need".
 
     Raises:
-        ModuleNotFoundError: What is missing is a module of ours, which no extra brings.
+        ModuleNotFoundError: The missing module is one of tactile_rt, which no extra contains.
     """
     missing = (error.name or extra).partition(".")[0]
     if missing == "tactile_rt":

@@ -1,13 +1,13 @@
-"""A stream at rest: an MCAP file (https://mcap.dev) that any MCAP reader opens, Foxglove for one.
+"""Recordings: streams stored as MCAP files (https://mcap.dev), which any MCAP reader opens.
 
     source --chunks, raw packets--> StreamWriter --> FILE.mcap --> Recording, replay:FILE.mcap
 
-    metadata  ``tactile_rt``: the array, what the device speaks, the clock's UTC offset
-              ``session``: what the user notes
+    metadata  ``tactile_rt``: the array, the device's codec, the clock's UTC offset
+              ``session``: the user's notes
     samples   chunks, bit for bit
-    wire      raw packets as they came, to be decoded again
-    health    how source and recorder are doing, at every change
-    decisions, events    what the daemon decided and told meanwhile
+    wire      raw packets as they arrived, which can be decoded again
+    health    state of source and recorder, at every change
+    decisions, events    the daemon's decisions and events during the recording
 
 The layout is described in docs/reference/recording.md.
 """

@@ -1,18 +1,18 @@
-"""Recordings as a LeRobot dataset (v3.0): an episode each, a row for each frame of the camera.
+"""Conversion of recordings to a LeRobot dataset (v3.0): an episode each, a row per camera frame.
 
-    data/chunk-000/file-000.parquet      rows, a file for each episode
-    videos/...                           what a camera saw, if there is a film of it
+    data/chunk-000/file-000.parquet      rows, one file per episode
+    videos/...                           camera films, if any
     meta/info.json, tasks, episodes, stats
-    meta/tactile_rt/episode-000000.json  what the recording is of: units, frame, calibration, UTC
+    meta/tactile_rt/episode-000000.json  the recording's units, frame, calibration, UTC offset
 
-What is needed: a camera has 30 frames a second, a sensor a thousand samples, and none may be lost;
-LeRobot knows one rate, that of the rows, and arrays of one shape.
+Goal: a camera has 30 frames a second, a sensor a thousand samples, and no sample may be lost; but
+LeRobot has a single rate, that of the rows, and arrays of fixed shape.
 
-The plan. A row has all samples since the row before, in an array that is as long as the fullest row
-needs, and how many they are. A row at time t has samples up to t and none after it: what a policy
-could know then. ``observation.state``, which every policy reads, is the newest sample.
+Plan: a row holds all samples since the row before, in an array as long as the fullest row needs,
+and their number. A row at time t holds samples up to t and none after it: only these could a policy
+know then. ``observation.state``, which every policy reads, is the newest sample.
 
-It is read and written piece by piece; it need not fit into memory.
+The data are read and written piece by piece; they need not fit into memory.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,8 +33,8 @@ STATE = "observation.state"
 TACTILE = "observation.tactile"
 COUNT = f"{TACTILE}.count"
 BLOCK_ROWS = 256  # written at once
-MOST_PADDING = 8  # times the samples: else they do not come as evenly as rows need
-FREE_CELLS = 1_000_000
+MOST_PADDING = 8  # padded cells per sample; more: the samples are too uneven for rows
+FREE_CELLS = 1_000_000  # padded cells that are allowed in addition
 
 _Arrays = dict[str, NDArray[Any]]
 
@@ -46,18 +46,18 @@ def write_dataset(
     task: str = "",
     films: Sequence[meta.CameraFilm] = (),
 ) -> int:
-    """Write recordings of one array as the episodes of a dataset; the number of samples.
+    """Write recordings of one array as episodes of a dataset; return the number of samples.
 
     Args:
-        folder: To make; one that is there is replaced.
-        task: What was done, in words, of all episodes; empty: what the note ``task`` of each
-            recording says, or its array's name.
+        folder: The dataset to write; an existing one is replaced.
+        task: Description of the task of all episodes; empty: the note ``task`` of each recording,
+            or its array's name.
 
     Raises:
-        ConfigError: An extra is missing, or a film is of no use.
+        ConfigError: An extra is missing, or a film cannot be used.
         RecordingError: A recording is damaged, has no samples, or its samples are spread too
             unevenly for rows.
-        SpecMismatch: They are of several arrays.
+        SpecMismatch: The recordings are of different arrays.
     """
     pa, pq = meta.import_pyarrow()
     if films and len(recordings) != 1:
@@ -66,27 +66,27 @@ def write_dataset(
     for other in recordings[1:]:
         if differing := spec.differences(other.spec):
             raise SpecMismatch(f"{other.path} is of another array: {differing[0]}")
-    ends = [_rows_of(recording, fps) for recording in recordings]
+    ends = [_find_row_ends(recording, fps) for recording in recordings]
     width = max(int(np.diff(end, prepend=0).max()) for end in ends)
-    schema = _schema(pa, spec, width)
+    schema = _make_schema(pa, spec, width)
     n, first, episodes = 0, 0, []
     with whole_folder(folder) as made:
         tasks: dict[str, int] = {}
         for k, (recording, end) in enumerate(zip(recordings, ends, strict=True)):
             about = recording.description
-            said = task or about.session.get("task") or spec.name
-            episode = meta.Episode(k, len(end), first, said, tasks.setdefault(said, len(tasks)))
+            name = task or about.session.get("task") or spec.name
+            episode = meta.Episode(k, len(end), first, name, tasks.setdefault(name, len(tasks)))
             state, values = meta.Statistics(), meta.Statistics()
             path = made / meta.DATA.format(chunk_index=k // 1000, file_index=k % 1000)
             path.parent.mkdir(parents=True, exist_ok=True)
-            # A dictionary of values takes all kinds of NaN for one.
+            # Dictionary encoding would merge NaNs of different bits.
             with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False) as file:
-                for columns, samples in _blocks(recording, end, width):
+                for columns, samples in _read_blocks(recording, end, width):
                     n += len(samples["seq"])
                     state.add(columns[STATE])
                     values.add(samples["values"], samples["valid"])
                     columns |= episode.columns(columns["frame_index"], fps)
-                    file.write_table(_table(pa, schema, columns))
+                    file.write_table(_make_table(pa, schema, columns))
             episode.statistics[STATE] = state.found()
             episode.statistics[f"{TACTILE}.values"] = values.found(repeat=width)
             for film in films:
@@ -100,37 +100,37 @@ def write_dataset(
     return n
 
 
-def _rows_of(recording: Recording, fps: int) -> NDArray[np.int64]:
-    """(row,) How many samples there are up to the end of each row; row k is at k / fps after the
-    first sample."""
+def _find_row_ends(recording: Recording, fps: int) -> NDArray[np.int64]:
+    """Return (row,) the number of samples up to the end of each row. Row k ends k / fps seconds
+    after the first sample."""
     t_ns = np.concatenate([chunk.t_ns for chunk in recording] or [np.zeros(0, np.int64)])
     if not len(t_ns):
         raise RecordingError(f"{recording.path} has no samples")
-    # Whole numbers: a sample that is taken at the very time of a row is in it.
+    # Integers, so that a sample taken exactly at the time of a row is in that row.
     times = t_ns.tolist()
     row = [-(-max(0, t - times[0]) * fps // NS_PER_S) for t in times]
     most = FREE_CELLS + MOST_PADDING * len(row)
     if max(row) >= most:
-        raise _uneven(recording, max(row), len(row))
-    # Where time goes back, samples stay in their order.
+        raise _uneven_error(recording, max(row), len(row))
+    # Where time goes back, samples keep their order.
     last = np.maximum.accumulate(np.array(row, np.int64))
     ends = np.searchsorted(last, np.arange(last[-1] + 1), side="right")
     if len(ends) * int(np.diff(ends, prepend=0).max()) > most:
-        raise _uneven(recording, len(ends), len(row))
+        raise _uneven_error(recording, len(ends), len(row))
     return ends
 
 
-def _uneven(recording: Recording, rows: int, samples: int) -> RecordingError:
+def _uneven_error(recording: Recording, rows: int, samples: int) -> RecordingError:
     return RecordingError(
         f"{recording.path}: its {samples} samples are spread over {rows} rows too unevenly for "
         "arrays of one length: convert what was recorded without a pause"
     )
 
 
-def _blocks(
+def _read_blocks(
     recording: Recording, ends: NDArray[np.int64], width: int
 ) -> Iterator[tuple[_Arrays, _Arrays]]:
-    """Columns of some rows, and the samples in them."""
+    """Yield the columns of `BLOCK_ROWS` rows at a time, with the samples in them."""
     spec = recording.spec
     counts = np.diff(ends, prepend=0)
     chunks = iter(recording)
@@ -166,16 +166,16 @@ def _blocks(
         states = []
         for begin, many in zip(begins, count, strict=True):
             mine = slice(begin, begin + many)
-            newest = _newest(newest, samples["values"][mine], samples["valid"][mine])
+            newest = _newest_valid(newest, samples["values"][mine], samples["valid"][mine])
             states.append(newest.ravel())
         columns[STATE] = np.array(states)
         yield columns, samples
 
 
-def _newest(
+def _newest_valid(
     before: NDArray[np.float32], values: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """(element, channel) The newest value that can be trusted, of each element."""
+    """Return (element, channel) the newest valid values of each element."""
     found = before.copy()
     for element in np.flatnonzero(valid.any(axis=0)):
         found[element] = values[np.flatnonzero(valid[:, element])[-1], element]
@@ -183,7 +183,7 @@ def _newest(
 
 
 def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
-    """As ``info.json`` has them."""
+    """Describe the columns for ``info.json``."""
     elements, channels, feature = list(spec.elements), list(spec.channels), meta.describe_feature
     flat = [f"{e}.{c}" for e in elements for c in channels]
     return {
@@ -199,7 +199,7 @@ def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
     }  # fmt: skip
 
 
-def _schema(pa: Any, spec: ArraySpec, width: int) -> Any:
+def _make_schema(pa: Any, spec: ArraySpec, width: int) -> Any:
     kinds = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
     fields = []
     for name, feature in {**_features(spec, width), **meta.FRAME}.items():
@@ -210,12 +210,12 @@ def _schema(pa: Any, spec: ArraySpec, width: int) -> Any:
     return pa.schema(fields)
 
 
-def _table(pa: Any, schema: Any, columns: _Arrays) -> Any:
+def _make_table(pa: Any, schema: Any, columns: _Arrays) -> Any:
     arrays = []
     for field in schema:
         column = columns[field.name]
         made = pa.array(column.ravel())
-        if pa.types.is_fixed_size_list(field.type):  # an array of one number is that number
+        if pa.types.is_fixed_size_list(field.type):  # an array of one number is stored as a scalar
             for size in reversed(column.shape[1:]):
                 made = pa.FixedSizeListArray.from_arrays(made, size)
         arrays.append(made)

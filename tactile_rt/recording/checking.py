@@ -1,9 +1,9 @@
-"""Are these the decisions of the model that was recorded, and the samples of its packets?
+"""Checks of a recording: decisions by replaying the model, samples by decoding the packets again.
 
-A decision is what it says (`FACTS`); how long it took, and what the wall clock then was, are not
-part of it. A model's step does not depend on how its stream was cut or paced, so the same model on
-the same samples decides the same, digit for digit. Packets are decoded again by this release, or
-by another codec, and compared sample by sample.
+Decisions are compared by their content (`FACTS`), not by computing or wall-clock time. A model's
+step does not depend on how its stream was cut or paced, so the same model on the same samples
+decides the same, digit for digit. Packets are decoded again by this release, or by another codec,
+and compared sample by sample.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from tactile_rt.recording.replay import prepare_replay
 FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
          "prediction_set", "coverage", "names", "names_coverage",
          "object", "object_margin", "object_touches")  # fmt: skip
-# A recording ends with its source; what was being decided just then came too late for it.
+# A recording ends with its source; decisions about its last second may have come too late for it.
 END_NS = NS_PER_S
 
 Fields = Mapping[str, Any]
@@ -34,16 +34,16 @@ Fields = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class RecordedModel:
-    """A model of the daemon that decided on the recorded source."""
+    """Model of the daemon that decided on the recorded source."""
 
     name: str  # name of the model in the configuration, and in its decisions
-    file: Path  # path that the model's file had
-    sha256: str  # SHA-256 of the file, in hexadecimal; empty: the recording does not tell
+    file: Path  # path of the model's file at the time of recording
+    sha256: str  # SHA-256 of the file, in hexadecimal; empty: not recorded
     table: Fields = field(default_factory=dict)  # model's table ``[[model]]`` in the configuration
 
 
 def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
-    """The models that decided on the source while it was recorded; none without a daemon."""
+    """List the models that decided on the source while it was recorded by a daemon."""
     session = about.session
     try:
         config = parse_toml(session.get("config", ""), "config").plain()
@@ -65,13 +65,13 @@ def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
 def live_model(
     what: str, about: Description, name: str, model: Path | None, check: bool
 ) -> RecordedModel | None:
-    """The model that decided live; None: none did.
+    """Select the model that decided live; None: none did.
 
     Args:
-        name: of the model; empty: the only one, or the one that `model` is.
+        name: of the model; empty: the only one, or the one whose file is `model`.
 
     Raises:
-        ConfigError: there is none of that name, or there are several.
+        ConfigError: no model has that name, or several models match.
     """
     models = recorded_models(about)
     names = ", ".join(m.name for m in models)
@@ -92,10 +92,10 @@ def live_model(
 
 
 def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
-    """The file of the model that is to decide: `model`, or the one that did live.
+    """Find the file of the model to replay: `model`, else the live one.
 
     Raises:
-        ConfigError: it is not there any more.
+        ConfigError: the file does not exist any more, or has changed.
     """
     if model is not None:
         return model
@@ -103,7 +103,7 @@ def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
         return shipped_model()
     if live.file.is_file() and live.sha256 in ("", hash_of(live.file)):
         return live.file
-    if live.sha256 == hash_of(shipped_model()):  # of another installation
+    if live.sha256 == hash_of(shipped_model()):  # at the path of another installation
         return shipped_model()
     raise ConfigError(
         f"the model that decided, {live.file} (sha256 {live.sha256[:16] or 'unknown'}), is not "
@@ -113,15 +113,15 @@ def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
 
 @dataclass(frozen=True)
 class Checked:
-    """What became of the comparison."""
+    """Result of comparing replayed with recorded decisions."""
 
     same: int  # number of decisions that are as recorded
-    before: int = 0  # number of recorded decisions about samples before the first
+    before: int = 0  # number of recorded decisions from before the first recorded sample
     # number of replayed decisions of the last second, for which the recording ended too early
     late: int = 0
     # number of replayed decisions that were not recorded because they were late (``late = "skip"``)
     withheld: int = 0
-    difference: str = ""  # first difference, in words; empty: there is none
+    difference: str = ""  # first difference, in words; empty: none
 
 
 def check_decisions(
@@ -132,14 +132,14 @@ def check_decisions(
     final_only: bool = False,
     may_withhold: bool = False,
 ) -> Checked:
-    """Compare decisions of one model, in their order.
+    """Compare recorded and replayed decisions of one model, in their order.
 
     Args:
-        recorded: as `Recording.decisions` gives them.
+        recorded: from `Recording.decisions`.
         replayed: with `FACTS`, of every step.
         span_ns: stream time of the first and the last sample.
-        final_only: whether only final ones were recorded.
-        may_withhold: whether late ones were not recorded.
+        final_only: whether only final decisions were recorded.
+        may_withhold: whether late decisions were not recorded.
     """
     kept = [d for d in recorded if d["t_ns"] >= span_ns[0]]
     mine = [d for d in replayed if d["final"] or not final_only]
@@ -150,23 +150,23 @@ def check_decisions(
         while may_withhold and at < len(mine) and mine[at]["t_ns"] < theirs["t_ns"]:
             at, withheld = at + 1, withheld + 1
         if at == len(mine):
-            difference = f"decision {k} ({_of(theirs)}) is not decided again"
-        elif found := _difference(theirs, mine[at]):
-            difference = f"decision {k} ({_of(theirs)}): {found}"
+            difference = f"decision {k} ({_name_decision(theirs)}) is not decided again"
+        elif found := _find_difference(theirs, mine[at]):
+            difference = f"decision {k} ({_name_decision(theirs)}): {found}"
         if difference:
             break
         at, same = at + 1, same + 1
     left = [] if difference else mine[at:]
     if left and not may_withhold and left[0]["t_ns"] < span_ns[1] - END_NS:
-        left, difference = [], f"a decision ({_of(left[0])}) was not recorded"
+        left, difference = [], f"a decision ({_name_decision(left[0])}) was not recorded"
     return Checked(same, before, len(left), withheld, difference)
 
 
 def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
-    """The samples of a chunk that reached the model live; None: no one did.
+    """Select the samples of a chunk that reached the model live; None: none did.
 
     Args:
-        skips: as `Recording.skips` gives them; where samples were lost, the model had none of them.
+        skips: from `Recording.skips`; the samples of a skip that is marked as lost are left out.
     """
     kept = np.ones(len(chunk), bool)
     for skip in skips:
@@ -177,17 +177,17 @@ def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
     return chunk.select(kept) if kept.any() else None
 
 
-def _of(decision: Fields) -> str:
+def _name_decision(decision: Fields) -> str:
     return f"step {decision['step']} of the contact at {decision['onset_ns']} ns"
 
 
-def _difference(recorded: Fields, replayed: Fields) -> str:
+def _find_difference(recorded: Fields, replayed: Fields) -> str:
     for name in FACTS:
-        if name not in recorded:  # by an earlier release, that did not tell it
+        if name not in recorded:  # an earlier release did not record it
             continue
         was, now = recorded[name], replayed[name]
         if name in ("prediction_set", "names"):
-            was, now = list(was), list(now)  # a message has no tuples
+            was, now = list(was), list(now)  # JSON has no tuples
         if was == now:
             continue
         if name != "probabilities":
@@ -204,41 +204,41 @@ Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class Redecoded:
-    """Recorded samples beside those that the packets decode to."""
+    """Comparison of recorded samples with those that the packets decode to."""
 
     recorded: int
     decoded: int
-    equal: int = 0  # number of samples of both whose values and validity are the same, bit for bit
-    differing: int = 0  # number of samples of both whose values or validity are not the same
-    # number of differing samples in which an element is valid in one of both alone
+    equal: int = 0  # number of common samples with the same values and validity, bit for bit
+    differing: int = 0  # number of common samples whose values or validity differ
+    # number of differing samples with an element that is valid in only one of the two
     validity: int = 0
     # each channel that differs, its unit, and the largest difference where both samples are valid
     largest: tuple[tuple[str, str, float], ...] = ()
     time_ns: int = 0  # largest difference between the two times of one sample, ns
-    # differences between the two arrays, in words; values then are not compared
+    # differences between the two arrays, in words; values are not compared then
     array: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
-        """It in words."""
+        """Write the comparison as lines of text."""
         if self.array:
             return [
                 f"{self.recorded} samples recorded, {self.decoded} decoded",
                 f"another array: {'; '.join(self.array)}",
             ]
         both = self.equal + self.differing
-        said = [
+        text = [
             f"{self.recorded} samples recorded, {self.decoded} decoded: {self.equal} are the same, "
             f"bit for bit, {self.differing} differ, {self.recorded - both} were recorded alone, "
             f"{self.decoded - both} decoded alone"
         ]
         if self.largest:
             parts = [f"{channel} {most:.3g} {unit}" for channel, unit, most in self.largest]
-            said.append(f"they differ by at most {', '.join(parts)}")
+            text.append(f"they differ by at most {', '.join(parts)}")
         if self.validity:
-            said.append(f"{self.validity} have elements that are valid in one of them alone")
+            text.append(f"{self.validity} have elements that are valid in one of them alone")
         if self.time_ns:
-            said.append(f"their times differ by at most {self.time_ns / 1e6:.3g} ms")
-        return said
+            text.append(f"their times differ by at most {self.time_ns / 1e6:.3g} ms")
+        return text
 
 
 def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None) -> Redecoded:
@@ -248,8 +248,8 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
         options: ``codec`` and the codec's own, as in a ``replay:`` URL; None: as recorded.
 
     Raises:
-        ConfigError: there are no packets, or the codec cannot be.
-        RecordingError: the codec finds no sample in them.
+        ConfigError: the recording has no packets, or the codec is invalid.
+        RecordingError: the recording has no samples, or the codec finds none in the packets.
     """
     recording = Recording(path)
     recorded = list(recording)
@@ -260,17 +260,17 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
         raise RecordingError(
             f"{path}: {sum(map(len, recorded))} samples recorded, {sum(map(len, decoded))} decoded"
         )
-    return _compared(recording.spec, concatenate(recorded), spec, concatenate(decoded))
+    return _compare(recording.spec, concatenate(recorded), spec, concatenate(decoded))
 
 
-def _compared(old_spec: ArraySpec, old: Chunk, new_spec: ArraySpec, new: Chunk) -> Redecoded:
+def _compare(old_spec: ArraySpec, old: Chunk, new_spec: ArraySpec, new: Chunk) -> Redecoded:
     array = tuple(old_spec.differences(new_spec))
     if array:
         return Redecoded(len(old), len(new), array=array)
-    ways = [_by_number(old, new, old_spec.rate_hz), _by_time(old, new, old_spec.rate_hz)]
-    # Numbers begin anew in a file that goes on with a stream; those of a device that does not
-    # count shift with each sample that one of both has not.
-    at, same = max(((way, _same(old, new, way)) for way in ways), key=lambda w: int(w[1].sum()))
+    ways = [_pair_by_number(old, new, old_spec.rate_hz), _pair_by_time(old, new, old_spec.rate_hz)]
+    # Numbers restart in a file that continues a stream; those of a device that does not count shift
+    # with each sample that only one side has.
+    at, same = max(((way, _is_equal(old, new, way)) for way in ways), key=lambda w: int(w[1].sum()))
     i, j = at[0][~same], at[1][~same]
     both = (old.valid[i] & new.valid[j])[..., None]
     apart = np.where(both, np.abs(old.values[i] - new.values[j]), 0.0)
@@ -284,26 +284,26 @@ def _compared(old_spec: ArraySpec, old: Chunk, new_spec: ArraySpec, new: Chunk) 
     )  # fmt: skip
 
 
-def _same(old: Chunk, new: Chunk, at: Pairs) -> NDArray[np.bool_]:
+def _is_equal(old: Chunk, new: Chunk, at: Pairs) -> NDArray[np.bool_]:
     i, j = at
     bits = old.values[i].view(np.uint32) == new.values[j].view(np.uint32)
     same: NDArray[np.bool_] = bits.all(axis=(1, 2)) & (old.valid[i] == new.valid[j]).all(axis=1)
     return same
 
 
-def _by_number(old: Chunk, new: Chunk, rate_hz: float) -> Pairs:
-    """Samples of the same number, but for what most numbers differ by."""
+def _pair_by_number(old: Chunk, new: Chunk, rate_hz: float) -> Pairs:
+    """Pair samples by number, after removing the most frequent shift between the numbers."""
     rows = {row.tobytes(): k for k, row in enumerate(old.values)}
     like = [(rows[bits], k) for k, row in enumerate(new.values) if (bits := row.tobytes()) in rows]
-    i, j = np.array(like, np.intp).T if like else _by_time(old, new, rate_hz)
+    i, j = np.array(like, np.intp).T if like else _pair_by_time(old, new, rate_hz)
     shifts, counts = np.unique(new.seq[j] - old.seq[i], return_counts=True)
     shift = shifts[counts.argmax()] if len(shifts) else 0
     _, i, j = np.intersect1d(old.seq, new.seq - shift, return_indices=True)
     return i, j
 
 
-def _by_time(old: Chunk, new: Chunk, rate_hz: float) -> Pairs:
-    """Samples of the same moment: no further apart than half a period."""
+def _pair_by_time(old: Chunk, new: Chunk, rate_hz: float) -> Pairs:
+    """Pair samples whose times are at most half a period apart."""
     middle = (old.t_ns[1:] + old.t_ns[:-1]) // 2
     nearest = np.searchsorted(middle, new.t_ns)
     near = np.abs(old.t_ns[nearest] - new.t_ns) <= NS_PER_S / rate_hz / 2

@@ -1,18 +1,18 @@
-"""A recording as arrays (.npz, .h5), text (.csv) or a ROS 2 bag, for programs that read those.
+"""Conversion of a recording to arrays (.npz, .h5), text (.csv) or a ROS 2 bag.
 
     seq, t_ns, values, valid       the samples, as in `Chunk`
-    decisions, events, health      messages, JSON, each with its time in ..._log_ns
-    about                          what the recording is of, JSON
+    decisions, events, health      messages as JSON, each with its time in ..._log_ns
+    about                          the recording's description as JSON
 
-A .csv has the samples alone. In an .npz, texts are JSON lines in arrays of bytes: in numpy's own
-text each takes the room of the longest. HDF5 is written piece by piece, and needs the extra
-``hdf5``.
+A .csv has the samples only. In an .npz, texts are JSON lines in arrays of bytes: in NumPy's own
+text arrays each item takes the size of the longest. HDF5 is written piece by piece, and needs the
+extra ``hdf5``.
 
-    bag/metadata.yaml    what is in it; ``ros2 bag info`` and ``ros2 bag play`` take the folder
-    bag/bag_0.mcap       a recording, which `Recording` reads, too; more of them are bag_1.mcap, ...
+    bag/metadata.yaml    its contents; ``ros2 bag info`` and ``ros2 bag play`` take the folder
+    bag/bag_0.mcap       a recording, which `Recording` reads, too; further ones are bag_1.mcap, ...
 
-A recording is a file of a bag as it is; here it is written anew, so that an array of one element
-gets its wrenches as ``geometry_msgs/msg/WrenchStamped`` besides.
+A recording could be a file of a bag without change; it is rewritten to add the wrenches of an array
+of one element as ``geometry_msgs/msg/WrenchStamped``.
 """
 
 import csv
@@ -44,20 +44,19 @@ if TYPE_CHECKING:
 
 COLUMNS = ("seq", "t_ns", "values", "valid")
 BLOCK = 1 << 14  # samples that are written at once
-PIECE = 1024  # samples that HDF5 stores together, with a checksum
+PIECE = 1024  # samples of an HDF5 chunk, which has a checksum
 
 
 def convert(path: str | Path, output: str | Path) -> int:
     """Write a recording as ``.npz``, ``.csv`` or ``.h5``, whole or not at all.
 
-    What they hold is laid out in docs/reference/recording.md; raw packets are in the recording
-    alone.
+    Their layout is described in docs/reference/recording.md; raw packets are in the recording only.
 
     Returns:
         Number of samples.
 
     Raises:
-        ConfigError: a name of another kind, or an extra is not installed.
+        ConfigError: the name has another ending, or an extra is not installed.
         RecordingError: the recording is damaged, or has no samples.
     """
     output = Path(output)
@@ -80,7 +79,7 @@ def convert(path: str | Path, output: str | Path) -> int:
 
 
 def about_text(about: Description) -> str:
-    """Write what a recording is of as one line of JSON, without its raw packets."""
+    """Write a description as one line of JSON, as of a recording without raw packets."""
     fields = {
         "tactile_rt": replace(about, wire="").to_metadata(),
         "session": seal(about.session) if about.session else {},
@@ -112,7 +111,7 @@ def _write_rows(chunk: Chunk) -> Iterator[list[Any]]:
 
 
 def write_npz(recording: Recording, file: BinaryIO) -> int:
-    """Write all arrays, which are in memory together."""
+    """Write all arrays; the whole recording is in memory meanwhile."""
     about, whole = recording.description, concatenate(list(_read_blocks(recording)))
     arrays: dict[str, Any] = {name: getattr(whole, name) for name in COLUMNS}
     for topic in TEXTS:
@@ -130,12 +129,12 @@ def write_npz(recording: Recording, file: BinaryIO) -> int:
 def write_hdf5(recording: Recording, file: BinaryIO) -> int:
     """Write datasets block by block, with the names and units of the array."""
     h5py, about, n = _import_h5py(), recording.description, 0
-    with _PatientFile(os.dup(file.fileno())) as patient, h5py.File(patient, "w") as made:
+    with _DeferredErrorFile(os.dup(file.fileno())) as out, h5py.File(out, "w") as made:
         for block in _read_blocks(recording):
             for name in COLUMNS:
                 _append(made, name, getattr(block, name), n)
             n += len(block)
-            patient.check()
+            out.check()
         text = h5py.string_dtype()
         for topic in TEXTS:
             lines, log_ns = _read_texts(recording, topic)
@@ -154,7 +153,7 @@ WRITERS = {".npz": write_npz, ".csv": write_csv, ".h5": write_hdf5, ".hdf5": wri
 
 
 def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
-    """Append to a dataset that has n rows; without any, make it."""
+    """Append to a dataset that has n rows; create it if n is 0."""
     if not n:
         made.create_dataset(
             name, data=data, maxshape=(None, *data.shape[1:]), chunks=(PIECE, *data.shape[1:]),
@@ -166,7 +165,7 @@ def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
 
 
 def _read_blocks(recording: Recording) -> Iterator[Chunk]:
-    """Read the samples, some `BLOCK` at a time; refuse a recording without any."""
+    """Yield the samples in blocks of `BLOCK` or a few more. Refuse a recording without samples."""
     waiting: list[Chunk] = []
     n = total = 0
     for chunk in recording:
@@ -193,8 +192,8 @@ def _import_h5py() -> Any:
     return h5py
 
 
-class _PatientFile(io.FileIO):
-    """A file that raises what failed when `check` asks, not amid HDF5's writing.
+class _DeferredErrorFile(io.FileIO):
+    """File whose write errors are raised by `check`, not while HDF5 writes.
 
     HDF5 would print dozens of lines for every piece that it cannot write.
     """
@@ -204,7 +203,7 @@ class _PatientFile(io.FileIO):
         self._failed: OSError | None = None
 
     def check(self) -> None:
-        """Raise what has failed."""
+        """Raise the first write error, if any."""
         if self._failed is not None:
             raise self._failed
 
@@ -223,35 +222,35 @@ class _PatientFile(io.FileIO):
         self.check()
 
 
-BAG_VERSION = 5  # of metadata.yaml: the newest that ROS 2 Humble reads; later ones read it, too
+BAG_VERSION = 5  # of metadata.yaml: the newest that ROS 2 Humble reads; later releases do, too
 
 
 class _File(NamedTuple):
     name: str
     begin_ns: int
     end_ns: int
-    counts: dict[tuple[str, str], int]  # of each topic and its message
+    counts: dict[tuple[str, str], int]  # number of messages by (topic, message type)
 
 
 def write_bag(recordings: Sequence[Recording], folder: Path) -> int:
-    """Write them; the number of samples.
+    """Write recordings as a ROS 2 bag; return the number of samples.
 
     Args:
-        folder: To make; one that is there is replaced.
+        folder: The bag to write; an existing one is replaced.
     """
     n = 0
     with whole_folder(folder) as made:
         files = []
         for k, recording in enumerate(recordings):
             name = f"{folder.name}_{k}.mcap"
-            samples, file = _write(recording, made / name)
+            samples, file = _write_file(recording, made / name)
             n += samples
             files.append(file)
-        (made / "metadata.yaml").write_text(_metadata(files))
+        (made / "metadata.yaml").write_text(_write_metadata(files))
     return n
 
 
-def _write(recording: Recording, path: Path) -> tuple[int, _File]:
+def _write_file(recording: Recording, path: Path) -> tuple[int, _File]:
     about, n = recording.description, 0
     begin_ns, end_ns = 1 << 63, 0
     with path.open("wb") as file:
@@ -270,7 +269,7 @@ def _write(recording: Recording, path: Path) -> tuple[int, _File]:
 
 
 def _add_wrenches(made: McapFile, raw: Raw) -> int:
-    """The wrench of each valid sample, if the array has one; the number of samples."""
+    """Add the wrench of each valid sample, if the array has one. Return the number of samples."""
     about = made.about
     chunk = decode_samples(raw.data, about.spec.shape)
     wrenches = messages.wrenches_of(about.spec, chunk.values)
@@ -284,8 +283,8 @@ def _add_wrenches(made: McapFile, raw: Raw) -> int:
     return len(chunk)
 
 
-def _metadata(files: Sequence[_File]) -> str:
-    """What ROS 2 reads first: YAML, of which JSON is a part."""
+def _write_metadata(files: Sequence[_File]) -> str:
+    """Write the text of metadata.yaml, as JSON, which is a subset of YAML."""
     totals = Counter[tuple[str, str]]()
     for file in files:
         totals.update(file.counts)

@@ -1,4 +1,4 @@
-"""What a recording says of itself, in metadata that carries a checksum."""
+"""Description of a recording: its metadata, sealed by a checksum."""
 
 import time
 import zlib
@@ -19,18 +19,18 @@ METADATA, SESSION, SUMMARY, RECOVERED = "tactile_rt", "session", "summary", "rec
 
 @dataclass(frozen=True)
 class Description:
-    """What a recording is of.
+    """Origin of a recording: array, device, clock and calibration.
 
     Attributes:
         utc_offset_ns: UTC less the host's monotonic time when the recording began, ns.
         source: The URL of the source that was recorded, or the device's name.
-        wire: ``serial`` or ``can``; empty where the source is no device, so that there are no
-            packets.
+        wire: ``serial`` or ``can``; empty where the source is no device, so that no packets are
+            recorded.
         codec: The name of the codec that the device spoke; empty without a device.
         codec_options: The options of the codec, as in a URL; paths are absolute.
         calibration: The calibration of the samples, not of the packets; None: the samples are as
             the codec gave them.
-        recovered: Whether the file was made whole after an interruption, and may have gaps.
+        recovered: Whether the file was recovered after an interruption, and may have gaps.
     """
 
     spec: ArraySpec
@@ -39,13 +39,13 @@ class Description:
     wire: str = ""
     codec: str = ""
     codec_options: Mapping[str, str] = field(default_factory=dict)
-    clock: str = "host"  # "device": its own time; "log": an imported log's
+    clock: str = "host"  # "device": the device's own clock; "log": times of an imported log
     calibration: Calibration | None = None
     session: Mapping[str, str] = field(default_factory=dict)
     recovered: bool = False
 
     def to_metadata(self) -> dict[str, str]:
-        """For the record ``tactile_rt``, sealed; the session's notes have one of their own."""
+        """Write the sealed fields of the record ``tactile_rt``; session notes have their own."""
         return seal(
             {
                 "version": LAYOUT_VERSION,
@@ -100,10 +100,10 @@ def seal(fields: Mapping[str, str]) -> dict[str, str]:
 
 
 def unseal(what: str, fields: Mapping[str, str]) -> dict[str, str]:
-    """The fields without their checksum.
+    """Check and remove the checksum of sealed fields.
 
     Raises:
-        RecordingError: it is not theirs.
+        RecordingError: the checksum does not fit the fields.
     """
     plain = {k: v for k, v in fields.items() if k != "crc32"}
     if fields.get("crc32") != _crc(plain):
@@ -116,7 +116,7 @@ def _crc(fields: Mapping[str, str]) -> str:
 
 
 def utc_offset_ns() -> int:
-    """UTC less monotonic time, now, ns."""
+    """Return the present difference of UTC and the host's monotonic time, ns."""
     before = time.monotonic_ns()
     utc = time.time_ns()
     return utc - (before + time.monotonic_ns()) // 2
@@ -125,14 +125,14 @@ def utc_offset_ns() -> int:
 def describe(
     source: Source, url: str = "", session: Mapping[str, str] | None = None
 ) -> Description:
-    """What a recording of this source is of; its UTC offset is that of now."""
+    """Describe a recording of this source that begins now."""
     notes = {**getattr(source, "notes", {}), **(session or {})}
     about = Description(source.spec, utc_offset_ns(), url, session=notes)
     device = device_of(source)
     if device is None:
         return about
     options = {
-        # A recording is read elsewhere than where its options were written.
+        # Paths become absolute: a recording is read from other folders than it was made in.
         name: str(Path(value).resolve()) if _is_file(value) else value
         for name, value in device.codec_options.items()
     }
@@ -146,5 +146,5 @@ def describe(
 def _is_file(value: str) -> bool:
     try:
         return bool(value) and Path(value).is_file()
-    except OSError:  # too long a name: an array's JSON
+    except OSError:  # the name is too long: it is an array's JSON
         return False

@@ -1,4 +1,4 @@
-"""Labelled touches of recordings become a sweep set, split by object.
+"""Sweep sets made of labelled touches of recordings, split by object.
 
 touches with labels -> objects -> train, validation, test -> folder
 """
@@ -22,9 +22,9 @@ from tactile_rt.sets.manifest import RECORDED_VERSION, RECORDINGS, SPLITS, UNLAB
 from tactile_rt.sets.objects import write_object
 
 SHARES = (0.7, 0.15, 0.15)  # of the objects of each category, by split
-ENOUGH = 3  # recordings of a label that may be its objects, one for each split
+ENOUGH = 3  # recordings of a label from which each counts as an object: one for each split
 DIGITS = 6  # of a recording's checksum, in the names of its objects
-STEM = 100  # bytes of a recording's name, likewise
+STEM = 100  # bytes of a recording's name, in the names of its objects
 
 
 def write_set(
@@ -38,17 +38,17 @@ def write_set(
     """Write a sweep set of labelled touches, whole or not at all.
 
     Args:
-        folder: where to; a set that is there is replaced.
+        folder: the set to write; an existing one is replaced.
         shares: of the objects of each category, for training, validation and test.
 
     Raises:
-        ConfigError: no touch can be used, or shares that cannot be.
+        ConfigError: no touch can be used, or the shares are invalid.
     """
     check_shares(shares)
     if not touches.used:
         why = "; ".join(touches.left_out) or "no recording holds one"
         raise ConfigError(f"no touch can be used: {why}")
-    objects = _objects(touches)
+    objects = _group_by_object(touches)
     categories = sorted({used[0].interval.label for used in objects.values()})
     category_of = {name: used[0].interval.label for name, used in objects.items()}
     manifest = SweepManifest(
@@ -57,7 +57,7 @@ def write_set(
         period_ns=touches.period_ns,
         lead=REST,
         categories=tuple(categories),
-        split=_split(category_of, shares, seed),
+        split=_split_objects(category_of, shares, seed),
         category_of=category_of,
         recipe={
             "name": folder.name,
@@ -82,7 +82,7 @@ def write_set(
 
 
 def check_shares(shares: Sequence[float]) -> None:
-    """Refuse shares that are not one for each split, negative, or nothing to train on."""
+    """Refuse shares of another number than splits, negative ones, and none for training."""
     whole = len(shares) == len(SPLITS) and all(s >= 0 for s in shares) and sum(shares) < inf
     if not whole or not shares[0]:
         raise ConfigError(
@@ -90,11 +90,11 @@ def check_shares(shares: Sequence[float]) -> None:
         )
 
 
-def _objects(touches: LabelledTouches) -> dict[str, list[LabelledTouch]]:
-    """The touches by the names of their objects.
+def _group_by_object(touches: LabelledTouches) -> dict[str, list[LabelledTouch]]:
+    """Group the touches by the name of their object.
 
-    An object is what the labels call one; else a recording, where a label has enough of them;
-    else each touch is one, and a line tells what that costs.
+    The labels may name the object. If not, each recording counts as an object where a label has
+    `ENOUGH` of them; else each touch does, and a line of `left_out` warns of the consequence.
     """
     recordings: defaultdict[str, set[Path]] = defaultdict(set)
     for used in touches.used:
@@ -119,10 +119,10 @@ def _objects(touches: LabelledTouches) -> dict[str, list[LabelledTouch]]:
     return dict(objects)
 
 
-def _split(
+def _split_objects(
     category_of: Mapping[str, str], shares: Sequence[float], seed: int
 ) -> dict[str, tuple[str, ...]]:
-    """The objects of each split, by a hash of their names; of each category some to train."""
+    """Split objects by a hash of their names; every category keeps some for training."""
     sides: dict[str, list[str]] = {split: [] for split in SPLITS}
     for category in sorted(set(category_of.values())):
         names = sorted(
@@ -130,7 +130,7 @@ def _split(
             key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest(),
         )
         held = [max(1, round(len(names) * s / sum(shares))) if s else 0 for s in shares[1:]]
-        while sum(held) >= len(names):  # of few objects rather one to tune on than one to test on
+        while sum(held) >= len(names):  # with few objects validation goes before test
             held[1 if held[1] >= held[0] else 0] -= 1
         ends = np.cumsum([len(names) - sum(held), *held]).tolist()
         for split, begin, end in zip(SPLITS, [0, *ends], ends, strict=False):

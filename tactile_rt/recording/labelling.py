@@ -1,9 +1,9 @@
-"""The touches of recordings, and what somebody says was touched.
+"""Labelled touches of recordings.
 
     recordings + intervals -> touches with labels
 
-What a touch is, `touches` says; what was touched, `labels`. What cannot be used is counted and
-told, never left out in silence. `labelled_set` makes a sweep set of them.
+Module `touches` finds the touches, `labels` reads the labelled intervals. Touches that cannot be
+used are counted and reported, never silently dropped. `labelled_set` makes a sweep set of the rest.
 """
 
 import hashlib
@@ -26,9 +26,9 @@ from tactile_rt.recording.replay import prepare_replay
 from tactile_rt.recording.touches import RecordedTouch, find_touches
 from tactile_rt.sets.manifest import UNLABELLED, SweepManifest
 
-PERIOD_NS = 9_000_000  # of a set's samples, unless the sensor is slower
-TELL_NS = NS_PER_S  # of the stream, between reports of how far it is
-# why a touch is not used, besides those of `touches`
+PERIOD_NS = 9_000_000  # sample period of a set, unless the sensor is slower
+TELL_NS = NS_PER_S  # stream time between two progress reports
+# reasons for which a touch is not used, in addition to those of `touches`
 OUTSIDE = "outside every interval"
 DISPUTED = "in intervals that overlap and name different things"
 AGAIN = "that an earlier recording holds, too"
@@ -39,7 +39,7 @@ Intervals = dict[Path, list[LabelledInterval]]
 
 @dataclass(frozen=True)
 class LabelledTouch:
-    """A touch that is used."""
+    """Touch with the labelled interval in which it begins."""
 
     touch: RecordedTouch
     recording: Path
@@ -49,58 +49,58 @@ class LabelledTouch:
 
 @dataclass
 class LabelledTouches:
-    """The touches of some recordings that can be used, and what could not."""
+    """Usable touches of some recordings, with a report of the others."""
 
     spec: ArraySpec
     period_ns: int  # sample period of the touches, ns
-    sensor: SensorSpec | None  # description of the array's sensor; None: it has none
+    sensor: SensorSpec | None  # description of the array's sensor; None: not described
     used: list[LabelledTouch] = field(default_factory=list)
     sums: dict[Path, str] = field(default_factory=dict)  # sha256 of each recording's file
     found: Counter[Path] = field(default_factory=Counter)
-    # lines that tell what could not be used, or should be known
+    # lines about touches that could not be used, and other things that the user should know
     left_out: list[str] = field(default_factory=list)
 
 
 def intervals_beside(recordings: Sequence[Path], labels: Path | None = None) -> Intervals:
-    """What was touched when, as a file says it.
+    """Read the labelled intervals of recordings from a file of labels.
 
     Args:
         labels: the file; None: ``labels.csv`` beside each recording.
 
     Raises:
-        ConfigError: there is no such file, or a mistake in one.
+        ConfigError: no such file exists, or one has a mistake.
     """
     if labels is not None:
         return read_labels(labels, recordings)
     found: Intervals = {}
     for folder in dict.fromkeys(one.parent for one in recordings):
         path = folder / LABELS
-        there = [one for one in recordings if one.parent == folder]
+        inside = [one for one in recordings if one.parent == folder]
         if not path.is_file():
             raise ConfigError(
-                f"no {LABELS} beside {there[0]}: write one (recording,start_s,end_s,label), or "
+                f"no {LABELS} beside {inside[0]}: write one (recording,start_s,end_s,label), or "
                 "give --labels FILE, --by-name or --unlabelled"
             )
-        found |= read_labels(path, there)
+        found |= read_labels(path, inside)
     return found
 
 
 def intervals_by_name(recordings: Sequence[Path]) -> Intervals:
-    """All of each recording is of the label that its file's name tells.
+    """Label the whole of each recording by the name of its file.
 
     Raises:
-        ConfigError: a name tells none.
+        ConfigError: a name contains no label.
     """
     return {one: [LabelledInterval(label=label_of_file(one))] for one in recordings}
 
 
 def intervals_of_all(recordings: Sequence[Path]) -> Intervals:
-    """All of each recording, without a label."""
+    """Return one unlabelled interval per recording, which covers all its samples."""
     return {one: [LabelledInterval(label=UNLABELLED)] for one in recordings}
 
 
 def like(path: Path) -> tuple[ArraySpec, SensorSpec | None, int]:
-    """Array, sensor and sample period (ns) of a sweep set, or of a model.
+    """Return array, sensor and sample period (ns) of a sweep set or a model.
 
     Raises:
         RecordingError: no such set, or it is damaged.
@@ -133,20 +133,20 @@ def find_labelled(
     pattern: Path | None = None,
     report: Callable[[Path, float], None] = lambda recording, seconds: None,
 ) -> LabelledTouches:
-    """Find the touches in recordings, and what was touched.
+    """Find the touches in recordings, and label them by the intervals.
 
     Args:
-        pattern: a sweep set or model of the same array, whose sensor and period are taken.
-        report: is told how far a recording has been read, s.
+        pattern: a sweep set or model of the same array, whose sensor and period are used.
+        report: is called with a recording and the position up to which it has been read, s.
 
     Raises:
-        ConfigError: a file cannot be read or is there twice, or channels that cannot be learnt
+        ConfigError: a file cannot be read or is given twice, or channels that cannot be learnt
             from.
         RecordingError: a file is damaged.
-        SpecMismatch: recordings of different arrays, or of another than the pattern's.
+        SpecMismatch: recordings of different arrays, or of another array than the pattern's.
     """
     opened = [Recording(one) for one in recordings]
-    sums = _sums(recordings)
+    sums = _hash_files(recordings)
     specs = [recording.spec for recording in opened]
     first, whose = specs[0], recordings[0]
     sensor, period_ns = None, max(PERIOD_NS, *(round(NS_PER_S / spec.rate_hz) for spec in specs))
@@ -161,12 +161,12 @@ def find_labelled(
     except ConfigError as error:
         raise ConfigError(f"{error}: --like takes it from a sweep set or model") from None
     reasons, silent = defaultdict[str, list[str]](list), list[str]()  # places, by reason
-    met: dict[bytes, Path] = {}  # the recording of each touch, by its numbers
+    met: dict[bytes, Path] = {}  # the recording of each touch, by the hash of its values
     for one, recording in zip(recordings, opened, strict=True):
         mine, touched = list(intervals.get(one, ())), set()
         begin_ns = next((int(chunk.t_ns[0]) for chunk in recording), 0)
         with prepare_replay(str(one.absolute()), {"speed": "0"}).open() as source:
-            followed = _follow(source, begin_ns, partial(report, one))
+            followed = _report_progress(source, begin_ns, partial(report, one))
             for touch in find_touches(recording.spec, followed, period_ns, floor):
                 found.found[one] += 1
                 onset_s, end_s = ((t - begin_ns) / NS_PER_S for t in (touch.onset_ns, touch.end_ns))
@@ -205,23 +205,23 @@ def find_labelled(
     return found
 
 
-def _follow(
+def _report_progress(
     source: Iterable[Chunk], begin_ns: int, report: Callable[[float], None]
 ) -> Iterator[Chunk]:
-    """Yield the chunks, and report how far they are, s since their beginning."""
-    told = begin_ns
+    """Yield the chunks, and report the position in the stream, s since its beginning."""
+    reported = begin_ns
     for chunk in source:
-        if chunk.t_ns[-1] - told >= TELL_NS:
-            told = int(chunk.t_ns[-1])
-            report((told - begin_ns) / NS_PER_S)
+        if chunk.t_ns[-1] - reported >= TELL_NS:
+            reported = int(chunk.t_ns[-1])
+            report((reported - begin_ns) / NS_PER_S)
         yield chunk
 
 
-def _sums(recordings: Sequence[Path]) -> dict[Path, str]:
-    """The sha256 of each recording's file.
+def _hash_files(recordings: Sequence[Path]) -> dict[Path, str]:
+    """Return the sha256 of each recording's file.
 
     Raises:
-        ConfigError: two are the same, whose touches would be on two sides of the split.
+        ConfigError: two are the same, so that a touch could be on two sides of the split.
     """
     sums: dict[Path, str] = {}
     by_sum: dict[str, Path] = {}

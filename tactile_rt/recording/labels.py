@@ -1,12 +1,12 @@
-"""What was touched when: intervals of recordings with a label, in a CSV file beside them.
+"""Labelled intervals of recordings, in a CSV file beside them.
 
     recording,start_s,end_s,label,object
     night.mcap,12.5,31,mug,red mug
     night.mcap,35,52.25,plate,
 
 Times are seconds since the recording's first sample, file names are relative to the CSV. The column
-``object`` (which of the mugs it was) may be left out, and ``recording`` where there is one alone.
-Whoever labels as a robot touches appends line by line; a line is there whole or not at all.
+``object`` (which of the mugs it was) may be left out, and ``recording`` if there is only one.
+A program that labels while a robot touches appends line by line; each line is written at once.
 """
 
 import csv
@@ -26,21 +26,21 @@ from tactile_rt.core.settings import check_columns, convert, nearest, read_csv, 
 LABELS = "labels.csv"  # beside the recordings
 NEEDED = ("start_s", "end_s", "label")
 COLUMNS = ("recording", *NEEDED, "object")
-# Of a name, as it becomes part of a file's: with a label and an object that has 255 bytes at most.
-LONGEST, MOST_BYTES = 60, 120  # characters, of which some need several bytes
-LONGEST_LINE = 10_000  # bytes, that are looked at
-# A model's refusals, and a touch that nobody labelled.
+# Limits of a name: label and object become parts of a file's name, which has at most 255 bytes.
+LONGEST, MOST_BYTES = 60, 120  # characters, and bytes in UTF-8
+LONGEST_LINE = 10_000  # bytes of a line that are parsed
+# A model's refusals, and an unlabelled touch.
 RESERVED = ("unknown", "none of these", "unlabelled")
 
 
 class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
-    """A part of a recording in which one thing is touched.
+    """Part of a recording in which one thing is touched.
 
     Attributes:
-        start_s, end_s: Seconds since the recording's first sample; the end is not in it.
-        object: The name of the one thing of this kind; empty: it is not told.
-        recording: The name of its file as the labels have it; empty: the only one.
-        where: File and line, for messages; empty: not out of a file.
+        start_s, end_s: Seconds since the recording's first sample; the end is not included.
+        object: The name of the individual object; empty: not labelled.
+        recording: The file name in the table of labels; empty: the only recording.
+        where: File and line, for messages; empty: not read from a file.
     """
 
     label: str
@@ -52,19 +52,19 @@ class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def thing(self) -> tuple[str, str]:
-        """What was touched: label and object."""
+        """Touched thing: label and object."""
         return self.label, self.object
 
 
 def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[LabelledInterval]]:
-    """The intervals of a file by recording, also of recordings that are not asked for.
+    """Read the intervals of a file, by recording; also those of recordings not asked for.
 
     Args:
-        recordings: those asked for; the paths of these are keys as they are given here.
+        recordings: the recordings asked for; their paths become keys as they are given here.
 
     Raises:
-        ConfigError: it cannot be read, or a line is wrong; names file, line and column, and what to
-            do.
+        ConfigError: the file cannot be read, or a line is wrong; names file, line and column, and
+            what to do.
     """
     check_no_pointer(path)
     table = read_csv(path)
@@ -84,7 +84,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
             raise refusal(node, ["start_s"], f"must be 0 or more, not {row.start_s:g}")
         if row.end_s <= row.start_s:
             raise refusal(node, ["end_s"], f"must be after start_s, {row.start_s:g} s")
-        if not row.recording.isprintable():  # which no path may be
+        if not row.recording.isprintable():  # refused before it becomes a path
             raise refusal(node, ["recording"], f"{row.recording!r} is no file's name")
         file = path.parent / row.recording
         if not row.recording and len(recordings) > 1:
@@ -99,24 +99,24 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
 
 
 def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
-    """Add a line to a file, which is made if it is not there; on return it is on the disk.
+    """Append a labelled interval to a file, and sync it; create the file if necessary.
 
-    A line is written at once. What an interruption has left of an earlier one ends where the next
-    begins, so that it spoils no other.
+    A line is written at once. If an interruption has left part of an earlier line, a line break is
+    added first, so that the new line stays intact.
 
     Args:
         recording: name of the recording, relative to the file's folder.
 
     Returns:
-        The line, without its end.
+        The line, without its line break.
 
     Raises:
-        ConfigError: a name that cannot be, times out of order, or a file with other columns.
+        ConfigError: an invalid name, times out of order, or a file with other columns.
     """
     for what, name in (("label", interval.label), ("object", interval.object)):
         if why := check_name(name, empty=what == "object"):
             raise ConfigError(f"{what} {name!r}: {why}")
-    if not recording.isprintable() or recording.startswith("#"):  # which begins a remark
+    if not recording.isprintable() or recording.startswith("#"):  # a # begins a remark
         raise ConfigError(f"recording {recording!r} cannot stand in {path.name}: rename it")
     if not 0 <= interval.start_s < interval.end_s < math.inf:
         raise ConfigError(f"start_s must be 0 or more and before end_s: {interval}")
@@ -124,25 +124,25 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
     if not new:
         check_appendable(path)
     times = (f"{t:.6f}".rstrip("0").rstrip(".") for t in (interval.start_s, interval.end_s))
-    line = text = _line(recording, *times, interval.label, interval.object)
+    line = text = _format_line(recording, *times, interval.label, interval.object)
     with path.open("ab+") as file:
         if new:
-            text = _line(*COLUMNS) + text
+            text = _format_line(*COLUMNS) + text
         else:
             file.seek(-1, os.SEEK_END)
             text = text if file.read(1) == b"\n" else "\n" + text
-        file.write(text.encode())  # one write, at the end
+        file.write(text.encode())  # a single write, at the end of the file
         file.flush()
         os.fsync(file.fileno())
     if new:
-        sync_folder(path.parent)  # the name, too
+        sync_folder(path.parent)  # for the file's name
     return line.rstrip("\n")
 
 
 def check_appendable(path: Path) -> None:
-    """Refuse a file that `append_label` cannot add to, since it has other columns."""
+    """Refuse a file to which `append_label` cannot append because of other columns."""
     with open_regular(path) as file:
-        columns = _cells(file.readline(LONGEST_LINE))
+        columns = _split(file.readline(LONGEST_LINE))
     if columns != COLUMNS:
         raise ConfigError(
             f"{path}:1: columns are {','.join(columns)}, not {','.join(COLUMNS)}: nothing can be "
@@ -151,19 +151,19 @@ def check_appendable(path: Path) -> None:
 
 
 def drop_torn_label(path: Path) -> bool:
-    """Take away what an interruption has left of a last line; whether there was any.
+    """Remove an incomplete last line, left by an interruption; return whether one was found.
 
-    A line that lacks nothing but its end stays: an editor may have left it so; so does what was
-    never written by `append_label`, which `read_labels` tells.
+    A line that lacks only its line break stays, as an editor may have left it. So does a line that
+    `append_label` cannot have written: `read_labels` reports it.
     """
     with open_regular(path) as file:
         data = file.read()
     end = data.rfind(b"\n") + 1
     whole, last = data[:end], data[end:]
     if whole:
-        torn = _cells(whole.partition(b"\n")[0]) == COLUMNS and len(_cells(last)) < len(COLUMNS)
+        torn = _split(whole.partition(b"\n")[0]) == COLUMNS and len(_split(last)) < len(COLUMNS)
     else:
-        torn = _line(*COLUMNS).encode().startswith(last)
+        torn = _format_line(*COLUMNS).encode().startswith(last)
     if not last or not torn:
         return False
     write_whole(path, lambda file: file.write(whole))
@@ -171,53 +171,53 @@ def drop_torn_label(path: Path) -> bool:
 
 
 def lines_of(path: Path) -> list[str]:
-    """The lines of a file with their ends, as `read_labels` counts them; what is no text, too."""
+    """Return a file's lines with line breaks, counted as by `read_labels`, even if undecodable."""
     return path.read_bytes().decode(errors="surrogateescape").splitlines(keepends=True)
 
 
 def remove_label(path: Path, line: str) -> None:
-    """Take a line of a file away, the last of several; it is there or not, never half.
+    """Remove a line of a file, the last of several equal lines. The rewrite is atomic.
 
     Args:
-        line: without its end, as `append_label` gave it or `lines_of`; where it is not there,
-            nothing is taken away.
+        line: without its line break, from `append_label` or `lines_of`; if the file lacks it,
+            nothing is removed.
     """
     lines = lines_of(path)
-    there = [k for k, text in enumerate(lines) if text.rstrip("\r\n") == line]
-    if there:
-        del lines[there[-1]]
+    found = [k for k, text in enumerate(lines) if text.rstrip("\r\n") == line]
+    if found:
+        del lines[found[-1]]
         data = "".join(lines).encode(errors="surrogateescape")
         write_whole(path, lambda file: file.write(data))
 
 
 def relabel(path: Path, old: str, new: str) -> None:
-    """Replace a label in a file at once; an empty one removes its lines."""
+    """Replace a label in a file by an atomic rewrite. An empty new label removes its lines."""
     lines = "".join(relabel_line(line, old, new) for line in lines_of(path))
     data = lines.encode(errors="surrogateescape")
     write_whole(path, lambda file: file.write(data))
 
 
 def relabel_line(line: str, old: str, new: str) -> str:
-    """Replace the label of a line if it is the old one; empty: no line."""
+    """Replace the label of a line if it is `old`. Return an empty line if `new` is empty."""
     cells = [cell.strip() for cell in next(csv.reader([line]), [])]
     at = COLUMNS.index("label")
     if len(cells) != len(COLUMNS) or cells[at] != old or tuple(cells) == COLUMNS:
         return line
     cells[at] = new
-    return _line(*cells) if new else ""
+    return _format_line(*cells) if new else ""
 
 
-def _cells(line: bytes) -> tuple[str, ...]:
-    """What is between the commas, of a line that may be torn."""
+def _split(line: bytes) -> tuple[str, ...]:
+    """Split a line, which may be incomplete, into its cells."""
     text = line[:LONGEST_LINE].decode("utf-8-sig", errors="replace")
     return tuple(cell.strip() for cell in next(csv.reader([text]), []))
 
 
 def check_name(name: str, empty: bool = False) -> str:
-    """Why a text cannot be a label or an object's name, which become names of files; "": it can.
+    """Return why a text cannot name a label or an object; "" if it can.
 
     Args:
-        empty: whether it may be empty.
+        empty: whether the name may be empty.
     """
     if not name:
         return "" if empty else "is empty; name what is touched"
@@ -233,19 +233,19 @@ def check_name(name: str, empty: bool = False) -> str:
 
 
 def label_of_file(path: Path) -> str:
-    """The label that a recording's name tells: `mug` of ``mug.mcap``, ``mug-3.mcap``, ``mug_3``.
+    """Read the label in a recording's name: `mug` of ``mug.mcap``, ``mug-3.mcap``, ``mug_3``.
 
     Raises:
-        ConfigError: it tells none.
+        ConfigError: the name contains no label.
     """
-    stem = re.sub(r"-\d{8}T\d{6}Z$", "", path.stem)  # of a rotated file
+    stem = re.sub(r"-\d{8}T\d{6}Z$", "", path.stem)  # time in the name of a rotated file
     label = re.sub(r"[-_ ]\d+$", "", stem)
     if why := check_name(label):
         raise ConfigError(f"{path}: its name tells no label: {why}")
     return label
 
 
-def _line(*cells: str) -> str:
+def _format_line(*cells: str) -> str:
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerow(cells)
     return out.getvalue()

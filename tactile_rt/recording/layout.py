@@ -1,5 +1,4 @@
-"""What is in a recording, as it is written and read here; `ros2_form` says how it stands in the
-file.
+"""Encoding of the messages of a recording; `ros2_form` converts them to their form in the file.
 
 Samples and packets are in CDR (little-endian), without a header; health, decisions and events are
 JSON.
@@ -15,17 +14,17 @@ from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame
 
 SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
-DECISIONS, EVENTS = "decisions", "events"  # of the daemon, in its messages
+DECISIONS, EVENTS = "decisions", "events"  # the daemon's messages
 
 Packet = bytes | Sequence[CanFrame] | None  # None: the line was opened here
 
 _CDR = b"\x00\x01\x00\x00"  # little-endian, no options
-_FRAME = struct.Struct("<I???xI")  # and its data, padded to 4
+_FRAME = struct.Struct("<I???xI")  # followed by its data, padded to 4 bytes
 
 
 @dataclass(frozen=True)
 class Raw:
-    """One message of a recording, as it stands in the file."""
+    """One message of a recording, undecoded."""
 
     topic: str
     t_ns: int  # time under which it was recorded, host monotonic time, ns
@@ -33,7 +32,7 @@ class Raw:
 
 
 def encode_samples(chunk: Chunk) -> bytes:
-    """A chunk as a message of ``Samples.msg``, less its header."""
+    """Encode a chunk as a message of ``Samples.msg`` without its header."""
     n, elements, channels = chunk.values.shape
     return b"".join(
         (
@@ -51,19 +50,19 @@ def encode_samples(chunk: Chunk) -> bytes:
 
 
 def samples_in(data: bytes) -> int:
-    """How many samples a message of ``Samples.msg``, less its header holds."""
+    """Return the number of samples in a message of ``Samples.msg`` without its header."""
     (n,) = struct.unpack_from("<I", data, 4)
     return int(n)
 
 
 def last_ns(data: bytes) -> int:
-    """When the last sample of a message was taken, host time, ns."""
+    """Return the host time of the last sample of a message, ns."""
     (t_ns,) = struct.unpack_from("<q", data, 12 + 16 * samples_in(data))
     return int(t_ns)
 
 
 def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
-    """Return the chunk in a message of an array of this shape, (element, channel)."""
+    """Decode the chunk of a message, of an array of shape (element, channel)."""
     elements, channels = shape
     n = samples_in(data)
     values_at = 4 + 16 + 16 * n + 12
@@ -76,7 +75,7 @@ def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
     )
     if (*counts, *again) != (elements, channels, n * elements * channels, n, n * elements):
         raise ValueError(f"samples of {counts[0]} x {counts[1]}, not {elements} x {channels}")
-    # Copied, so that what is read is as its owner's as what a device delivers.
+    # Copied, so that the reader may change it, as a chunk that a device delivers.
     return Chunk(
         np.frombuffer(data, "<i8", n, 12).astype(np.int64),
         np.frombuffer(data, "<i8", n, 20 + 8 * n).astype(np.int64),
@@ -88,7 +87,7 @@ def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
 
 
 def encode_packet(packet: Packet, wire: str) -> bytes:
-    """A raw packet as a message of ``SerialPacket.msg`` or ``CanPacket.msg``."""
+    """Encode a raw packet as a message of ``SerialPacket.msg`` or ``CanPacket.msg``."""
     opened, things = packet is None, packet or b""
     parts = [_CDR, struct.pack("<?3xI", opened, len(things))]
     if wire == "serial":
@@ -114,7 +113,7 @@ def is_samples(data: bytes, shape: tuple[int, int]) -> bool:
 
 
 def decode_packet(data: bytes, wire: str) -> Packet:
-    """The raw packet in a message."""
+    """Decode the raw packet of a message; raise ValueError if it is damaged."""
     if len(data) < 12 or data[:4] != _CDR:
         raise ValueError(f"{len(data)} bytes are not a packet")
     opened, n = struct.unpack_from("<?3xI", data, 4)

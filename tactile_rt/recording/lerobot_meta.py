@@ -1,6 +1,6 @@
-"""What a LeRobot dataset (v3.0) has beside its rows: ``meta/``, and a camera's frames.
+"""Parts of a LeRobot dataset (v3.0) other than its rows: ``meta/``, and camera films.
 
-Its names and shapes are LeRobot's; https://github.com/huggingface/lerobot, ``datasets/utils.py``.
+Names and shapes are those of https://github.com/huggingface/lerobot, ``datasets/utils.py``.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,28 +19,28 @@ from tactile_rt.core.packages import require_extra
 
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 CODEC = "libx264"
-OPTIONS = {"g": "2", "crf": "20"}  # as LeRobot: any frame is found within two
-LOOKED_AT = 100  # frames, of which statistics are made
-PIXELS = 16384  # of each, at most
+OPTIONS = {"g": "2", "crf": "20"}  # as LeRobot: every second frame is a key frame
+LOOKED_AT = 100  # frames for the statistics
+PIXELS = 16384  # of each of these frames, at most
 
 
 @dataclass(frozen=True)
 class CameraFilm:
-    """A film and when it was taken."""
+    """Film of a camera, and when it was taken."""
 
     name: str
     path: Path  # file of the film, in any form that FFmpeg reads
-    # time of the film's first frame after the recording's first sample, s; below 0 it was before
+    # time from the recording's first sample to the film's first frame, s; negative: before it
     begin_s: float
     size: tuple[int, int]  # (height, width) of a frame
 
     @property
     def key(self) -> str:
-        """The name of its feature."""
+        """Name of the film's feature."""
         return f"observation.images.{self.name}"
 
     def feature(self, fps: int) -> dict[str, Any]:
-        """As ``info.json`` has it."""
+        """Describe the film for ``info.json``."""
         height, width = self.size
         return {
             "dtype": "video",
@@ -55,10 +55,10 @@ class CameraFilm:
 
 
 def film_of(text: str) -> CameraFilm:
-    """A film as it is named on the command line: ``front=front.mp4`` or ``front=front.mp4@1.25``.
+    """Parse a film of the command line: ``front=front.mp4`` or ``front=front.mp4@1.25``.
 
     Raises:
-        ConfigError: It is not named so, no film, or PyAV is missing.
+        ConfigError: The text has another form, the file is no film, or PyAV is missing.
     """
     name, equals, place = text.partition("=")
     file, at, seconds = place.rpartition("@")
@@ -66,7 +66,7 @@ def film_of(text: str) -> CameraFilm:
         file, seconds = place, "0"
     try:
         begin_s = float(seconds)
-    except ValueError:  # an @ in the name of the file
+    except ValueError:  # the @ is part of the file's name
         file, begin_s = place, 0.0
     if not (equals and name.replace("_", "").isalnum() and file and np.isfinite(begin_s)):
         raise ConfigError(f"--video is NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
@@ -83,10 +83,10 @@ def film_of(text: str) -> CameraFilm:
 
 
 def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
-    """Write the frame of each row: the newest that there was; before the first one, that.
+    """Write the newest frame at the time of each row, or else the first frame.
 
     Returns:
-        The statistics of colours, from 0 to 1, as LeRobot has them: of every so many frames.
+        The statistics of colours, from 0 to 1, of regularly sampled frames, as LeRobot has them.
 
     Raises:
         ConfigError: The film cannot be decoded.
@@ -101,7 +101,7 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
             stream = made.add_stream(CODEC, rate=fps, options=OPTIONS)
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             stream.time_base = Fraction(1, fps)
-            for k, frame in enumerate(_frames(av, film, rows, fps)):
+            for k, frame in enumerate(_decode_frames(av, film, rows, fps)):
                 if k % max(1, rows // LOOKED_AT) == 0:
                     pixels = frame.to_ndarray(format="rgb24").reshape(-1, 3)
                     seen.append(pixels[:: max(1, len(pixels) // PIXELS)] / 255.0)
@@ -121,17 +121,17 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
     return {**shaped, "count": np.array([len(seen)])}
 
 
-def _frames(av: Any, film: CameraFilm, rows: int, fps: int) -> Iterator[Any]:
-    """A decoded frame for each row."""
+def _decode_frames(av: Any, film: CameraFilm, rows: int, fps: int) -> Iterator[Any]:
+    """Yield a decoded frame for each row."""
     with av.open(str(film.path)) as file:
-        # Times are read first: whoever writes a frame gives it others.
+        # Times are read first: writing a frame changes its time.
         decoded = ((frame.time or 0.0, frame) for frame in file.decode(video=0))
         now = following = next(decoded, None)
         if now is None:
             raise ConfigError(f"{film.path} has no frame")
         first = now[0]
         for k in range(rows):
-            # A hundredth of a frame: times of a film are rounded to its own clock.
+            # Tolerance of a hundredth of a frame: a film's times are rounded to its own clock.
             until = (k + 0.01) / fps - film.begin_s
             while following is not None and following[0] - first <= until:
                 now, following = following, next(decoded, None)
@@ -145,7 +145,7 @@ def _import_av() -> Any:
 
 
 def describe_feature(kind: str, *shape: int, names: Any = None) -> dict[str, Any]:
-    """Describe a column of the rows as ``info.json`` has it."""
+    """Describe a column of the rows for ``info.json``."""
     return {"dtype": kind, "shape": list(shape), "names": names}
 
 
@@ -153,12 +153,12 @@ INFO = "meta/info.json"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 CODEBASE = "v3.0"
 IN_CHUNK = 1000  # files of a folder
-# What every row has besides.
+# Further columns of every row.
 NUMBERS = ("frame_index", "episode_index", "index", "task_index")
 FRAME = {"timestamp": describe_feature("float32", 1)}
 FRAME |= {name: describe_feature("int64", 1) for name in NUMBERS}
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-MOST_KEPT = 10_000  # rows of numbers, of which quantiles are taken
+MOST_KEPT = 10_000  # rows that are kept for quantiles
 
 
 def import_pyarrow() -> tuple[Any, Any]:
@@ -171,7 +171,7 @@ def import_pyarrow() -> tuple[Any, Any]:
 
 @dataclass
 class Episode:
-    """An episode: a recording."""
+    """Episode of the dataset: one recording."""
 
     index: int
     rows: int
@@ -182,10 +182,10 @@ class Episode:
     statistics: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
 
     def columns(self, frame: NDArray[np.int64], fps: int) -> dict[str, NDArray[Any]]:
-        """What some rows have besides samples.
+        """Return the columns of some rows other than samples.
 
         Args:
-            frame: (row,) Their numbers within the episode.
+            frame: (row,) Numbers of the rows within the episode.
         """
         return {
             "timestamp": (frame / fps).astype(np.float32),
@@ -197,9 +197,9 @@ class Episode:
 
 
 class Statistics:
-    """What policies scale their inputs by; added to piece by piece.
+    """Running statistics of a feature, by which policies scale their inputs.
 
-    Quantiles are of every so many rows, at most `MOST_KEPT` of them; all else is of all.
+    Quantiles are of regularly sampled rows, at most `MOST_KEPT`; all else is of all rows.
     """
 
     def __init__(self) -> None:
@@ -212,11 +212,11 @@ class Statistics:
         self._every, self._seen = 1, 0
 
     def add(self, values: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> None:
-        """Count some rows in.
+        """Add some rows to the statistics.
 
         Args:
             values: (n, ...) Numbers.
-            valid: (n, ...) Which of them count, of a shape that begins as that of `values`.
+            valid: (n, ...) Mask of those that count, with the leading axes of `values`.
         """
         good = np.isfinite(values)
         if valid is not None:
@@ -235,10 +235,10 @@ class Statistics:
             self._kept, self._every = self._kept[::2], 2 * self._every
 
     def found(self, repeat: int = 0) -> dict[str, NDArray[Any]]:
-        """By LeRobot's names; where nothing counted, 0.
+        """Return the statistics by LeRobot's names; 0 where no value was valid.
 
         Args:
-            repeat: Say it so many times, along a new first axis; 0: once, without one.
+            repeat: Number of copies along a new first axis; 0: no such axis.
         """
         n = np.maximum(self._n, 1)
         mean = self._sum / n
@@ -247,7 +247,7 @@ class Statistics:
             "std": np.sqrt(np.maximum(self._squares / n - mean**2, 0)),
         }  # fmt: skip
         kept = np.array(self._kept)
-        kept[:, np.isnan(kept).all(axis=0)] = 0  # what never counted
+        kept[:, np.isnan(kept).all(axis=0)] = 0  # values that were never valid
         one |= {name: np.nanquantile(kept, q, axis=0) for name, q in QUANTILES.items()}
         one = {name: np.where(np.isfinite(value), value, 0.0) for name, value in one.items()}
         if repeat:
@@ -263,7 +263,7 @@ def write_meta(
     tasks: Mapping[str, int],
     films: Sequence[CameraFilm],
 ) -> None:
-    """Write all of it but what is ours."""
+    """Write ``meta/``, except for our own files in it."""
     pa, pq = import_pyarrow()
     info = {
         "codebase_version": CODEBASE,
@@ -281,15 +281,15 @@ def write_meta(
         "features": {**features, **{film.key: film.feature(fps) for film in films}},
     }
     (folder / INFO).write_bytes(msgspec.json.format(msgspec.json.encode(info), indent=4))
-    (folder / "meta" / "stats.json").write_bytes(msgspec.json.encode(_all_of(episodes)))
-    pq.write_table(_tasks(pa, tasks), folder / "meta" / "tasks.parquet")
+    (folder / "meta" / "stats.json").write_bytes(msgspec.json.encode(_merge_statistics(episodes)))
+    pq.write_table(_make_task_table(pa, tasks), folder / "meta" / "tasks.parquet")
     path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     path.parent.mkdir(parents=True)
-    rows = [_episode(e, fps, films) for e in episodes]
+    rows = [_describe_episode(e, fps, films) for e in episodes]
     pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")
 
 
-def _episode(episode: Episode, fps: int, films: Sequence[CameraFilm]) -> dict[str, Any]:
+def _describe_episode(episode: Episode, fps: int, films: Sequence[CameraFilm]) -> dict[str, Any]:
     chunk, file = divmod(episode.index, IN_CHUNK)
     row: dict[str, Any] = {
         "episode_index": episode.index,
@@ -314,8 +314,8 @@ def _episode(episode: Episode, fps: int, films: Sequence[CameraFilm]) -> dict[st
     return row
 
 
-def _all_of(episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Statistics of all episodes together; quantiles are the means of theirs, as LeRobot has it."""
+def _merge_statistics(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Merge the statistics of all episodes; quantiles are averaged, as LeRobot does."""
     made: dict[str, Any] = {}
     for feature in episodes[0].statistics:
         each = [e.statistics[feature] for e in episodes]
@@ -333,8 +333,8 @@ def _all_of(episodes: Sequence[Episode]) -> dict[str, Any]:
     return made
 
 
-def _tasks(pa: Any, tasks: Mapping[str, int]) -> Any:
-    """As pandas would write a table whose index the tasks are: LeRobot reads it so."""
+def _make_task_table(pa: Any, tasks: Mapping[str, int]) -> Any:
+    """Make the table of tasks as pandas would, with the tasks as index. LeRobot expects that."""
     index = "__index_level_0__"
     text = {"pandas_type": "unicode", "numpy_type": "object"}
     about = {

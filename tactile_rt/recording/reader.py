@@ -1,4 +1,4 @@
-"""Read a recording back. What is damaged is named, never misread."""
+"""Reader of recordings, which reports damage and never returns wrong data."""
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -18,81 +18,81 @@ from tactile_rt.recording.ros2_form import is_in_file_form, name_channel, plain
 if TYPE_CHECKING:
     from tactile_rt.recording.records import Record
 
-FOOTER = b"\x02" + (20).to_bytes(8, "little")  # its opcode and length
+FOOTER = b"\x02" + (20).to_bytes(8, "little")  # opcode and length of the footer
 FOOTER_BYTES = len(FOOTER) + 20 + len(MAGIC)
 
 T = TypeVar("T")
 
 
 class Recording:
-    """A recording, read from its file: what it is of, and all that is in it.
+    """Description and contents of a recording, read from its file.
 
         recording = Recording("run.mcap")
         for chunk in recording: ...
 
-    Every iteration opens the file, and reads it from its beginning. Where damage is met, what comes
-    before it has been given out.
+    Every iteration opens the file, and reads it from its beginning. If the file is damaged, all
+    that comes before the damage is delivered first.
 
     Raises:
-        ConfigError: there is no such file, or the extra is not installed.
-        RecordingError: it is no recording, unfinished, damaged, or of another version. All that
-            iterates raises it, too.
+        ConfigError: no such file exists, or the extra is not installed.
+        RecordingError: the file is no recording, unfinished, damaged, or of another version. All
+            iterators raise it, too.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        with _opened(self.path) as file:
-            self.description = _described(self.path, read_records(file))[0]
+        with _open_finished(self.path) as file:
+            self.description = _read_head(self.path, read_records(file))[0]
 
     @property
     def spec(self) -> ArraySpec:
-        """The array of the samples."""
+        """Array of the samples."""
         return self.description.spec
 
     def __iter__(self) -> Iterator[Chunk]:
         return self.chunks()
 
     def chunks(self) -> Generator[Chunk, None, None]:
-        """The chunks, as they were recorded."""
+        """Yield the chunks as they were recorded."""
         shape = self.spec.shape
-        return self._decoded(layout.SAMPLES, lambda raw: layout.decode_samples(raw.data, shape))
+        return self._decode(layout.SAMPLES, lambda raw: layout.decode_samples(raw.data, shape))
 
     def packets(self) -> Iterator[tuple[layout.Packet, int]]:
-        """The raw packets and their arrival, host time in ns; None where the line was opened."""
+        """Yield raw packets (None: the line was opened) with their arrival, host time in ns."""
         wire = self.description.wire
         decode = layout.decode_packet
-        return self._decoded(layout.WIRE, lambda raw: (decode(raw.data, wire), raw.t_ns))
+        return self._decode(layout.WIRE, lambda raw: (decode(raw.data, wire), raw.t_ns))
 
     def health(self) -> Iterator[dict[str, Any]]:
-        """How source and recorder were, whenever it changed.
+        """Yield the state of source and recorder at each change.
 
-        The fields are those of docs/reference/recording.md.
+        The fields are described in docs/reference/recording.md.
         """
-        return self._decoded(layout.HEALTH, _fields)
+        return self._decode(layout.HEALTH, _parse_json)
 
     def decisions(self) -> Iterator[dict[str, Any]]:
-        """What the daemon's models decided, as it published it."""
-        return self._decoded(layout.DECISIONS, _fields)
+        """Yield the decisions of the daemon's models, as they were published."""
+        return self._decode(layout.DECISIONS, _parse_json)
 
     def events(self) -> Iterator[dict[str, Any]]:
-        """What changed in the daemon meanwhile: contacts, and states of its parts."""
-        return self._decoded(layout.EVENTS, _fields)
+        """Yield the daemon's events: contacts, and changes of state of its parts."""
+        return self._decode(layout.EVENTS, _parse_json)
 
     def skips(self, model: str) -> list[dict[str, Any]]:
-        """The stretches that a model skipped as it was behind.
+        """Return the stretches that a model skipped because it was behind.
 
-        The fields are those of docs/reference/messages.md.
+        The fields are described in docs/reference/messages.md.
         """
         return [e for e in self.events() if e.get("type") == "skip" and e.get("model") == model]
 
     def raw(self, *topics: str) -> Generator[layout.Raw, None, None]:
-        """The messages of these channels, undecoded; of none, the file is only checked."""
+        """Yield the messages of some channels, undecoded; without any, only check the file."""
         from mcap.records import Channel, Message
 
         path = self.path
-        with _opened(path) as file, _naming(path):
+        with _open_finished(path) as file, _explain_damage(path):
             records = read_records(file)
-            about, record = _described(path, records)
+            about, record = _read_head(path, records)
             names: dict[int, str] = {}
             due: dict[int, int] = {}
             while record is not None:
@@ -116,23 +116,23 @@ class Recording:
                         yield layout.Raw(name, t_ns, plain(name, record.data))
                 record = next(records, None)
 
-    def _decoded(self, topic: str, decode: Callable[[layout.Raw], T]) -> Generator[T, None, None]:
+    def _decode(self, topic: str, decode: Callable[[layout.Raw], T]) -> Generator[T, None, None]:
         for raw in self.raw(topic):
-            with _naming(self.path):
+            with _explain_damage(self.path):
                 decoded = decode(raw)
             yield decoded
 
 
-def _fields(raw: layout.Raw) -> dict[str, Any]:
+def _parse_json(raw: layout.Raw) -> dict[str, Any]:
     return msgspec.json.decode(raw.data, type=dict[str, Any])
 
 
-def _described(path: Path, records: "Iterator[Record]") -> "tuple[Description, Record | None]":
-    """What the recording is of, and the record after that."""
+def _read_head(path: Path, records: "Iterator[Record]") -> "tuple[Description, Record | None]":
+    """Return the description of a recording, and the first record after it."""
     from mcap.records import Metadata
 
     found: dict[str, dict[str, str]] = {}
-    with _naming(path):
+    with _explain_damage(path):
         record = next(records, None)
         while isinstance(record, Metadata):
             found.setdefault(record.name, record.metadata)
@@ -146,8 +146,8 @@ def _described(path: Path, records: "Iterator[Record]") -> "tuple[Description, R
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """A recording that has been written to its end."""
+def _open_finished(path: Path) -> Iterator[BinaryIO]:
+    """Open a recording; refuse one that has not been written to its end."""
     try:
         file = open_regular(path)
     except FileNotFoundError:
@@ -167,7 +167,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def is_finished(path: Path) -> bool:
-    """Whether the file has the end that is written last; nothing else of it is looked at."""
+    """Return whether a file ends as a finished recording; nothing else is checked."""
     try:
         with open_regular(path) as file:
             return _has_end(file)
@@ -182,7 +182,7 @@ def _has_end(file: BinaryIO) -> bool:
     return tail.startswith(FOOTER) and tail.endswith(MAGIC)
 
 
-def _naming(path: Path) -> AbstractContextManager[None]:
-    """Name the file where its damage makes the MCAP library raise anything."""
+def _explain_damage(path: Path) -> AbstractContextManager[None]:
+    """Turn any error of the MCAP library on damage into one that names the file."""
     hint = "); `tactile-rt recover` keeps what is whole"
     return explain_errors(RecordingError, f"{path} is damaged (", hint)

@@ -1,13 +1,13 @@
-"""The records of an MCAP file, in their order, within bounds of memory and time.
+"""Reader of the records of an MCAP file, in file order, within bounds of memory and time.
 
-What is needed: a file may come from elsewhere, so nothing in it is believed before it is checked. A
-few bytes can say that they unpack to gigabytes, or that a million channels follow.
+A file may come from anywhere, so every field is checked before it is used: a few bytes can claim to
+unpack to gigabytes, or announce a million channels.
 
-The plan. The file is read once, from its beginning; its index is not used, so where that points to
-does not matter. A record's length is held against what is left of the file. Only what recordings
-are made of is looked into: metadata, channels, messages, and chunks of these; all else is passed
-over. A chunk unpacks to the size that it declares and to `MOST_UNPACKED` at most, the whole file to
-`MOST_RATIO` times its size.
+The file is read once, from its beginning. Its index is not used, so a wrong index does no harm. A
+record's length is checked against the bytes left in the file. Only the records that make up a
+recording are parsed: metadata, channels, messages, and chunks of these; all others are skipped. A
+chunk unpacks to the size that it declares and to `MOST_UNPACKED` at most, the whole file to
+`MOST_RATIO` times its size, plus `FREE`.
 """
 
 import struct
@@ -24,45 +24,45 @@ if TYPE_CHECKING:
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA, DATA_END = 1, 2, 3, 4, 5, 6, 12, 15
 
-MOST_UNPACKED: Final = 32 << 20  # bytes of a chunk; ours have one MiB and a message more
+MOST_UNPACKED: Final = 32 << 20  # bytes of a chunk; ours have one MiB plus one message at most
 MOST_RATIO: Final = (
-    2000  # of all chunks to the file; a large array that measures 0 reaches 1500 ...
+    2000  # unpacked chunks to file size; a large array that measures 0 reaches 1500 ...
 )
-FREE: Final = 256 << 20  # bytes ... beyond these
-MOST_METADATA: Final = 4 << 20  # bytes, all together
-MOST_OTHERS: Final = 10_000  # records that are neither chunks nor messages nor their index
-PIECE: Final = 1 << 20  # bytes read at once of what is passed over
-INDEXES: Final = (7, 8)  # of a chunk's messages, and of chunks: as many as there are chunks
+FREE: Final = 256 << 20  # bytes that may be unpacked beyond that ratio
+MOST_METADATA: Final = 4 << 20  # bytes of all metadata records together
+MOST_OTHERS: Final = 10_000  # records other than chunks, messages and their indexes
+PIECE: Final = 1 << 20  # bytes of a skipped record that are read at once
+INDEXES: Final = (7, 8)  # message index and chunk index: one or more per chunk
 
 _FRAME = struct.Struct("<BQ")  # opcode and length
 _MESSAGE = struct.Struct("<HIQQ")
-MOST_LOOKS: Final = 4  # times the file, at what looks like a chunk
+MOST_LOOKS: Final = 4  # times the file's size that may be read as candidate chunks
 ENDS: Final = (CHUNK, DATA_END, FOOTER)
-MARK: Final = struct.pack("<I4s", 4, b"zstd")  # how a chunk of ours is compressed
-MARK_AT: Final = _FRAME.size + 8 + 8 + 8 + 4  # after times, size and checksum
-_CHUNK = struct.Struct("<QQQII")  # and the name of the compression, the data's length, the data
+MARK: Final = struct.pack("<I4s", 4, b"zstd")  # name of the compression of our chunks
+MARK_AT: Final = _FRAME.size + 8 + 8 + 8 + 4  # its offset: after times, size and checksum
+_CHUNK = struct.Struct("<QQQII")  # then the name of the compression, the data's length, the data
 
 
 def read_records(file: BinaryIO) -> "Iterator[Record]":
-    """What is in a file that was written to its end, until damage is met.
+    """Yield the records of a finished file, up to the first damage.
 
     Raises:
-        ValueError: damage, or more than a recording has.
+        ValueError: the file is damaged, or exceeds the limits of a recording.
     """
     return _Reader(file).records()
 
 
 def read_whole_records(file: BinaryIO) -> "Iterator[Record]":
-    """What is whole in a file that was cut off or damaged, also behind a hole.
+    """Yield the intact records of a truncated or damaged file, also those after a hole.
 
     Raises:
-        ValueError: there is more in it than a recording has.
+        ValueError: the file exceeds the limits of a recording.
     """
     return _Reader(file).whole_records()
 
 
-class _TooMuch(ValueError):
-    """More than a recording has: not damage that what is whole can be saved from."""
+class _LimitExceeded(ValueError):
+    """The file exceeds a limit of recordings; unlike damage, nothing is salvaged from it."""
 
 
 class _Reader:
@@ -76,11 +76,11 @@ class _Reader:
         self._unpacked = self._metadata = self._others = self._looked = 0
 
     def records(self) -> "Iterator[Record]":
-        self._begin()
-        while (frame := self._next()) is not None:
+        self._check_magic()
+        while (frame := self._next_frame()) is not None:
             opcode, length = frame
             if opcode == CHUNK:
-                yield from self._inside(self._unpack(self._read(length)))
+                yield from self._split_chunk(self._unpack_chunk(self._read(length)))
             elif opcode == DATA_END:
                 self._check_sum(length)
             elif opcode == FOOTER:
@@ -89,32 +89,32 @@ class _Reader:
                     raise ValueError("its end is none of an MCAP file")
                 return
             else:
-                yield from self._single(opcode, length)
+                yield from self._read_single(opcode, length)
         raise ValueError("it ends before its end is written")
 
     def whole_records(self) -> "Iterator[Record]":
-        """What is of the whole file, and then what is in chunks, wherever they are.
+        """Yield the records at the beginning of the file, then those of every intact chunk.
 
-        A power cut leaves any page of what was not synced yet, and zeros for the others. So nothing
-        that says how long it is leads on to what follows: chunks are looked for, and their
-        checksums say whether they are.
+        After a power cut any of the pages that were not synced may be left, the others are zeros.
+        So a record's length does not lead to the next record: chunks are searched for by their
+        mark, and confirmed by their checksums.
         """
         try:
-            self._begin()
-            while (frame := self._next()) is not None and frame[0] not in ENDS:
-                yield from self._single(*frame)
-        except _TooMuch:
+            self._check_magic()
+            while (frame := self._next_frame()) is not None and frame[0] not in ENDS:
+                yield from self._read_single(*frame)
+        except _LimitExceeded:
             raise
-        except Exception:  # cut off here; a damaged length reads as anything
+        except Exception:  # truncated here; a damaged length can have any value
             pass
         at = 0
         while (found := self._find(MARK, at)) >= 0:
             at, data = self._chunk_around(found)
             if data is not None:
-                yield from self._inside(data)
+                yield from self._split_chunk(data)
 
     def _chunk_around(self, mark: int) -> tuple[int, bytes | None]:
-        """The records of the chunk that has the mark here, if one has, and where to look on."""
+        """Return where to search on, and the chunk's data around this mark if intact."""
         begin = mark - MARK_AT
         head = self._peek(begin, MARK_AT + len(MARK) + 8) if begin >= 0 else b""
         if len(head) < MARK_AT + len(MARK) + 8:
@@ -127,24 +127,24 @@ class _Reader:
         record = self._peek(begin + _FRAME.size, length)
         self._looked += length
         if self._looked > FREE + MOST_LOOKS * self._size:
-            raise _TooMuch("more that looks like a chunk than there is room for")
+            raise _LimitExceeded("more that looks like a chunk than there is room for")
         self._at = begin + _FRAME.size + length
         try:
             if len(record) < length or not _CHUNK.unpack_from(record)[3]:  # no checksum
                 return mark + 1, None
-            data = self._unpack(record)
+            data = self._unpack_chunk(record)
             others = self._others
-            for _ in self._inside(data):  # nothing of a chunk that breaks off
+            for _ in self._split_chunk(data):  # check all records: a broken chunk yields none
                 pass
-            self._others = others  # they are counted when they are taken
-        except _TooMuch:
+            self._others = others  # they are counted when they are yielded
+        except _LimitExceeded:
             raise
-        except Exception:  # damaged: what follows may be whole
+        except Exception:  # damaged: later chunks may be intact
             return mark + 1, None
         return self._at, data
 
     def _find(self, mark: bytes, at: int) -> int:
-        """Where these bytes are next; -1: nowhere."""
+        """Return the next position of these bytes from `at` on; -1: none."""
         while at < self._size:
             if (found := self._peek(at, PIECE).find(mark)) >= 0:
                 return at + found
@@ -152,22 +152,22 @@ class _Reader:
         return -1
 
     def _peek(self, at: int, size: int) -> bytes:
-        """So many bytes, or fewer; none where the medium is damaged."""
+        """Return up to `size` bytes at a position; none where the medium cannot be read."""
         try:
             self._file.seek(at)
             return self._file.read(size)
         except OSError:
             return b""
 
-    def _begin(self) -> None:
+    def _check_magic(self) -> None:
         if self._read(len(MAGIC)) != MAGIC:
             raise ValueError("it is no MCAP file")
 
-    def _next(self) -> tuple[int, int] | None:
-        """Opcode and length of the next record; None at the end."""
+    def _next_frame(self) -> tuple[int, int] | None:
+        """Return opcode and length of the next record; None at the end of the file."""
         if self._at == self._size:
             return None
-        self._before = self._crc
+        self._crc_before = self._crc
         opcode, length = _FRAME.unpack(self._read(_FRAME.size))
         if length > self._size - self._at:
             raise ValueError(f"a record of {length} bytes where {self._size - self._at} are left")
@@ -183,30 +183,30 @@ class _Reader:
         self._crc = zlib.crc32(data, self._crc)
         return data
 
-    def _single(self, opcode: int, length: int) -> "Iterator[Record]":
-        """A record outside chunks, if it is one of ours."""
+    def _read_single(self, opcode: int, length: int) -> "Iterator[Record]":
+        """Yield a record outside chunks if recordings use its kind; skip it otherwise."""
         if opcode == MESSAGE and length <= MOST_UNPACKED:
             yield self._message(self._read(length))
             return
         if opcode == METADATA:
             self._metadata += length
             if self._metadata > MOST_METADATA:
-                raise _TooMuch(f"metadata of more than {MOST_METADATA >> 20} MiB")
+                raise _LimitExceeded(f"metadata of more than {MOST_METADATA >> 20} MiB")
         if opcode not in INDEXES:
             self._count_other()
         if opcode in (METADATA, CHANNEL) and length <= MOST_METADATA:
-            yield self._parsed(opcode, self._read(length))
+            yield self._parse(opcode, self._read(length))
             return
         while length:
             length -= len(self._read(min(length, PIECE)))
 
     def _check_sum(self, length: int) -> None:
-        before = self._before
-        (told,) = struct.unpack_from("<I", self._read(length))
-        if told not in (0, before):
+        before = self._crc_before
+        (stored,) = struct.unpack_from("<I", self._read(length))
+        if stored not in (0, before):
             raise ValueError("its checksum is another")
 
-    def _unpack(self, record: bytes) -> bytes:
+    def _unpack_chunk(self, record: bytes) -> bytes:
         _, _, size, crc, name_length = _CHUNK.unpack_from(record)
         at = _CHUNK.size + name_length
         name = record[_CHUNK.size : at]
@@ -221,15 +221,15 @@ class _Reader:
             )
         self._unpacked += size
         if self._unpacked > FREE + MOST_RATIO * self._at:
-            raise _TooMuch(f"chunks that unpack to more than {MOST_RATIO} times the file")
-        data: bytes = _unpacked(name.decode(errors="replace"), packed, size)
+            raise _LimitExceeded(f"chunks that unpack to more than {MOST_RATIO} times the file")
+        data: bytes = _decompress(name.decode(errors="replace"), packed, size)
         if len(data) != size:
             raise ValueError(f"a chunk does not unpack to the {size} bytes that it says")
         if crc and zlib.crc32(data) != crc:
             raise ValueError("the checksum of a chunk is another")
         return data
 
-    def _inside(self, data: bytes) -> "Iterator[Record]":
+    def _split_chunk(self, data: bytes) -> "Iterator[Record]":
         at, end, unpack = 0, len(data), _FRAME.unpack_from
         while at < end:
             opcode, length = unpack(data, at)
@@ -242,21 +242,21 @@ class _Reader:
                 continue
             self._count_other()
             if opcode == CHANNEL:
-                yield self._parsed(opcode, data[begin:at])
+                yield self._parse(opcode, data[begin:at])
             elif opcode != SCHEMA:
                 raise ValueError(f"a record of kind {opcode} in a chunk")
 
     def _count_other(self) -> None:
         self._others += 1
         if self._others > MOST_OTHERS:
-            raise _TooMuch(f"more than {MOST_OTHERS} records besides messages")
+            raise _LimitExceeded(f"more than {MOST_OTHERS} records besides messages")
 
     def _message(self, data: bytes) -> "Message":
         channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data)
         return self._new_message(channel, log_time, data[_MESSAGE.size :], publish_time, sequence)
 
     @staticmethod
-    def _parsed(opcode: int, data: bytes) -> "Channel | Metadata":
+    def _parse(opcode: int, data: bytes) -> "Channel | Metadata":
         from mcap.data_stream import ReadDataStream
         from mcap.records import Channel, Metadata
 
@@ -265,16 +265,16 @@ class _Reader:
         return parsed
 
 
-def _unpacked(compression: str, packed: memoryview, size: int) -> Any:
-    """At most one byte more than `size`, whatever the data says of itself."""
+def _decompress(compression: str, packed: memoryview, size: int) -> Any:
+    """Decompress data to at most `size` + 1 bytes, whatever size the data itself declares."""
     if not compression:
         return bytes(packed)
     if compression == "zstd":
         import zstandard
 
-        told = zstandard.get_frame_parameters(packed).content_size
-        if told not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise ValueError(f"a chunk says that it unpacks to {size} bytes and to {told}")
+        declared = zstandard.get_frame_parameters(packed).content_size
+        if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError(f"a chunk says that it unpacks to {size} bytes and to {declared}")
         return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
     if compression == "lz4":
         import lz4.frame

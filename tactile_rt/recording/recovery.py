@@ -1,4 +1,4 @@
-"""Make a whole recording of one that was cut short or damaged."""
+"""Recovery of a recording that was cut short or damaged."""
 
 import os
 from collections.abc import Iterator
@@ -17,23 +17,23 @@ from tactile_rt.recording.writer import McapFile, check_not_recorded
 if TYPE_CHECKING:
     from tactile_rt.recording.records import Record
 
-MOST_NONE = 1000  # messages that are none, after which the file is no damaged recording
+MOST_NONE = 1000  # invalid messages, beyond which the file is taken for no recording at all
 
 
 def recover(path: str | Path, output: str | Path | None = None, force: bool = False) -> Path:
-    """Write all that is whole in a recording into a new one; the old one stays.
+    """Copy all intact parts of a recording into a new one; keep the old one.
 
     Args:
         path: of a recording that was cut short (a killed process, a full disk) or damaged.
-        output: where to; None: beside it, as ``NAME.recovered.mcap``.
+        output: the file to write; None: ``NAME.recovered.mcap`` in the same folder.
 
     Returns:
-        The new file; `path` itself if it is whole.
+        The new file; `path` itself if that is intact and `output` is None.
 
     Raises:
-        ConfigError: there is no such file, the output is there already or is being recorded right
+        ConfigError: no such file exists, or the output exists already or is being recorded right
             now.
-        RecordingError: it is no recording, or nothing in it is whole.
+        RecordingError: the file is no recording, or nothing in it is intact.
     """
     path = Path(path)
     whole = _is_whole(path)
@@ -49,7 +49,7 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(f"{path} is not an MCAP file, or was cut before it began")
         file.seek(0)
-        about, records = _begun(path, _bounded(path, file))
+        about, records = _read_head(path, _read_records(path, file))
         write_whole(output, lambda new: _copy(path, records, new, about))
     sync_folder(output.parent)
     return output
@@ -64,15 +64,15 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def _bounded(path: Path, file: BinaryIO) -> "Iterator[Record]":
+def _read_records(path: Path, file: BinaryIO) -> "Iterator[Record]":
     try:
         yield from read_whole_records(file)
     except ValueError as error:
         raise RecordingError(f"{path} is no recording: {error}") from None
 
 
-def _begun(path: Path, records: "Iterator[Record]") -> "tuple[Description, Iterator[Record]]":
-    """What the recording is of, and what follows."""
+def _read_head(path: Path, records: "Iterator[Record]") -> "tuple[Description, Iterator[Record]]":
+    """Return the description of a recording, and the records after it."""
     from mcap.records import Metadata
 
     found: dict[str, dict[str, str]] = {}
@@ -93,7 +93,7 @@ def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Descrip
 
     file = McapFile(new, about)
     file.note(RECOVERED, {"by": "tactile_rt"})
-    # A damaged first chunk takes the names of the channels with it, but we number them alike.
+    # A damaged first chunk loses the names of the channels, but their numbers are always the same.
     numbered = (name for name, wire in CHANNELS if wire in ("", about.wire))
     names = dict(enumerate(numbered, 1))
     whole, none = False, 0
@@ -102,7 +102,7 @@ def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Descrip
             names[record.id] = name_channel(record.topic)
         elif isinstance(record, Message) and record.channel_id in names:
             name = names[record.channel_id]
-            if name == ARRAY:  # written anew
+            if name == ARRAY:  # `McapFile.add` writes it anew
                 continue
             if is_in_file_form(name, record.data, about.spec.shape):
                 t_ns = record.log_time - about.utc_offset_ns

@@ -1,6 +1,6 @@
-"""`replay:` URLs: what was recorded, as a stream again.
+"""`replay:` URLs: recordings and sweep sets played back as streams.
 
-replay:run.mcap                                   the recorded chunks, as fast as they came
+replay:run.mcap                                   the recorded chunks, at the recorded pace
 replay:run.mcap?speed=10                          ten times as fast; 0: as fast as they are read
 replay:run.mcap?loop=true                         over and over
 replay:run.mcap?from=wire                         raw packets, decoded again
@@ -34,24 +34,24 @@ from tactile_rt.recording.records import MAGIC
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import read_object
 
-# Six objects sweep past simulated whiskers, see bench/write_demo.py: `replay:demo`.
+# `replay:demo`: six objects sweep past simulated whiskers; made by bench/write_demo.py.
 DEMO = Path(__file__).parents[1] / "assets" / "demo.mcap"
-NPZ = b"PK"  # how it begins
-SWEEP_CHUNK_NS = 9_000_000  # a chunk's length, as other sources have it
-SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
+NPZ = b"PK"  # first bytes of such a file
+SWEEP_CHUNK_NS = 9_000_000  # length of a chunk, as of other sources
+SLICE_S = 0.1  # time after which a waiting read notices that the source was closed, at most
 
-# Chunks and when each is due: ns on any clock, from 0 or not.
+# Chunks with the time at which each is due: ns on any clock, with any zero.
 Timed = Iterator[tuple[int, Chunk]]
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Options of ``replay:`` of a recording, besides those of its codec."""
+    """Options of ``replay:`` of a recording, in addition to those of its codec."""
 
     # pace of the stream, as a multiple of the recorded one; 0 for as fast as it is read
     speed: float = 1.0
     codec: str = ""  # name of the codec that decodes raw packets; empty for the recorded one
-    # whether the recording begins again at its end; numbers and times of samples go on
+    # whether the recording begins again at its end; sample numbers and times continue
     loop: bool = False
 
 
@@ -84,9 +84,9 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         options = _take_options(what, fields, ReplayOptions)
         if options.codec:
             raise ConfigError(f"{what}: codec= is for from=wire; samples are decoded already")
-        chunks, calibrated = partial(_recorded, recording), about.calibration is not None
-        again = (about.spec, chunks, options.speed, calibrated, options.loop)
-        return Prepared(about.spec, partial(ReplaySource, *again))
+        chunks, calibrated = partial(_read_chunks, recording), about.calibration is not None
+        arguments = (about.spec, chunks, options.speed, calibrated, options.loop)
+        return Prepared(about.spec, partial(ReplaySource, *arguments))
     if channel != WIRE:
         raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
     if not about.wire:
@@ -97,33 +97,33 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
     same = options.codec in ("", about.codec)
     if same:
         own = {**about.codec_options, **own}
-    told = own.pop("array", "")  # what the device was said to be when it was recorded
-    array = ArraySpec.from_json(told) if told else None
+    declared = own.pop("array", "")  # the array that the device was declared to be
+    array = ArraySpec.from_json(declared) if declared else None
 
     def new_codec() -> Codec[Any]:
         codec = make_codec(about.wire, options.codec or about.codec, own)
         codec.spec = codec.spec or array
         return codec
 
-    def decode() -> _Decoding:
-        return _Decoding(str(path), new_codec(), recording.packets(), about.clock)
+    def decode() -> _Decoder:
+        return _Decoder(str(path), new_codec(), recording.packets(), about.clock)
 
-    def opened() -> Source:
-        first = [decode()]  # which knows the array; each further pass is decoded anew
+    def open_decoded() -> Source:
+        first = [decode()]  # it knows the array; each further pass is decoded anew
         return ReplaySource(
             first[0].spec, lambda stats: (first.pop() if first else decode()).chunks(stats),
             options.speed, loop=options.loop,
         )  # fmt: skip
 
-    prepared = Prepared(new_codec().spec, opened)
+    prepared = Prepared(new_codec().spec, open_decoded)
     if about.calibration is not None:
         prepared = prepared.calibrated(about.calibration)
-    # What a device said of itself is among the packets.
+    # A device's own description is among the recorded packets.
     return replace(prepared, spec=about.spec) if same and not prepared.spec else prepared
 
 
 def _check_file(path: Path) -> None:
-    """Refuse what is no file, or begins as no recording does."""
+    """Refuse a path that is not a file in the form of MCAP or npz."""
     if not os.path.isfile(path):
         raise ConfigError(f"no file {path}")
     try:
@@ -143,16 +143,16 @@ def _take_options(what: str, fields: dict[str, str], kind: type[Any]) -> Any:
 
 
 class ReplaySource(Source):
-    """Chunks again, each when it is due.
+    """Source that delivers stored chunks, each when it is due.
 
-    The chunks, their times and all that is decided by them do not depend on the speed. A recording
-    is not live at any speed: it waits for its reader, who then falls behind the pace but loses
+    The chunks, their times and all decisions on them do not depend on the speed. A recording is not
+    live at any speed: it waits for its reader, so a slow reader falls behind the pace but loses
     nothing.
 
     Args:
-        timed: makes the chunks and when they are due, ns; what is lost is counted in its argument.
-        speed: times the recorded pace; 0: at once.
-        loop: whether to begin again at the end, with numbers and times that go on.
+        timed: makes the chunks and their due times, ns; it counts lost samples in its argument.
+        speed: multiple of the recorded pace; 0: each chunk at once.
+        loop: whether to begin again at the end, with numbers and times that continue.
     """
 
     live = False
@@ -168,7 +168,7 @@ class ReplaySource(Source):
         super().__init__(spec)
         self.calibrated = calibrated
         self._speed = speed
-        self._timed = self._again_and_again(timed) if loop else timed(self.stats)
+        self._timed = self._repeat(timed) if loop else timed(self.stats)
         self._next: tuple[int, Chunk] | None = None
         self._begin: tuple[int, int] | None = None  # due time and host time of the first chunk
         self._closed = False
@@ -196,16 +196,16 @@ class ReplaySource(Source):
     def close(self) -> None:
         self._closed = True
         try:
-            self._timed.close()  # type: ignore[attr-defined]  # which closes the file
+            self._timed.close()  # type: ignore[attr-defined]  # it closes the file
         except ValueError:
-            pass  # being read in another thread, whose next read ends
+            pass  # another thread is reading: its next read ends
 
-    def _again_and_again(self, timed: Callable[[SourceStats], Timed]) -> Timed:
-        """Pass after pass, each beginning a sample's period after the end of the one before."""
+    def _repeat(self, timed: Callable[[SourceStats], Timed]) -> Timed:
+        """Repeat the stream for ever; each pass begins one sample period after the last."""
         period = round(NS_PER_S / self.spec.rate_hz)
-        end: tuple[int, int] | None = None  # number and time that the next sample is to have
+        end: tuple[int, int] | None = None  # number and time of the next sample
         while True:
-            shift: tuple[int, int] | None = None  # of numbers and times in this pass
+            shift: tuple[int, int] | None = None  # added to numbers and times of this pass
             for due, chunk in timed(self.stats):
                 if shift is None:
                     begins = int(chunk.seq[0]), int(chunk.t_ns[0])
@@ -214,7 +214,7 @@ class ReplaySource(Source):
                 end = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1]) + period
                 yield due + shift[1], chunk
             if shift is None:
-                return  # there is nothing in it
+                return  # the stream is empty
 
     def _wait_s(self, due: int) -> float:
         if not self._speed:
@@ -226,8 +226,8 @@ class ReplaySource(Source):
         return (since - (now - self._begin[1])) / NS_PER_S
 
 
-def _recorded(recording: Recording, stats: SourceStats) -> Timed:
-    """The chunks as recorded; what their numbers leave out was lost."""
+def _read_chunks(recording: Recording, stats: SourceStats) -> Timed:
+    """Yield the recorded chunks; count gaps in their numbers as missing samples."""
     after: int | None = None
     for chunk in recording:
         first, last = int(chunk.seq[0]), int(chunk.seq[-1])
@@ -237,11 +237,11 @@ def _recorded(recording: Recording, stats: SourceStats) -> Timed:
         yield int(chunk.t_ns[-1]), chunk
 
 
-class _Decoding:
-    """Raw packets through a codec and a stamper, as `DeviceSource` does it.
+class _Decoder:
+    """Recorded packets, decoded by a codec and stamped as `DeviceSource` does it live.
 
     Raises:
-        RecordingError: the codec finds no sample in them.
+        RecordingError: the codec finds no description of the array in the packets.
     """
 
     def __init__(
@@ -249,12 +249,12 @@ class _Decoding:
     ) -> None:
         self._codec, self._packets, self._clock = codec, packets, clock
         self._early: list[tuple[Samples | None, int]] = []
-        # What the codec finds before the device has described itself waits, as in a live start.
+        # Samples that come before the device has described itself wait, as in a live start.
         while codec.spec is None:
             found = next(packets, None)
             if found is None:
                 break
-            self._early += self._feed(*found)
+            self._early += self._decode(*found)
         if codec.spec is None:
             raise RecordingError(
                 f"{path}: codec {type(codec).__name__} finds no description of an array in its "
@@ -263,13 +263,13 @@ class _Decoding:
         self.spec = codec.spec
 
     def chunks(self, stats: SourceStats) -> Timed:
-        """The chunks and the arrival of the packets that completed them."""
+        """Yield (arrival of the packet that completes a chunk in ns, chunk)."""
         codec = self._codec
         stamper = Stamper(codec, self.spec, stats, steady=self._clock != "log")
         if self._clock == "device" and codec.tick_ns is not None:
             stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         connected = False
-        later = chain.from_iterable(self._feed(packet, t_ns) for packet, t_ns in self._packets)
+        later = chain.from_iterable(self._decode(packet, t_ns) for packet, t_ns in self._packets)
         for samples, t_ns in chain(self._early, later):
             if samples is None:
                 if connected:
@@ -280,10 +280,10 @@ class _Decoding:
             if chunk is not None:
                 yield t_ns, chunk
 
-    def _feed(self, packet: Packet, t_ns: int) -> list[tuple[Samples | None, int]]:
+    def _decode(self, packet: Packet, t_ns: int) -> list[tuple[Samples | None, int]]:
         if packet is None:
             self._codec.forget()
-            self._codec.commands(Command.START)  # some note what they have asked for
+            self._codec.commands(Command.START)  # some codecs remember what they asked for
             return [(None, t_ns)]
         samples = self._codec.feed(packet, t_ns)
         return [] if samples is None else [(samples, t_ns)]
@@ -294,12 +294,12 @@ class SweepOptions:
     """Options of ``replay:`` of a sweep set's object."""
 
     speed: float = 1.0  # pace as a multiple of real time; 0: as fast as it is read
-    # whether the recording begins again at its end; numbers and times of samples go on
+    # whether the sweeps begin again at their end; sample numbers and times continue
     loop: bool = False
     # number of the only sweep to stream, from 0; None: all, one after another
     sweep: int | None = None
-    # rest before each sweep, s, besides the lead that is stored with it: so that a contact ends,
-    # and a baseline is taken, before the next
+    # rest before each sweep, s, in addition to the stored lead, so that the contact ends and a new
+    # baseline is taken before the next sweep
     rest_s: float = 0.5
 
     def __post_init__(self) -> None:
@@ -308,7 +308,7 @@ class SweepOptions:
 
 
 def _sweep_chunks(path: Path, manifest: SweepManifest, options: SweepOptions) -> Timed:
-    """Cut the sweeps of an object, once they are checked, into chunks."""
+    """Check the sweeps of an object, and cut them into chunks."""
     values, _ = read_object(path.parent, path.stem)
     if values.ndim != 4 or values.shape[2:] != manifest.spec.shape or not values.shape[1]:
         raise RecordingError(
@@ -325,7 +325,7 @@ def _cut_sweeps(sweeps: Iterator[np.ndarray], rest: int, manifest: SweepManifest
     period, size = manifest.period_ns, max(1, SWEEP_CHUNK_NS // manifest.period_ns)
     first = 0
     for sweep in sweeps:
-        # The lead again and again, so that the rest has the noise of the sweep.
+        # The rest repeats the lead, so that it has the noise of the sweep.
         lead = sweep[: max(1, manifest.lead)]
         stream = np.concatenate([np.resize(lead, (rest, *lead.shape[1:])), sweep])
         for at in range(0, len(stream), size):

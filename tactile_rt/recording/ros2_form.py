@@ -1,5 +1,5 @@
-"""How what is recorded stands in the file: every channel is a ROS 2 topic of a message whose
-definition is in the file, so that whatever reads ROS 2 reads it.
+"""Conversion of messages to and from their form in the file: every channel is a ROS 2 topic whose
+message definition is in the file, so that any reader of ROS 2 can read it.
 
     /tactile/whiskers/samples    tactile_rt_msgs/msg/Samples
 """
@@ -9,7 +9,7 @@ from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import CDR
 
 ARRAY, WRENCH = "array", "wrench"
-# In the order in which they are numbered, by which a file is recovered whose beginning is damaged.
+# In the order of their numbers, by which a file with a damaged beginning is recovered.
 CHANNELS = {
     (layout.SAMPLES, ""): messages.SAMPLES,
     (layout.WIRE, "serial"): f"{messages.OURS}/SerialPacket",
@@ -24,7 +24,7 @@ TEXTS = (layout.HEALTH, layout.DECISIONS, layout.EVENTS)
 
 
 def name_channel(topic: str) -> str:
-    """Return the channel of a topic, such as ``samples``; another topic as it is."""
+    """Return the channel of a topic, such as ``samples``; any other topic unchanged."""
     parts = topic.split("/")
     if len(parts) == 4 and parts[:2] == ["", PREFIX]:
         return parts[3]
@@ -32,7 +32,7 @@ def name_channel(topic: str) -> str:
 
 
 def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes:
-    """Write a message of `layout` as it stands in the file."""
+    """Convert a message of `layout` to its form in the file."""
     if name == layout.SAMPLES:
         return messages.stamped(data, layout.last_ns(data) + utc_offset_ns, frame)
     if name == layout.DECISIONS:
@@ -41,7 +41,7 @@ def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes
 
 
 def plain(name: str, data: bytes) -> bytes:
-    """What was given to `put_in_form`."""
+    """Convert a message back from its form in the file: the inverse of `put_in_form`."""
     if name == layout.SAMPLES:
         return messages.unstamped(data)
     if name in TEXTS:
@@ -52,8 +52,8 @@ def plain(name: str, data: bytes) -> bytes:
 
 
 def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
-    """Whether data can be what `put_in_form` gave for a message of this channel, as far as its
-    length, beginning and end tell.
+    """Return whether data can be a message that `put_in_form` made for a channel. Only length,
+    beginning and end are checked.
 
     Args:
         shape: (element, channel) of the array.

@@ -1,10 +1,10 @@
-"""When one file of a recording is followed by the next, and what they are called.
+"""Rotation of the files of a recording: their names, and when the next one begins.
 
     FOLDER/whiskers-20261121T170512Z.mcap, whiskers-20261121T171512Z.mcap, ...
 
-Each file is whole in itself: it says what it is of, and begins with what a device needs to be
-understood. Writing is the matter of `tactile_rt.recording.writer`; whoever writes asks after each
-flush whether the next file is due.
+Each file is complete in itself: it has a description, and begins with the packets in which a device
+describes itself. `tactile_rt.recording.writer` writes it; the caller checks after each flush
+whether the next file is due.
 """
 
 import os
@@ -24,21 +24,21 @@ SUFFIX = ".mcap"
 
 @dataclass(frozen=True)
 class Rotation:
-    """The files of one recording, named by the UTC at which each was begun."""
+    """Files of one recording, each named by the UTC time at which it was begun."""
 
     folder: Path
     stem: str
-    mb: float = 0.0  # size beyond which the next file begins, MB; 0: whatever the size
+    mb: float = 0.0  # size beyond which the next file begins, MB; 0: no limit
     seconds: float = 0.0  # time after which the next file begins, s; 0: never
 
     def begin(self, source: Source, about: Description, **further: Any) -> RecordingWriter:
-        """Begin the next file; one that is there is never written over.
+        """Begin the next file; never overwrite an existing one.
 
         Args:
             source, about, further: as for `RecordingWriter`.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: the file cannot be written.
         """
         utc = datetime.fromtimestamp((time.monotonic_ns() + about.utc_offset_ns) / NS_PER_S, UTC)
         stem = f"{self.stem}-{utc:%Y%m%dT%H%M%S}Z"
@@ -48,12 +48,12 @@ class Rotation:
                 continue
             try:
                 return RecordingWriter(path, source, about, **further)
-            except FileExistsError:  # by now
+            except FileExistsError:  # another process has made it meanwhile
                 continue
         raise OSError(f"{self.folder}: a thousand files of this second")
 
     def is_due(self, writer: RecordingWriter) -> bool:
-        """Whether this file, as it was when last flushed, is to be followed by the next."""
+        """Return whether the next file is due, by age and last flushed size of this."""
         age_ns = time.monotonic_ns() - writer.begun_ns
         return bool(
             (self.mb and writer.stats.bytes > self.mb * MB)

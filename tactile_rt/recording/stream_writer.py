@@ -1,4 +1,4 @@
-"""Record a stream while it runs, without ever holding it up.
+"""Recording of a running stream, without delaying it.
 
 source --> push ----+
                     +--> bounded queue --(thread)--> RecordingWriter --> FILE.mcap
@@ -23,42 +23,41 @@ from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Syncer
 from tactile_rt.recording.writer import RecordingWriter, WriterStats
 
-WAKE_S = 0.05  # how often the thread looks: what a recording is late by, at most
+WAKE_S = 0.05  # period of the thread, and so the largest delay of writing
 SYNC_S = 1.0
-FLUSH_S = 0.5  # with the wake and a slow write still well under the second that may be lost
+FLUSH_S = 0.5  # with the wake and a slow write, well under the second that may be lost
 QUEUE_BYTES = 64 << 20
-ITEM_BYTES, FRAME_BYTES = 500, 200  # what Python needs around the bytes
+ITEM_BYTES, FRAME_BYTES = 500, 200  # memory that Python needs in addition to the data
 
 Entry = tuple[str, Any, int, int]  # topic, chunk or packet, host time in ns, bytes
 
 
 class StreamWriter:
-    """Record a source. Make it before the first read, and `push` every chunk that is read.
+    """Recorder of a source. Make it before the first read, and `push` every chunk that is read.
 
-    A thread of its own writes, at least every half second, so that a killed process leaves a file
-    from which `recover` takes all but the last moment; another puts the file on the medium every
-    second, for a power cut. What waits for a slow disk is bounded: the
-    oldest is dropped then, and counted. Of a device, the raw packets and its health are recorded
-    without further ado.
+    A separate thread writes at least every half second: after a kill of the process, `recover`
+    restores all but the last moment. Another thread syncs the file to the medium every second, for
+    a power cut. The queue for a slow disk is bounded: when it is full, the oldest data are dropped
+    and counted. Raw packets and health of a device are recorded automatically.
 
     Args:
-        path: of the file, as a rule ``.mcap``.
-        source: what is recorded; stays its owner's.
-        url: where the source is, for the record.
-        session: what else to note: who, where, why.
-        force: whether to replace a file that is there.
-        flush_s: between two writes to the file.
-        sync_s: between two syncs, which put the file on the medium; 0: only at its end.
-        queue_bytes: that may wait for the disk.
-        rotate_mb: begin a new file beyond so many MB; 0: never. Files that are rotated are named by
-            their beginning, too: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
-        rotate_s: begin a new file after so many seconds; 0: never.
+        path: of the file, usually ``.mcap``.
+        source: the recorded source; the caller closes it.
+        url: of the source, for the recording's description.
+        session: further notes: who, where, why.
+        force: whether to replace an existing file.
+        flush_s: time between two writes to the file, s.
+        sync_s: time between two syncs to the medium, s; 0: only at the end.
+        queue_bytes: largest size of the data that wait for the disk.
+        rotate_mb: size after which a new file begins, MB; 0: never. The names of rotated files have
+            the time of their beginning: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
+        rotate_s: time after which a new file begins, s; 0: never.
 
     Attributes:
-        path: The path of the file that is being written, or was last.
+        path: The path of the file that is being written, or was written last.
 
     Raises:
-        ConfigError: the file is there already, its folder is not, or the extra is not installed.
+        ConfigError: the file exists already, its folder does not, or the extra is not installed.
     """
 
     def __init__(
@@ -81,7 +80,7 @@ class StreamWriter:
         rotation = Rotation(self.path.parent, self.path.stem, rotate_mb, rotate_s)
         self._rotation = rotation if rotate_mb or rotate_s else None
         self._flush_s, self._sync_s, self._sync_at = flush_s, sync_s, 0.0
-        self._past: list[RecordingWriter] = []  # closed, and perhaps not on the medium yet
+        self._past: list[RecordingWriter] = []  # closed files, perhaps not synced yet
         self._syncer = Syncer()
         self._queue = BoundedQueue[Entry](size=queue_bytes, measure=_measure, kinds=(SAMPLES, WIRE))
         self._stop, self._asked, self._flushed = (threading.Event() for _ in range(3))
@@ -89,8 +88,8 @@ class StreamWriter:
         self._closed = False
         self._prelude: list[tuple[Packet, int]] = []
         try:
-            with _explained(self.path):
-                self._now = (WriterStats(), self._begin(force))  # of finished files; the open one
+            with _explain_errors(self.path):
+                self._now = (WriterStats(), self._begin(force))  # (of finished files, open file)
         except BaseException:
             self._syncer.close()
             raise
@@ -99,12 +98,12 @@ class StreamWriter:
         if self._device is not None:
             self._device.tap(lambda packet, t_ns: self._prelude.append((packet, t_ns)))
             for packet, t_ns in self._prelude:
-                self._packet(packet, t_ns)
-            self._device.tap(self._packet)
+                self._add_packet(packet, t_ns)
+            self._device.tap(self._add_packet)
 
     @property
     def stats(self) -> WriterStats:
-        """What became of what was to be recorded, over all files; from any thread."""
+        """Counts of what was recorded and dropped in all files; for any thread."""
         (past, writer), dropped = self._now, self._queue.dropped
         done = writer.stats
         return WriterStats(
@@ -113,22 +112,22 @@ class StreamWriter:
         )  # fmt: skip
 
     def push(self, chunk: Chunk) -> None:
-        """Record a chunk; returns at once, but lets a source that is not live wait for the disk.
+        """Queue a chunk for recording. Only a source that is not live waits for the disk.
 
         Raises:
             RecordingError: the file cannot be written any more (a full disk).
         """
         if self._error is not None:
-            raise self._broken()
+            raise self._make_error()
         size = chunk.values.nbytes + chunk.valid.nbytes + 16 * len(chunk) + ITEM_BYTES
         if not self._source.live:
             self._queue.wait_for_room()
-        # Times of a device's own clock would put the samples far from all else in the file.
+        # The times of a device's own clock would separate the samples from the other messages.
         own = self.about.clock == "device"
         self._queue.put((SAMPLES, chunk, time.monotonic_ns() if own else int(chunk.t_ns[-1]), size))
 
     def flush(self) -> None:
-        """Wait until the system has all that was pushed: whatever becomes of us, it is kept.
+        """Wait until the operating system holds all pushed chunks, which then survive a kill.
 
         Raises:
             RecordingError: the file cannot be written any more.
@@ -138,10 +137,10 @@ class StreamWriter:
         while not self._flushed.wait(WAKE_S) and self._thread.is_alive():
             pass
         if self._error is not None:
-            raise self._broken()
+            raise self._make_error()
 
     def close(self) -> None:
-        """Write what waits, and the index; safe to call twice.
+        """Write all queued data and the index; safe to call twice.
 
         Raises:
             RecordingError: the file could not be written to its end.
@@ -154,7 +153,7 @@ class StreamWriter:
         self._stop.set()
         self._thread.join()
         self._queue.close()
-        writer = self._counted()
+        writer = self._update_dropped()
         try:
             if self._error is None:
                 _check_there(writer)
@@ -162,13 +161,13 @@ class StreamWriter:
             self._error = error
         try:
             writer.close(finish=self._error is None)
-        except OSError as error:  # also what is still buffered may find no room
+        except OSError as error:  # the disk may be full for buffered data, too
             self._error = self._error or error
         self._syncer.close()
         for file in (*self._past, writer):
             self._error = self._error or file.failed
         if self._error is not None:
-            raise self._broken()
+            raise self._make_error()
 
     def __enter__(self) -> Self:
         return self
@@ -180,7 +179,7 @@ class StreamWriter:
             if error is None:
                 raise
 
-    def _broken(self) -> RecordingError:
+    def _make_error(self) -> RecordingError:
         assert self._error is not None
         why = getattr(self._error, "strerror", None) or repr(self._error)
         return RecordingError(
@@ -188,12 +187,12 @@ class StreamWriter:
             "in it"
         )
 
-    def _packet(self, packet: Packet, t_ns: int) -> None:
+    def _add_packet(self, packet: Packet, t_ns: int) -> None:
         each = 1 if isinstance(packet, bytes) else FRAME_BYTES
         self._queue.put((WIRE, packet, t_ns, ITEM_BYTES + each * len(packet or ())))
 
     def _begin(self, force: bool) -> RecordingWriter:
-        """Begin the first file, or the next; it is described as the source is now."""
+        """Begin the first or next file, with the present description of the source."""
         self.about = describe(self._source, self._url, self._session)
         if self._rotation is None:
             writer = RecordingWriter(
@@ -203,7 +202,7 @@ class StreamWriter:
             writer = self._rotation.begin(
                 self._source, self.about, prelude=self._prelude, syncer=self._syncer
             )
-        self._sync_at = 0.0  # so a power cut hardly ever leaves a name without a description
+        self._sync_at = 0.0  # at once: a power cut then rarely leaves a name without description
         self.path, self.files = writer.path, self.files + 1
         return writer
 
@@ -213,7 +212,7 @@ class StreamWriter:
         flush_at = time.monotonic() + self._flush_s
         while True:
             stopping = self._stop.wait(WAKE_S)
-            asked = self._asked.is_set()  # before all that waits is written, so that none is left
+            asked = self._asked.is_set()  # read first, so that all data queued before are written
             try:
                 while (entry := self._queue.get(0)) is not None:
                     self._write(*entry)
@@ -224,8 +223,8 @@ class StreamWriter:
                 if asked:
                     self._asked.clear()
                     self._flushed.set()
-                self._counted().tell()
-            except Exception as error:  # whatever it is, it belongs to the user's thread
+                self._update_dropped().tell()
+            except Exception as error:  # any error is raised in the user's thread
                 self._error = error
                 self._queue.close(drop=True)
                 return
@@ -237,7 +236,7 @@ class StreamWriter:
         self._now[1].add(topic, encoded, t_ns)
 
     def _flush(self) -> float:
-        writer = self._counted()
+        writer = self._update_dropped()
         if self._is_sync_due():
             self._sync_at = time.monotonic() + self._sync_s
             writer.sync()
@@ -258,8 +257,8 @@ class StreamWriter:
     def _is_sync_due(self) -> bool:
         return self._sync_s > 0 and time.monotonic() >= self._sync_at
 
-    def _counted(self) -> RecordingWriter:
-        """The open file, told what was dropped since it was begun."""
+    def _update_dropped(self) -> RecordingWriter:
+        """Return the open file, with the counts of what was dropped since it was begun."""
         (past, writer), dropped = self._now, self._queue.dropped
         writer.stats.dropped_samples = dropped[SAMPLES] - past.dropped_samples
         writer.stats.dropped_packets = dropped[WIRE] - past.dropped_packets
@@ -277,8 +276,8 @@ def _measure(entry: Entry) -> tuple[str, int, int]:
 
 
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Why a file cannot be begun, in one line."""
+def _explain_errors(path: Path) -> Iterator[None]:
+    """Turn an error on opening a file into a `ConfigError` of one line."""
     try:
         yield
     except FileExistsError:

@@ -1,7 +1,7 @@
-"""Put what is written on the medium, and let nobody wait for it.
+"""Sync of recordings to the storage medium in the background.
 
-What the operating system has outlives the process, but not a power cut: only a sync puts it on the
-medium, which on a memory card may take seconds. So a thread of its own does that.
+Data that the operating system holds outlives the process, but not a power cut: only a sync puts it
+on the medium. On a memory card that may take seconds, so a separate thread syncs.
 """
 
 import threading
@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 
 class Extent(NamedTuple):
-    """How much of a recording there is, up to some moment."""
+    """Amount of a recording up to some moment."""
 
     samples: int = 0
     packets: int = 0
-    newest_ns: int = 0  # host monotonic time of the newest sample, ns; 0 if there is none
+    newest_ns: int = 0  # host monotonic time of the newest sample, ns; 0 without a sample
 
 
 class Syncer:
-    """A thread that syncs one file after another, in the order in which they ask."""
+    """Thread that runs sync jobs one after another, in the order of `add`."""
 
     def __init__(self) -> None:
         self._jobs: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
@@ -27,11 +27,11 @@ class Syncer:
         self._thread.start()
 
     def add(self, job: Callable[[], object]) -> None:
-        """Call this in the thread, after all that was added before; it must not raise."""
+        """Queue a job to run in the thread after all earlier ones. It must not raise."""
         self._jobs.put(job)
 
     def close(self) -> None:
-        """Wait until all of it is done, and end."""
+        """Wait until all queued jobs are done, then end the thread."""
         self._jobs.put(None)
         self._thread.join()
 

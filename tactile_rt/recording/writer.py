@@ -1,16 +1,15 @@
-"""Write a recording: one file, in one thread.
+"""Writer of one recording file, in one thread.
 
     RecordingWriter    a file in a folder, with counts, health and summary
-    McapFile           the channels of a recording in whatever is written to
+    McapFile           the channels of a recording in any binary file object
 
-What is killed while it writes leaves a file from which `recover` takes all that had been flushed,
-and a power cut one from which it takes all that had been synced. For that the file must say what it
-is of, which takes several steps; so it gets its name only when it does. Until then it is hidden in
-the same folder, as ``.NAME.XXXXXXXX.mcap.part``.
+After a kill of the process, `recover` can restore all that had been flushed; after a power cut, all
+that had been synced. This needs a file that begins with its description. Writing that takes several
+steps, so the file gets its name only afterwards. Until then it is hidden in the same folder, as
+``.NAME.XXXXXXXX.mcap.part``.
 
-When one file follows another is the matter of `tactile_rt.recording.rotation`; how a stream is
-recorded beside what else is done with it, that of `tactile_rt.recording.stream_writer` and of the
-daemon's recorder.
+`tactile_rt.recording.rotation` starts one file after another. `tactile_rt.recording.stream_writer`
+and the daemon's recorder record a stream while the program does other work.
 """
 
 import errno
@@ -48,15 +47,15 @@ from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, PREFIX, put_in_form
 from tactile_rt.recording.syncing import Extent, Syncer
 
 SEQUENCES = 1 << 32
-PART = ".mcap.part"  # ends the name of a file until it says what it is of
+PART = ".mcap.part"  # ending of the name of a file without a complete description
 
 
 class McapFile:
-    """The channels of a recording in an MCAP file; knows nothing of names, counts or health.
+    """Channels of a recording in an MCAP file, without file name or health.
 
     Args:
-        file: to write; not closed with this.
-        further: channels besides those of a recording, and the ROS 2 message of each.
+        file: to write; the caller closes it.
+        further: additional channels, and the ROS 2 message type of each.
     """
 
     def __init__(
@@ -65,15 +64,15 @@ class McapFile:
         import mcap.writer
 
         self.about, self._file = about, file
-        # Checksums over the whole file, too: a record that is lost altogether must be noticed.
+        # Checksums over the whole file, too, so that the loss of a whole record is noticed.
         self._writer: Any = mcap.writer.Writer(file, enable_data_crcs=True)
         self._writer.start(profile="ros2", library="tactile_rt")
-        # In this order: a file that says what it is of has the notes, too, wherever it is cut.
+        # In this order, so that a truncated file with a description has the notes, too.
         if about.session:
             self._writer.add_metadata(SESSION, seal(about.session))
         self._writer.add_metadata(METADATA, about.to_metadata())
         self._array = about.session.get("daemon_source") or about.spec.name
-        self.topics: dict[str, tuple[str, str]] = {}  # of each channel, and its message
+        self.topics: dict[str, tuple[str, str]] = {}  # (topic, message type) of each channel
         self._channels: dict[str, int] = {}
         schemas: dict[str, int] = {}
         kinds = {name: kind for (name, wire), kind in CHANNELS.items() if wire in ("", about.wire)}
@@ -87,31 +86,31 @@ class McapFile:
         self.counts = dict.fromkeys(self._channels, 0)
 
     def add(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message, as `layout` has it, of this host time, ns."""
+        """Add a message encoded by `layout`, of this host time, ns."""
         spec, offset_ns = self.about.spec, self.about.utc_offset_ns
         if not self.counts[ARRAY]:
             self.put(ARRAY, messages.array_message(spec, self._array, t_ns + offset_ns), t_ns)
         self.put(name, put_in_form(name, data, offset_ns, spec.frame), t_ns)
 
     def put(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message as it is to stand in the file; messages are numbered so that none gets
-        lost."""
+        """Add a message that is already in its form in the file. Messages are numbered, so that a
+        loss is noticed."""
         utc = max(0, t_ns + self.about.utc_offset_ns)
         count = self.counts[name]
         self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)
         self.counts[name] = count + 1
 
     def note(self, name: str, fields: Mapping[str, str]) -> None:
-        """Add metadata."""
+        """Add a metadata record, sealed by a checksum."""
         self._writer.add_metadata(name, seal(fields))
 
     def flush(self) -> int:
-        """Let the system have all that was added; the size of the file."""
+        """Write buffered messages to the operating system; return the size of the file."""
         self._writer.flush()
         return self._file.tell()
 
     def finish(self) -> int:
-        """Write the index; the size of the file."""
+        """Write the index and end of the file; return its size."""
         self._writer.finish()
         self._file.flush()
         return self._file.tell()
@@ -119,28 +118,28 @@ class McapFile:
 
 @dataclass
 class WriterStats:
-    """What became of what was to be recorded."""
+    """Counts of what was recorded and dropped."""
 
     samples: int = 0
     packets: int = 0
-    dropped_samples: int = 0  # number of samples that were not written: the disk was slow or full
-    dropped_packets: int = 0  # number of raw packets that were not written, for the same reason
+    dropped_samples: int = 0  # number of samples not written because the disk was slow or full
+    dropped_packets: int = 0  # number of raw packets not written for the same reason
     bytes: int = 0
 
 
 class RecordingWriter:
-    """A recording of a source, written by the thread that calls.
+    """Recording of a source, written by the calling thread.
 
     Args:
-        source: what is recorded, for its health and losses; it is not read here.
-        prelude: packets in which a device described itself, and their arrivals, ns: it must be
-            understood from every file.
+        source: the recorded source, for its health and losses; it is not read here.
+        prelude: packets in which a device described itself, and their arrivals, ns, so that every
+            file can be decoded by itself.
         dropped: samples and packets that could not be recorded before.
-        syncer: what syncs the file; None: the thread that calls.
+        syncer: syncs the file in its thread; None: the calling thread syncs.
 
     Raises:
-        FileExistsError: there is such a file.
-        ConfigError: it is to be replaced, and is being recorded right now.
+        FileExistsError: the file exists already.
+        ConfigError: the file to replace is being recorded right now.
     """
 
     def __init__(
@@ -155,28 +154,28 @@ class RecordingWriter:
         syncer: Syncer | None = None,
     ) -> None:
         self.path, self.begun_ns = path, time.monotonic_ns()
-        # of which `dropped_samples` and `dropped_packets` are the caller's to keep
+        # the caller updates `dropped_samples` and `dropped_packets`
         self.stats = WriterStats(dropped_samples=dropped[0], dropped_packets=dropped[1])
         self._source, self._device = source, device_of(source)
-        self._told: tuple[Any, ...] = ()  # the health that was last written
-        self.flushed = Extent()  # what the operating system has, which a kill of the process leaves
+        self._written_state: tuple[Any, ...] = ()  # health and losses that were last written
+        self.flushed = Extent()  # held by the operating system, so it survives a kill
         self._synced, self._newest_ns = Extent(), 0
-        self.unsynced_ns = 0  # host time since which something waits for the medium; 0: nothing
-        self.failed: OSError | None = None  # of a sync
-        self.done = False  # whether it is closed, and its last sync has ended
+        self.unsynced_ns = 0  # host time since which data wait for a sync; 0: none wait
+        self.failed: OSError | None = None  # error of a sync
+        self.done = False  # whether the file is closed, and its last sync has ended
         self._syncer, self._waiting, self._name_synced = syncer, False, False
         target = path.resolve() if force else path  # a link is followed, not replaced
         special = force and target.exists() and not target.is_file()  # a pipe, /dev/null
         if force:
             check_not_recorded(path)
-        hidden = target if special else _hidden(target, force)
+        hidden = target if special else _hide_name(target, force)
         self._raw = _create(hidden, special)
         if not special:
             with suppress(OSError):  # a file system without locks
                 fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._handle = -1
         try:
-            # Beforehand: by the time of a sync descriptors may be out.
+            # Duplicated now: no descriptor may be left at the time of a sync.
             self._handle = os.dup(self._raw.fileno())
             self._file = McapFile(self._raw, about)
             for packet, t_ns in prelude if about.wire else ():
@@ -197,7 +196,7 @@ class RecordingWriter:
 
     @property
     def synced(self) -> Extent:
-        """What is on the medium, which a power cut leaves; from any thread."""
+        """Extent on the medium, which survives a power cut; for any thread."""
         return min(self._synced, self.flushed)
 
     def add(self, topic: str, data: bytes, t_ns: int) -> None:
@@ -210,18 +209,18 @@ class RecordingWriter:
             self.stats.packets += 1
 
     def tell(self, always: bool = False, closed: bool = False) -> None:
-        """Add how source and recorder are, if that has changed, or `always`."""
+        """Add the state of source and recorder if it has changed, or `always`."""
         health, mine = self._device.health if self._device is not None else None, self.stats
-        told = (_changing(health), mine.dropped_samples, mine.dropped_packets)
-        if told == self._told and not always:
+        state = (_select_state(health), mine.dropped_samples, mine.dropped_packets)
+        if state == self._written_state and not always:
             return
-        self._told = told
+        self._written_state = state
         now = time.monotonic_ns()
-        state = "streaming" if health is None else str(health.state)
+        name = "streaming" if health is None else str(health.state)
         fields = {
             "t_ns": now,
             "utc_offset_ns": utc_offset_ns(),
-            "state": "closed" if closed else state,
+            "state": "closed" if closed else name,
             "reason": "" if health is None else health.reason,
             "device": health,
             "stats": asdict(self._source.stats),
@@ -230,53 +229,53 @@ class RecordingWriter:
         self._file.add(HEALTH, msgspec.json.encode(fields), now)
 
     def flush(self) -> int:
-        """Let the system have all of it; the file's size."""
+        """Write all that was added to the operating system; return the size of the file."""
         self.tell()
         self.stats.bytes = self._file.flush()
-        self._flushed()
+        self._note_flushed()
         return self.stats.bytes
 
     def sync(self) -> None:
-        """Let the system have all of it, and the medium as soon as it can; `synced` says when it
-        has, `failed` that it could not."""
+        """Flush, and sync to the medium as soon as possible. Afterwards `synced` is updated, or
+        `failed` is set."""
         self.flush()
-        if not self._waiting:  # one that waits will take all that has been flushed until it begins
+        if not self._waiting:  # a waiting sync includes all that is flushed before it begins
             self._sync_soon()
 
     def disown(self, since: Extent) -> tuple[int, int]:
-        """Samples and packets that were added after `since`, and are not in the file or may not be,
-        because writing failed; they no longer count as written."""
+        """Subtract from the counts all that was added after `since`, as writing failed. Return the
+        subtracted numbers of samples and packets."""
         stats = self.stats
         samples, packets = stats.samples - since.samples, stats.packets - since.packets
         stats.samples, stats.packets, self.flushed = since.samples, since.packets, since
         return samples, packets
 
     def whereabouts(self) -> Literal["there", "moved", "deleted", "emptied"]:
-        """Look at what others did with the file.
+        """Check whether others have moved, deleted or emptied the file.
 
-        ``moved`` means that another or none has its name, ``emptied`` that it is shorter than what
-        was written, as a log rotator leaves it.
+        ``moved``: no file or another one has its name; ``emptied``: it is shorter than what was
+        written, as after log rotation.
         """
         if self._special:
             return "there"
         mine = os.fstat(self._raw.fileno())
         if mine.st_nlink == 0:
             return "deleted"
-        if isinstance(self._raw.raw, _Growing) and mine.st_size < self._raw.raw.written:
+        if isinstance(self._raw.raw, _CountingFile) and mine.st_size < self._raw.raw.written:
             return "emptied"
         try:
             named = os.lstat(self._target)
         except (FileNotFoundError, NotADirectoryError):
             return "moved"
-        except OSError:  # one may not look
+        except OSError:  # the folder may not be read
             return "there"
         return "there" if os.path.samestat(mine, named) else "moved"
 
     def close(self, finish: bool = True) -> None:
-        """Write the index and close. Also when that fails the file is closed: it can be recovered.
+        """Write the index and close the file, also if that fails: it can be recovered.
 
         Args:
-            finish: whether to write the index; not, where writing has failed before.
+            finish: whether to write the index; False if writing has failed before.
 
         Raises:
             OSError: no room for the index.
@@ -284,21 +283,21 @@ class RecordingWriter:
         try:
             if finish:
                 self.tell(always=True, closed=True)
-                told = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
-                self._file.note(SUMMARY, told)
+                summary = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
+                self._file.note(SUMMARY, summary)
                 self.stats.bytes = self._file.finish()
-                self._flushed()
+                self._note_flushed()
         finally:
             try:
                 self._sync_soon(last=True)
             finally:
-                with suppress(OSError):  # the syncer holds its duplicate for some time yet
+                with suppress(OSError):  # the syncer's duplicate would keep the lock for a while
                     fcntl.flock(self._raw, fcntl.LOCK_UN)
                 self._raw.close()
         if self._syncer is None and self.failed is not None:
             raise self.failed
 
-    def _flushed(self) -> None:
+    def _note_flushed(self) -> None:
         extent = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
         if extent != self.flushed and not self.unsynced_ns:
             self.unsynced_ns = time.monotonic_ns()
@@ -313,7 +312,7 @@ class RecordingWriter:
             self._syncer.add(job)
 
     def _sync(self, last: bool) -> None:
-        """In the syncer's thread; its handle stays open when the file is closed meanwhile."""
+        """Sync in the syncer's thread. The handle stays open after the file is closed."""
         self._waiting = False
         extent, began_ns = self.flushed, time.monotonic_ns()
         try:
@@ -326,8 +325,8 @@ class RecordingWriter:
             self._synced = extent
             self.unsynced_ns = began_ns if self.flushed != extent else 0
         except OSError as error:
-            # The system has given up what it could not write; a later sync would not tell. But
-            # for want of a descriptor the name alone is not synced: the next one does that.
+            # The system has discarded what it could not write; a later sync would not fail. But
+            # without a free descriptor only the name is not synced: the next sync does that.
             if last or error.errno not in (errno.EMFILE, errno.ENFILE):
                 self.failed = self.failed or error
         finally:
@@ -336,8 +335,8 @@ class RecordingWriter:
             self.done = last
 
 
-def _changing(health: Health | None) -> tuple[Any, ...]:
-    """Of a device's health, what is told at once when it changes."""
+def _select_state(health: Health | None) -> tuple[Any, ...]:
+    """Select those parts of a device's health whose change is recorded at once."""
     if health is None:
         return ()
     return (
@@ -349,11 +348,11 @@ def _changing(health: Health | None) -> tuple[Any, ...]:
 def check_not_recorded(path: Path) -> None:
     """Refuse to replace a file that a `RecordingWriter` of any process has open.
 
-    It is told by the lock that the writer has on the file itself, which ends with the writer,
-    however it ends, and goes where the file is moved to.
+    The writer holds a lock on the file itself, which ends with the writer in any case, and follows
+    the file when it is moved.
 
     Raises:
-        ConfigError: it is being recorded.
+        ConfigError: the file is being recorded.
     """
     if not path.is_file():
         return
@@ -373,15 +372,15 @@ def check_not_recorded(path: Path) -> None:
         os.close(handle)
 
 
-def _hidden(path: Path, force: bool) -> Path:
-    """What the file is called until it says what it is of."""
+def _hide_name(path: Path, force: bool) -> Path:
+    """Return the hidden name that a file has until its description is complete."""
     if not force and os.path.lexists(path):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     return path.with_name(f".{path.stem[:50]}.{secrets.token_hex(4)}{PART}")
 
 
-class _Growing(io.FileIO):
-    """A new file that counts what was written, always at its end."""
+class _CountingFile(io.FileIO):
+    """New file that counts the bytes written to it, always at its end."""
 
     written = 0
 
@@ -395,16 +394,16 @@ def _create(path: Path, special: bool) -> io.BufferedWriter:
     if special:
         return path.open("wb")
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
-    return io.BufferedWriter(_Growing(handle, "ab"))
+    return io.BufferedWriter(_CountingFile(handle, "ab"))
 
 
 def _reveal(hidden: Path, path: Path, force: bool) -> None:
-    """Give the file its name; unless forced, never that of another one."""
+    """Give the hidden file its name; replace an existing file only if forced."""
     if force:
         hidden.replace(path)
         return
     try:
-        path.hardlink_to(hidden)  # unlike renaming, fails if there is such a file by now
+        path.hardlink_to(hidden)  # unlike renaming, fails if such a file exists by now
     except FileExistsError:
         raise
     except OSError:  # a file system without links, as on a memory card

@@ -1,1 +1,1 @@
-"""Where samples come from: a URL opens a device, a simulation, a recording or several of them."""
+"""Sources of samples: a URL opens a device, a simulation, a recording or several of them."""

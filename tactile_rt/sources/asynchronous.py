@@ -1,4 +1,4 @@
-"""A source in an event loop.
+"""Reading of a source in an event loop.
 
 async for chunk in chunks(source):
     ...
@@ -10,14 +10,14 @@ from contextlib import suppress
 
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-LOOK_S = 0.1  # how often a source is looked at though nothing has come
+LOOK_S = 0.1  # longest wait until a source is read again although no data came
 
 
 async def chunks(source: Source) -> AsyncIterator[Chunk]:
-    """The chunks of a source as they come, until it ends; it stays the caller's to close.
+    """Yield the chunks of a source as they come, until it ends. The caller closes it.
 
-    As long as the source has a descriptor to wait for, the loop waits for that and no thread is
-    needed. A source without one, or a line that is lost, is read in a thread, 0.1 s at a time.
+    If the source has a file descriptor, the loop waits for that and no thread is needed. A source
+    without one, or with a lost line, is read in a thread, 0.1 s at a time.
 
     Raises:
         SourceError: the device broke.

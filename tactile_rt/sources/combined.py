@@ -1,4 +1,4 @@
-"""Several arrays as one: what each feels, on one clock, in one spec.
+"""Combination of several arrays into one, with one clock and one spec.
 
 combined:robot_head.toml, which reads
 
@@ -10,7 +10,7 @@ combined:robot_head.toml, which reads
     [[source]]
     name = "right"
     url = "serial:///dev/ttyACM1?codec=native"
-    position = [0.0, -0.04, 0.0]            # of its mount frame in this one's, m
+    position = [0.0, -0.04, 0.0]            # of its mount frame in the combined one, m
     orientation = [1.0, 0.0, 0.0, 0.0]      # unit quaternion, w x y z
 """
 
@@ -42,12 +42,12 @@ from tactile_rt.core.stream import (
 from tactile_rt.drivers.opening import Prepared
 from tactile_rt.sources.opening import check_source, open_source
 
-LATEST_NS = NS_PER_S // 5  # an array that lags so far is left out: its elements are invalid
+LATEST_NS = NS_PER_S // 5  # an array that lags further is left out: its elements are invalid
 SLICE_S = 0.005
 
 
 class MemberArray(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One array among several.
+    """One of several arrays to combine.
 
     Attributes:
         name: The name of the array, put before the names of its elements.
@@ -68,24 +68,24 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     source: tuple[MemberArray, ...] = ()
 
 
-# Files that are being read, one within another: none may combine itself.
+# Nested files that are being read: no file may combine itself.
 _READING: ContextVar[tuple[str, ...]] = ContextVar("_READING", default=())
 
 
 def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
-    """What opens the arrays that a TOML file lists.
+    """Prepare to open the arrays that a TOML file lists.
 
     Raises:
         ConfigError: the file cannot be read, is not of the layout above, or a URL in it is wrong.
-            To open what is returned raises `SourceError` if one of the devices cannot be opened.
+            Opening the returned source raises `SourceError` if a device cannot be opened.
     """
     if not path:
         raise ConfigError("combined: needs a file, e.g. combined:head.toml")
     if fields:
         raise ConfigError(f"combined:{path} takes no options: they are in the file")
     nodes = read_toml(Path(path))
-    wanted: _File = convert(nodes, _File)
-    if not wanted.source:
+    file: _File = convert(nodes, _File)
+    if not file.source:
         raise ConfigError(f"{path}: no [[source]] to combine")
     place, above = os.path.realpath(path), _READING.get()
     if place in above:
@@ -93,7 +93,7 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
     within = _READING.set((*above, place))
     specs = []
     try:
-        for i, part in enumerate(wanted.source):
+        for i, part in enumerate(file.source):
             try:
                 specs.append(check_source(part.url))
             except TactileError as error:
@@ -101,23 +101,23 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
     finally:
         _READING.reset(within)
 
-    def opened() -> Source:
+    def open_all() -> Source:
         with contextlib.ExitStack() as stack:
-            sources = [stack.enter_context(open_source(part.url)) for part in wanted.source]
-            made = CombinedSource(sources, wanted.source, wanted.name, wanted.rate_hz)
+            sources = [stack.enter_context(open_source(part.url)) for part in file.source]
+            made = CombinedSource(sources, file.source, file.name, file.rate_hz)
             stack.pop_all()
             return made
 
     known = [spec for spec in specs if spec is not None]
     if len(known) < len(specs):
-        return Prepared(None, opened)
-    return Prepared(combine_specs(known, wanted.source, wanted.name, wanted.rate_hz), opened)
+        return Prepared(None, open_all)
+    return Prepared(combine_specs(known, file.source, file.name, file.rate_hz), open_all)
 
 
 def combine_specs(
     specs: list[ArraySpec], parts: Sequence[MemberArray], name: str, rate_hz: float
 ) -> ArraySpec:
-    """One spec of all elements, each array's rows below those of the one before.
+    """Combine specs into one, with each array's rows below those of the previous array.
 
     Raises:
         ConfigError: the arrays do not measure the same channels, or two have one name.
@@ -155,24 +155,24 @@ def combine_specs(
 
 @dataclass
 class _Feed:
-    """One of the sources, on the common time grid."""
+    """State of one source on the common time grid."""
 
     source: Source
     resampler: Resampler
-    begin: int  # of its elements among all
+    begin: int  # index of its first element among all
     rows: dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]]
-    newest: int | None = None  # grid point
+    newest: int | None = None  # newest grid point
     ended: bool = False
 
 
 class CombinedSource(Source):
-    """Samples of several sources, resampled to common times.
+    """Source of the samples of several sources, resampled to common times.
 
     An array that is more than 0.2 s behind, lost or at its end is left out: its elements are
-    invalid until it comes again. The stream ends when all have.
+    invalid until it comes again. The stream ends when all sources have ended.
 
     Args:
-        sources: What to combine; closed with this one.
+        sources: The sources to combine; closed with this one.
     """
 
     def __init__(
@@ -188,14 +188,14 @@ class CombinedSource(Source):
             for s, begin in zip(sources, begins, strict=False)
         ]
         self._period_ns = period
-        self._next: int | None = None  # grid point
+        self._next: int | None = None  # next grid point to deliver
         self._first = 0
         self._closed = False
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         end, over = None if timeout is None else time.monotonic() + timeout, False
         while not self._closed:
-            if (chunk := self._ready()) is not None:
+            if (chunk := self._take_ready()) is not None:
                 self.stats.delivered += len(chunk)
                 return chunk
             if over:
@@ -213,15 +213,15 @@ class CombinedSource(Source):
             source.close()
 
     def _read_on(self, patience_s: float) -> None:
-        """Read the source that is furthest behind; if it has nothing, the others too."""
+        """Read the source that is furthest behind; if it has no samples, the others too."""
         running = [feed for feed in self._feeds if not feed.ended]
         running.sort(key=lambda feed: -1 if feed.newest is None else feed.newest)
         for feed in running:
-            if self._take(feed, patience_s):
+            if self._read_feed(feed, patience_s):
                 return
             patience_s = 0.0
 
-    def _take(self, feed: _Feed, patience_s: float) -> bool:
+    def _read_feed(self, feed: _Feed, patience_s: float) -> bool:
         try:
             chunk = feed.source.read(patience_s)
         except EndOfStream:
@@ -241,8 +241,8 @@ class CombinedSource(Source):
             feed.newest = int(out.seq[-1])
         return True
 
-    def _ready(self) -> Chunk | None:
-        """The grid points that every source has passed, or been given up on."""
+    def _take_ready(self) -> Chunk | None:
+        """Return the samples that are complete, or whose missing sources lag too far."""
         begun = [feed.newest for feed in self._feeds if feed.newest is not None]
         if not begun:
             return None

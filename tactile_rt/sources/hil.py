@@ -1,13 +1,13 @@
-"""Hardware in the loop, without hardware: does a driver change what is decided?
+"""Emulated hardware in the loop: a test whether a driver changes the decisions.
 
 source --> emulated device --> pty, slcan or CAN bus --> the real driver --> classifier
    |                                                                            | compared
    +--(the same samples, stamped by the device's clock)-----------> classifier --+
 
-A decision depends on the times of its samples, as they are resampled. So the driver is asked for
-the device's own time (`clock=device`), and the direct path's samples have the time that the
-device's clock showed: what is compared is what the wire and the driver did, and nothing else. Of a
-device that sends no time, samples are a period apart on both paths.
+A decision depends on the times of its samples, as they are resampled. So the driver uses the
+device's own time (`clock=device`), and samples of the direct path have the time that the device's
+clock showed: only the effects of wire and driver are compared. If a device sends no time, samples
+are a period apart on both paths.
 """
 
 import os
@@ -35,44 +35,44 @@ if TYPE_CHECKING:
     from tactile_rt.drivers.health import Health
 
 WIRES: Final = ("serial", "slcan", "virtual")
-SAME_LABEL: Final = 0.99  # of the decisions, where the format rounds
-START_S: Final = 30.0  # for a simulation to build its world before the first sample
+SAME_LABEL: Final = 0.99  # least share of decisions with equal label if the format rounds values
+START_S: Final = 30.0  # time for a simulation to build its world before the first sample
 WAIT_S: Final = 0.1
-# Of an emulated native device whose values are rounded, N and N m: a count is then finer than the
-# least noise that the models assume, 2 uN and 10 nN m. A mouse's whiskers bear a fiftieth of it.
+# Ranges of an emulated native device with rounded values, N and N m: a count is then finer than the
+# least noise that the models assume, 2 uN and 10 nN m. A mouse's whiskers bear a fiftieth of them.
 RANGES: Final = {"range_n": "0.01", "range_nm": "0.0001"}
-SAME_EPISODE_NS: Final = 100_000_000  # onsets of the same touch differ by less
+SAME_EPISODE_NS: Final = 100_000_000  # largest difference between onsets of the same touch
 
 
 @dataclass(frozen=True)
 class LoopReport:
-    """What came out of a loop, in numbers of samples and decisions."""
+    """Result of a loop, in numbers of samples and decisions."""
 
     samples: int
     identical_samples: int  # with the same bits
     direct: int  # decisions of the direct path
     wire: int  # decisions of the driver's path
-    identical: int  # decisions that are the same in every bit on both paths, latency apart
-    same_label: int  # decisions of the same touch and step
+    identical: int  # decisions with the same bits on both paths, except for latency
+    same_label: int  # decisions of the same touch and step with the same label
     finals: int  # last decisions of a touch on the direct path
-    finals_same: int  # of them with the same label on both paths
-    passed: int  # simulated objects; 0 where nobody knows what passed
+    finals_same: int  # those of them with the same label on both paths
+    passed: int  # simulated objects that passed; 0 if the source does not know them
     right: int  # objects whose first touch ended, on the driver's path, with the right name
-    exact: bool  # all decisions must be identical; else 99 % must have the same label
-    faulty: bool  # faults were on the way: only the account of losses must be right
+    exact: bool  # whether all decisions must be identical; else 99 % must have the same label
+    faulty: bool  # whether faults were injected: then only the counts of losses must be right
     stats: SourceStats
-    sent: int  # packets, copies included
+    sent: int  # packets, including copies
     health: "Health"
 
     @property
     def accounted(self) -> bool:
-        """Whether each packet is delivered or counted as lost."""
+        """True if each packet is delivered or counted as lost."""
         s = self.stats
         return self.sent == s.delivered + s.corrupt + s.missing + s.dropped + s.duplicates
 
     @property
     def failure(self) -> str:
-        """What is not as it must be; empty: all is well."""
+        """Requirement that is not met; empty: none."""
         decisions = max(self.direct, self.wire)
         if not self.accounted:
             return f"{self.sent} packets were sent, and the driver's account does not add up"
@@ -90,7 +90,7 @@ class LoopReport:
 
 
 class _Tee(Source):
-    """A source whose chunks are also kept."""
+    """Source that also keeps its chunks."""
 
     def __init__(self, inner: Source) -> None:
         super().__init__(inner.spec)
@@ -108,17 +108,17 @@ class _Tee(Source):
 
 
 class Loop:
-    """One source, through an emulated device and its driver, and beside them.
+    """Comparison of a source's direct path with that through an emulated device and its driver.
 
     Args:
-        source: What the device measures; the loop closes it.
+        source: The signal that the device measures; the loop closes it.
         options: Options of the codec, as in a URL; a native device's ranges are `RANGES` unless
             given.
-        faults: What goes wrong on the way; the schedule is used up.
-        seconds: How much of the source's stream to send, s; None to send all.
+        faults: Faults to inject; the schedule is consumed.
+        seconds: Length of the source's stream to send, s; None to send all.
 
     Attributes:
-        complete: Whether the loop has run to the end; a report is only judged then.
+        complete: Whether the loop has run to the end; only then is a report judged.
 
     Raises:
         ConfigError: an unknown wire, codec or option.
@@ -154,7 +154,7 @@ class Loop:
         own = codec_class(make.wire, codec).Options
         form = self._options.get("format", getattr(own, "format", ""))
         self._exact = codec == "native" and form == "float32" and not faults
-        self._tick_ns = self._device.codec.tick_ns  # of the device's clock; None: it sends no time
+        self._tick_ns = self._device.codec.tick_ns  # of the device's clock; None: no clock
         self._period_ns = NS_PER_S / source.spec.rate_hz
         self._first_ns: int | None = None
         self._pending: deque[tuple[int, Chunk]] = deque()  # first number, samples
@@ -164,11 +164,11 @@ class Loop:
         self.complete = False
 
     def run(self) -> LoopReport:
-        """Run to the source's end, or to an interrupt, after which `report` tells the rest.
+        """Run to the source's end, or to an interrupt, after which `report` gives partial results.
 
         Raises:
             SourceError: the source, the device or the driver broke.
-            SpecMismatch: what the codec carries cannot be the source's array.
+            SpecMismatch: the codec cannot carry the source's array.
         """
         with self._tee, self._device:
             clock = "host" if self._tick_ns is None else "device"
@@ -179,7 +179,7 @@ class Loop:
                 self._device.wait(0)  # if the source broke, that is why
                 raise
             with driver:
-                # What the codec calls its elements and channels are the source's all the same.
+                # The codec's names of elements and channels are replaced by the source's.
                 driver = self._driver = declare(driver, self._tee.spec)
                 classifier = Classifier(self._model, driver.spec)
                 while True:
@@ -196,7 +196,7 @@ class Loop:
         return self.report()
 
     def report(self) -> LoopReport:
-        """What there is to say of it so far."""
+        """Return the result of the loop so far."""
         driver: Any = self._driver
         if driver is None:
             raise SourceError("the loop has not been closed: there is nothing to report")
@@ -209,7 +209,7 @@ class Loop:
             identical_samples=self._identical,
             direct=len(direct),
             wire=len(wire),
-            identical=sum(_identical(a, b) for a, b in pairs),
+            identical=sum(_is_identical(a, b) for a, b in pairs),
             same_label=sum(a.label == b.label for a, b in pairs),
             finals=sum(d.final for d in direct),
             finals_same=sum(a.label == b.label for a, b in finals),
@@ -224,7 +224,7 @@ class Loop:
 
     @property
     def _passes(self) -> "list[tuple[int, str]]":
-        """When each object began to come by, in the driver's time, ns, and its class."""
+        """Start of each object's pass, in the driver's time, ns, and its class."""
         began_ns, class_of = self._first_ns or 0, self._direct.card.class_of
         passes = getattr(self._tee.inner, "passes", ())
         return [(p.start_ns - began_ns, class_of.get(p.category, p.category)) for p in passes]
@@ -235,7 +235,7 @@ class Loop:
         return Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
 
     def _push_direct(self) -> None:
-        """The samples that have gone into the device since, straight into the classifier."""
+        """Push the samples that the device has taken since into the direct classifier."""
         while self._tee.kept:
             chunk = self._tee.kept.popleft()
             if self._first_ns is None:
@@ -251,7 +251,7 @@ class Loop:
             self._decided[0].extend(self._direct.push(chunk))
 
     def _compare(self, chunk: Chunk) -> None:
-        """Compare what came with what went, sample by sample, by their numbers."""
+        """Compare received samples with sent ones of the same number."""
         for i, number in enumerate(chunk.seq.tolist()):
             while self._pending and self._pending[0][0] + len(self._pending[0][1]) <= number:
                 self._pending.popleft()
@@ -266,7 +266,7 @@ class Loop:
 
 
 def check_line(wire: str, codec: str, options: dict[str, str]) -> None:
-    """Refuse what no source could go through, before one is opened; see `Loop`.
+    """Refuse a line that `Loop` cannot emulate, before a source is opened.
 
     Raises:
         ConfigError: an unknown wire, codec or option.
@@ -277,10 +277,10 @@ def check_line(wire: str, codec: str, options: dict[str, str]) -> None:
 
 
 def named_right(passes: Sequence[tuple[int, str]], decisions: Sequence[Classification]) -> int:
-    """How many of the objects that passed are named by the last decision of their first touch.
+    """Count the objects that the last decision of their first touch names correctly.
 
     Args:
-        passes: when each began to come by, stream time in ns, and its category; in order.
+        passes: start of each object's pass, stream time in ns, and its category; in order.
     """
     named: dict[int, str] = {}
     for decision in decisions:
@@ -293,7 +293,7 @@ def named_right(passes: Sequence[tuple[int, str]], decisions: Sequence[Classific
 def pair(
     direct: Sequence[Classification], wire: Sequence[Classification]
 ) -> list[tuple[Classification, Classification]]:
-    """Decisions of the two paths that are about the same step of the same touch."""
+    """Pair the decisions of both paths on the same step of the same touch."""
     by_step: dict[int, list[Classification]] = {}
     for decision in wire:
         by_step.setdefault(decision.step, []).append(decision)
@@ -308,7 +308,7 @@ def pair(
     return pairs
 
 
-def _identical(a: Classification, b: Classification) -> bool:
-    """Whether two decisions are the same in every bit, but for the time that they took."""
+def _is_identical(a: Classification, b: Classification) -> bool:
+    """Return whether two decisions have the same bits, except for the time taken."""
     plain = all(getattr(a, n) == getattr(b, n) for n in ("onset_ns", "t_ns", "step", "final"))
     return plain and a.label == b.label and a.probabilities.tobytes() == b.probabilities.tobytes()

@@ -1,10 +1,10 @@
-"""A made-up array that feels bumps go by: a source that needs neither device nor simulator.
+"""Synthetic source: an array with artificial touches, which needs neither device nor simulator.
 
-The bumps are of no object, so what a model decides on them means nothing; `replay:demo` is of some.
+The bumps are no objects, so a model's decisions on them mean nothing; `replay:demo` has objects.
 
 synthetic:                                    5 whiskers x 6 channels at 1 kHz, without end
 synthetic:35x6?rate_hz=1000&seconds=10&pace=fast&seed=3
-synthetic:mouse                               the array that the package's own model knows
+synthetic:mouse                               the array of the package's own model
 """
 
 import re
@@ -18,27 +18,27 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
-COLUMNS = 7  # of the grid that the whiskers stand on
+COLUMNS = 7  # of the grid of whiskers
 PITCH_M = 0.002
 CHUNK_S = 0.009
-BUMP_S, EVERY_S = 0.3, 1.5  # a bump's length, and from one to the next
-REST_S = 0.6  # before the first, for a baseline
+BUMP_S, EVERY_S = 0.3, 1.5  # length of a bump, and period of bumps
+REST_S = 0.6  # before the first bump, for a baseline
 PEAK = {"N": 2e-3, "N m": 2e-5}
-# of what a device measures, that can be bought
+# peaks for devices on the market, by SI unit
 LOADS = {"N": 5.0, "N m": 0.1, "T": 1e-3, "Pa": 1e4, "V": 5e-3, "m/s2": 5.0, "F": 1e-12, "1": 1e3}
 REST = {"K": 298.15}
-NOISE = 0.005  # of the peak, RMS
+NOISE = 0.005  # RMS, in parts of the peak
 NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 @dataclass(frozen=True)
 class SyntheticOptions:
-    """How fast, how long.
+    """Options of ``synthetic:``.
 
     Attributes:
         seconds: Length of the stream, s; 0 for an endless one.
         pace: ``realtime`` delivers samples when they are due, ``fast`` at once.
-        touches: Whether bumps pass over the array; without, it is at rest, and there is only noise.
+        touches: Whether bumps pass over the array; if not, it is at rest, with noise only.
     """
 
     rate_hz: float = 1000.0
@@ -58,7 +58,7 @@ class SyntheticOptions:
 
 
 def synthetic_spec(elements: int, channels: int, rate_hz: float) -> ArraySpec:
-    """Whiskers in rows of seven, 2 mm apart, that measure up to three forces and three moments."""
+    """Make a spec of whiskers in rows of seven, 2 mm apart. Channels: forces, then moments."""
     grid = tuple(divmod(i, COLUMNS) for i in range(elements))
     return ArraySpec(
         name="synthetic",
@@ -84,7 +84,7 @@ class SyntheticSource(Source):
     Options = SyntheticOptions
 
     def __init__(self, size: str, options: SyntheticOptions) -> None:
-        super().__init__(_spec(size, options))
+        super().__init__(_make_spec(size, options))
         self.live = options.pace == "realtime"
         self._rng = np.random.default_rng(options.seed)
         self._left = round(options.seconds * options.rate_hz) if options.seconds else None
@@ -96,7 +96,7 @@ class SyntheticSource(Source):
         self._sent, self._start_ns, self._closed = 0, -1, False
 
     def like(self, spec: ArraySpec) -> "SyntheticSource":
-        """Such bumps on another array, of the size that its device measures, at its rate."""
+        """Return a source of similar bumps on another array, at its rate and typical loads."""
         source = SyntheticSource("", replace(self._options, rate_hz=spec.rate_hz))
         Source.__init__(source, spec)
         source._peak = np.array([LOADS.get(unit, 1.0) for unit in spec.units])
@@ -106,8 +106,8 @@ class SyntheticSource(Source):
 
     @staticmethod
     def check(size: str, options: SyntheticOptions) -> ArraySpec:
-        """The array that it would be; raises the `ConfigError` that opening it would raise."""
-        return _spec(size, options)
+        """Return the spec of a source, or raise the `ConfigError` that opening would raise."""
+        return _make_spec(size, options)
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         n = max(1, round(CHUNK_S * self.spec.rate_hz))
@@ -129,13 +129,13 @@ class SyntheticSource(Source):
             self._left -= n
         self.stats.delivered += n
         valid = np.ones((n, len(self.spec.elements)), np.bool_)
-        return Chunk(seq, self._start_ns + due, self._values(due / NS_PER_S), valid)
+        return Chunk(seq, self._start_ns + due, self._make_values(due / NS_PER_S), valid)
 
     def close(self) -> None:
         self._closed = True
 
-    def _values(self, t_s: NDArray[np.float64]) -> NDArray[np.float32]:
-        """(n, element, channel) at these times since the start."""
+    def _make_values(self, t_s: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the values (n, element, channel) at times since the start, s."""
         phase = (t_s[:, None] - self._at) % EVERY_S / BUMP_S  # (n, element)
         bump = np.where(phase < 1, np.sin(np.pi * np.minimum(phase, 1)), 0.0)
         share = np.cos(np.arange(len(self._peak)) * 1.1)  # channels differ in size and sign
@@ -145,16 +145,16 @@ class SyntheticSource(Source):
         return values
 
 
-def _spec(size: str, options: SyntheticOptions) -> ArraySpec:
+def _make_spec(size: str, options: SyntheticOptions) -> ArraySpec:
     if size == "mouse":
         from tactile_rt.classifier.model_file import shipped_model
 
         return replace(read_array(shipped_model()), rate_hz=options.rate_hz)
-    return synthetic_spec(*_numbers(size), options.rate_hz)
+    return synthetic_spec(*_parse_size(size), options.rate_hz)
 
 
-def _numbers(size: str) -> tuple[int, int]:
-    """(elements, channels) of ``35x6``."""
+def _parse_size(size: str) -> tuple[int, int]:
+    """Parse a size such as ``35x6`` into (elements, channels)."""
     found = re.fullmatch(r"(\d{1,4})x([1-6])", size or "5x6")
     if not found or int(found[1]) == 0:
         raise ConfigError(

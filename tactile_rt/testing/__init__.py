@@ -1,5 +1,5 @@
-"""For your own tests: a small array, chunks of any signal, a source that needs no device, and
-devices on real lines that need no hardware.
+"""Helpers for your own tests: a small array, chunks of any signal, a source without a device, and
+emulated devices on real lines.
 
 spec = small_spec()
 source = ArraySource(spec, cut(signal, spec.rate_hz))
@@ -8,7 +8,7 @@ with FakeSerial(signal, "native", spec=spec) as device, open_source(device.url) 
     chunk = source.read(timeout=1.0)
     device.unplug()
 
-`tactile_rt.testing.fixtures` has them as fixtures.
+`tactile_rt.testing.fixtures` provides the devices as fixtures.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ __all__ = ["ArraySource", "FakeCan", "FakeSerial", "cut", "small_spec"]
 
 
 def small_spec(elements: int = 3, rate_hz: float = 1000.0) -> ArraySpec:
-    """A row of elements 2 mm apart that measure one force and one moment."""
+    """Make the spec of elements in a row, 2 mm apart. Each has a force and a moment."""
     return ArraySpec(
         name="small",
         elements=tuple(f"A{i}" for i in range(elements)),
@@ -42,11 +42,11 @@ def small_spec(elements: int = 3, rate_hz: float = 1000.0) -> ArraySpec:
 
 
 def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) -> list[Chunk]:
-    """Cut a signal into chunks of evenly spaced, wholly valid samples.
+    """Cut a signal into chunks of evenly spaced samples that are all valid.
 
     Args:
         values: The signal, (n, element, channel), SI units.
-        samples: Samples of each chunk; the last chunk may be shorter.
+        samples: Samples per chunk; the last chunk may be shorter.
     """
     signal = np.asarray(values, dtype=np.float32)
     seq = np.arange(len(signal), dtype=np.int64)
@@ -58,15 +58,15 @@ def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) 
 
 
 class ArraySource(Source):
-    """Chunks in memory as a source: one per read, at once, then the end.
+    """Source of chunks in memory: one per read, at once, then the end.
 
     Args:
-        spec: What the samples are.
+        spec: Description of the samples.
         chunks: The chunks to deliver, in order.
         live: Whether to claim to be a device, so that a `Session` reads in a thread of its own.
 
     Raises:
-        ValueError: A chunk is not of the shape that `spec` tells.
+        ValueError: A chunk does not have the shape of `spec`.
     """
 
     def __init__(self, spec: ArraySpec, chunks: Sequence[Chunk], live: bool = False) -> None:
@@ -89,7 +89,7 @@ class ArraySource(Source):
 
 
 class _SignalDevice(EmulatedDevice):
-    """An emulated device that takes a signal, on a line without a speed."""
+    """Emulated device that measures a given signal, on a line of unlimited speed."""
 
     paced = False
 
@@ -101,30 +101,30 @@ class _SignalDevice(EmulatedDevice):
         spec: ArraySpec | None = None,
         **further: Any,
     ) -> None:
-        source = _source_of(signal, self.wire, codec, spec, further)
+        source = _make_source(signal, self.wire, codec, spec, further)
         super().__init__(source, codec, **further)
 
 
 class FakeSerial(_SignalDevice, EmulatedSerial):
-    """A device on a serial port, plugged in while entered: see `EmulatedSerial`. Its line carries
-    all that it sends, unless an option ``baud`` says how fast it is.
+    """Device on a serial port, plugged in inside the ``with`` block: see `EmulatedSerial`. The
+    line's speed is unlimited, unless an option ``baud`` gives it.
 
     Args:
-        signal: What the device measures: (n, element, channel) in SI units, or a source.
-        spec: The array, where neither the codec nor a source tells.
+        signal: The measured signal: (n, element, channel) in SI units, or a source.
+        spec: The array, if neither the codec nor a source defines it.
         further: Options of `EmulatedSerial`.
     """
 
 
 class FakeCan(_SignalDevice, EmulatedCan):
-    """A device on a CAN bus, plugged in while entered: see `EmulatedCan`. Its bus carries all that
-    it sends, unless an option ``bitrate`` says how fast it is.
+    """Device on a CAN bus, plugged in inside the ``with`` block: see `EmulatedCan`. The bus's speed
+    is unlimited, unless an option ``bitrate`` gives it.
 
     The arguments are those of `FakeSerial`, and `EmulatedCan` has further options.
     """
 
 
-def _source_of(
+def _make_source(
     signal: ArrayLike | Source, wire: str, codec: str, spec: ArraySpec | None, further: Any
 ) -> Source:
     if isinstance(signal, Source):

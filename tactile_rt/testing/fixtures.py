@@ -1,4 +1,4 @@
-"""Fixtures for tests with emulated devices. In your conftest.py:
+"""Pytest fixtures for tests with emulated devices. In your conftest.py:
 
     from tactile_rt.testing.fixtures import fake_can, fake_serial
 
@@ -7,7 +7,7 @@
         with open_source(device.url) as source:
             ...
 
-Nothing else of tactile_rt imports it, so that pytest is needed for tests only.
+No other module of tactile_rt imports this one, so that pytest is needed for tests only.
 """
 
 from collections.abc import Callable, Iterator
@@ -22,13 +22,13 @@ __all__ = ["fake_can", "fake_serial"]
 
 @pytest.fixture
 def fake_serial() -> Iterator[Callable[..., FakeSerial]]:
-    """Makes devices on serial ports, plugged in; unplugged when the test ends."""
+    """Provide a factory of plugged-in serial devices, unplugged when the test ends."""
     with ExitStack() as devices:
         yield lambda *words, **options: devices.enter_context(FakeSerial(*words, **options))
 
 
 @pytest.fixture
 def fake_can() -> Iterator[Callable[..., FakeCan]]:
-    """Makes devices on CAN buses, plugged in; unplugged when the test ends."""
+    """Provide a factory of plugged-in CAN devices, unplugged when the test ends."""
     with ExitStack() as devices:
         yield lambda *words, **options: devices.enter_context(FakeCan(*words, **options))

@@ -346,7 +346,7 @@ def test_a_lock_of_another_user_is_a_lock_and_names_the_user(tmp_path):
 def bound(key):
     """What has a lock's name, and does not listen yet."""
     holder = socket.socket(socket.AF_UNIX)
-    holder.bind(lock._name(key))
+    holder.bind(lock._make_name(key))
     return holder
 
 
@@ -372,7 +372,7 @@ def test_a_holder_that_very_many_have_asked_is_not_waited_for(tmp_path):
             for _ in range(100):
                 one = asking.enter_context(socket.socket(socket.AF_UNIX))
                 one.setblocking(False)
-                one.connect(lock._name(key))
+                one.connect(lock._make_name(key))
         with pytest.raises(AlreadyRunning, match="in use by another process"):
             Locks().hold([key])
 

@@ -1,17 +1,17 @@
-"""From what a user wrote to typed structs, and one wording of every mistake.
+"""Conversion of a user's settings to typed structs, with uniform error messages.
 
 TOML files, ``--set key=value``, the ``?option=value`` of a URL and the rows of a CSV file all
-become a tree of `SettingNode`, in which every value knows where it was written; `convert` makes a
-struct or a dataclass of it. A mistake is one line::
+become a tree of `SettingNode`, in which every value has its place in the text; `convert` turns it
+into a struct or a dataclass. An error is one line::
 
     robot.toml:5: page.port: expected a whole number <= 65535, got 70000
     serial:/dev/ttyUSB0 has no option 'boud'; did you mean baud?
     --set page.prot=1: page has no key 'prot'; did you mean port?
     loads.csv:3: fx: expected a number, got '1,2'
 
-tree      the tree, and TOML text as one
-structs   a tree as a struct, and what is wrong with it in words
-written   what is text alone: ``--set``, URLs, CSV
+tree      the tree, and parsing of TOML
+structs   conversion of a tree to a struct, with error messages
+written   settings that are text only: ``--set``, URLs, CSV
 """
 
 from tactile_rt.core.settings.structs import convert, hint, nearest, no_such, refusal

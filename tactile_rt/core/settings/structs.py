@@ -1,13 +1,13 @@
-"""A tree of settings as a typed struct, and what is wrong with it in a user's words.
+"""Conversion of a tree of settings to a typed struct, with errors in a user's words.
 
-Goals: every mistake is one line that says where it was written, which key it is, what was found and
-what is allowed; a right tree costs one call of msgspec; no wording of msgspec's reaches a user.
+Goals: every error is one line with the place, the key, the value that was found and what is
+allowed; a correct tree costs one call of msgspec; no wording of msgspec's reaches a user.
 
-Plan: keys are checked first, as a misspelt one is the commonest mistake, and one that msgspec would
-only call unknown. Then msgspec converts the whole tree. Only if it refuses is the culprit looked
-for, by converting the branches one by one, down to the smallest that is refused by itself: its path
-tells where, its type what is allowed. That works for whatever msgspec converts, tables under keys
-of any name and checks of the structs' own included, whose path msgspec does not tell.
+Plan: keys are checked first, as a misspelt key is the most frequent mistake, which msgspec would
+only call unknown. Then msgspec converts the whole tree. Only if it refuses, the branches are
+converted one by one to find the smallest branch that is refused by itself: its path is the place of
+the error, its type defines what is allowed. This works for all that msgspec converts, including
+tables under arbitrary keys and the structs' own checks, for which msgspec gives no path.
 """
 
 import dataclasses
@@ -27,17 +27,17 @@ from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.settings.tree import SettingNode, named
 
 UNITS = {"_s": "seconds", "_ms": "milliseconds", "_mb": "megabytes", "_hz": "hertz"}
-ALIKE = (  # units that one may take for another
+ALIKE = (  # units that a user may confuse
     ("s", "ms", "us", "ns", "sec", "seconds", "min", "minutes", "h", "hours"),
     ("mb", "b", "kb", "gb", "mib", "gib", "bytes"),
 )
-WORDS = {  # of msgspec, in a user's words
+WORDS = {  # a user's words for msgspec's
     "float": "a number", "int": "a whole number", "bool": "true or false", "str": "text",
     "object": "a table", "array": "a list", "null": "nothing",
 }  # fmt: skip
 SEVERAL = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
-LISTED = 66  # characters of the names that a message lists
-_REFUSED = (ConfigError, ValueError, OverflowError, RecursionError)  # msgspec's are ValueErrors
+LISTED = 66  # characters of names that a message lists
+_CONVERSION_ERRORS = (ConfigError, ValueError, OverflowError, RecursionError)  # msgspec: ValueError
 
 
 def convert(
@@ -48,15 +48,15 @@ def convert(
     top: Any = None,
     lax: bool = False,
 ) -> Any:
-    """What stands at a path of a tree, as a type.
+    """Convert the value at a path of a tree to a type.
 
     Args:
-        top: the type of the whole tree, to tell a table that stands in another one's place; by
-            default `kind` if the path is empty.
+        top: the type of the whole tree, to recognize a table of the file that is nested wrongly;
+            by default `kind` if the path is empty.
         lax: whether the values are text as written, so that ``"5"`` is a number.
 
     Raises:
-        ConfigError: an unknown key, a value of the wrong type or range, or what a struct's own
+        ConfigError: an unknown key, a value of the wrong type or range, or one that a struct's own
             check refuses; one line with place, key, what was found and what is allowed.
     """
     node, here = root.at(path), list(path)
@@ -65,21 +65,21 @@ def convert(
         _check_finite(root, node, here, kind)
     try:
         return msgspec.convert(node.plain(), kind, strict=not lax)
-    except _REFUSED as error:
-        steps, leaf, cause = _culprit(node, kind, lax) or ([], kind, error)
+    except _CONVERSION_ERRORS as error:
+        steps, leaf, cause = _find_smallest_error(node, kind, lax) or ([], kind, error)
         whole = [*here, *steps]
-        raise refusal(root, whole, _said(cause, root.at(whole), leaf, whole)) from None
+        raise refusal(root, whole, _explain(cause, root.at(whole), leaf, whole)) from None
 
 
 def refusal(root: SettingNode, path: Sequence[str | int], why: str) -> ConfigError:
-    """The error of what stands at a path."""
+    """Make the error for the value at a path."""
     node, name = root.at(path), named(path)
     where = node.where if node.line or node.file != root.file else root.where
     return ConfigError(f"{where}: {name}: {why}" if name else f"{where}: {why}")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A phrase for a message's end: ``did you mean X?``, or what there is."""
+    """Suggest a name for a message's end: ``did you mean X?``, or list known names."""
     names = list(known)
     plain = {n.casefold(): n for n in names}
     near = difflib.get_close_matches(name.casefold(), plain, 1, 0.6)
@@ -92,12 +92,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:
-    """A whole message: ``no recipe 'defualt'; did you mean default?``"""
+    """Make a whole message: ``no recipe 'defualt'; did you mean default?``"""
     return f"no {what} {name!r}; {nearest(name, known)}"
 
 
 def hint(key: str, known: Sequence[str]) -> str:
-    """The nearest key; one that differs in its unit alone is told with the unit."""
+    """Suggest the nearest key; with its unit in words if only the unit differs."""
     for alike in ALIKE:
         found = re.search(rf"_({'|'.join(alike)})$", key.lower())
         if not found:
@@ -113,7 +113,7 @@ def hint(key: str, known: Sequence[str]) -> str:
 
 
 def types_of(kind: Any) -> dict[str, Any]:
-    """The types of a struct's or dataclass's keys, by the keys as they are written."""
+    """Return the types of a struct's or dataclass's keys, by the keys as written."""
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return {f.encode_name: f.type for f in msgspec.structs.fields(kind)}
     if dataclasses.is_dataclass(kind):
@@ -123,13 +123,13 @@ def types_of(kind: Any) -> dict[str, Any]:
 
 
 def is_list(kind: Any, path: Sequence[str | int]) -> bool:
-    """Whether there is a list of tables at a path of a struct."""
-    return _inner(_kind_at(kind, path))[1]
+    """Return whether a path of a struct is a list of tables."""
+    return _find_struct(_kind_at(kind, path))[1]
 
 
 def is_text(kind: Any, path: Sequence[str | int]) -> bool:
-    """Whether there is text at a path of a struct."""
-    found = _bare(_kind_at(kind, path))
+    """Return whether a path of a struct is text."""
+    found = _strip_type(_kind_at(kind, path))
     return found is str or (
         typing.get_origin(found) is Literal and isinstance(typing.get_args(found)[0], str)
     )
@@ -139,7 +139,7 @@ def _kind_at(kind: Any, path: Sequence[str | int]) -> Any:
     for step in path:
         if isinstance(step, int):
             continue
-        inner = _inner(kind)[0]
+        inner = _find_struct(kind)[0]
         kind = types_of(inner).get(step) if inner is not None else None
     return kind
 
@@ -150,20 +150,20 @@ def _is_table(kind: Any) -> bool:
     )
 
 
-def _inner(kind: Any) -> tuple[Any, bool]:
-    """The struct that a key's value is, or is a list of; None: neither."""
-    bare = _bare(kind)
+def _find_struct(kind: Any) -> tuple[Any, bool]:
+    """Return a key's struct (None: none), and whether its value is a list of these."""
+    bare = _strip_type(kind)
     if _is_table(bare):
         return bare, False
     if typing.get_origin(bare) in (tuple, list):
         items = typing.get_args(bare)
-        if items and _is_table(item := _bare(items[0])) and items[1:] in ((), (Ellipsis,)):
+        if items and _is_table(item := _strip_type(items[0])) and items[1:] in ((), (Ellipsis,)):
             return item, True
     return None, False
 
 
-def _bare(kind: Any, value: Any = None) -> Any:
-    """A type without its annotation and without None; of several the one that a value is of."""
+def _strip_type(kind: Any, value: Any = None) -> Any:
+    """Strip annotations and None from a type, and choose from a union by the value."""
     while True:
         origin = typing.get_origin(kind)
         if origin is Annotated:
@@ -171,7 +171,7 @@ def _bare(kind: Any, value: Any = None) -> Any:
         elif origin in (typing.Union, types.UnionType):
             choices = [c for c in typing.get_args(kind) if c is not types.NoneType]
             if len(choices) > 1:
-                choices = [c for c in choices if _takes(_bare(c), value)]
+                choices = [c for c in choices if _is_same_sort(_strip_type(c), value)]
             if len(choices) != 1:
                 return kind
             (kind,) = choices
@@ -179,17 +179,17 @@ def _bare(kind: Any, value: Any = None) -> Any:
             return kind
 
 
-def _takes(kind: Any, value: Any) -> bool:
-    """Whether a value is of the sort of a type: a table, a list, or one of the others."""
+def _is_same_sort(kind: Any, value: Any) -> bool:
+    """Return whether value and type are of one sort: table, list or neither."""
     origin = typing.get_origin(kind)
     if isinstance(value, dict):
         return _is_table(kind) or origin is dict
     return (origin in (tuple, list)) == isinstance(value, list) and not _is_table(kind)
 
 
-def _below(node: SettingNode, kind: Any) -> Iterator[tuple[str | int, SettingNode, Any]]:
-    """(step, node, type) of what a table or list holds; nothing if it is not of its type."""
-    bare = _bare(kind, node.value)
+def _walk_values(node: SettingNode, kind: Any) -> Iterator[tuple[str | int, SettingNode, Any]]:
+    """Yield (step, node, type) of a table's or list's values; nothing for a wrong type."""
+    bare = _strip_type(kind, node.value)
     origin, arguments = typing.get_origin(bare), typing.get_args(bare)
     if isinstance(node.value, dict):
         fields = types_of(bare) if _is_table(bare) else {}
@@ -205,12 +205,12 @@ def _below(node: SettingNode, kind: Any) -> Iterator[tuple[str | int, SettingNod
                 yield i, below, arguments[0 if several else i]
 
 
-# what is wrong
+# errors
 
 
 def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -> None:
-    """Refuse unknown keys, and tables that are written as what they are not."""
-    bare = _bare(kind, node.value)
+    """Refuse unknown keys, values in place of tables, and the wrong one of [name], [[name]]."""
+    bare = _strip_type(kind, node.value)
     if _is_table(bare) and not isinstance(node.value, dict):
         name = named(path) or "the file"
         raise ConfigError(f"{node.where}: {name} is a table of keys, not {shown(node.plain())}")
@@ -218,57 +218,57 @@ def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -
     for key, below in node.value.items() if fields or _is_table(bare) else ():
         if key not in fields:
             owner = named(path) or "the file"
-            said = (path and _table_hint(key, top)) or hint(key, list(fields))
-            raise ConfigError(f"{below.where}: {owner} has no key {key!r}; {said}")
-        inner, several = _inner(fields[key])
+            advice = (path and _table_hint(key, top)) or hint(key, list(fields))
+            raise ConfigError(f"{below.where}: {owner} has no key {key!r}; {advice}")
+        inner, several = _find_struct(fields[key])
         if inner is not None and several and not isinstance(below.value, list):
             name = named([*path, key])
             raise ConfigError(f"{below.where}: there may be several of {name}: write [[{key}]]")
         if inner is not None and not several and isinstance(below.value, list):
             name = named([*path, key])
             raise ConfigError(f"{below.where}: there is but one: write [{name}]")
-    for step, below, inner in _below(node, kind):
+    for step, below, inner in _walk_values(node, kind):
         _check_keys(below, [*path, step], inner, top)
 
 
 def _table_hint(key: str, top: Any) -> str:
-    """Where a table of the file belongs that stands in another one; empty: it is no such table."""
-    inner, several = _inner(types_of(top).get(key)) if top is not None else (None, False)
+    """Explain where a wrongly nested table of the file belongs; empty: no such table."""
+    inner, several = _find_struct(types_of(top).get(key)) if top is not None else (None, False)
     if inner is None:
         return ""
     return f"it is a table of the file: write {f'[[{key}]]' if several else f'[{key}]'}"
 
 
 def _check_finite(root: SettingNode, node: SettingNode, path: list[str | int], kind: Any) -> None:
-    """Refuse text for a number that is none: TOML's are refused where they are read."""
-    for step, below, inner in _below(node, kind):
+    """Refuse text such as nan or inf for a number. In TOML it is refused on reading."""
+    for step, below, inner in _walk_values(node, kind):
         _check_finite(root, below, [*path, step], inner)
-    if _bare(kind, node.value) is float and isinstance(node.value, str):
+    if _strip_type(kind, node.value) is float and isinstance(node.value, str):
         try:
             number = float(node.value)
         except ValueError:
-            return  # told with what is allowed
+            return  # the conversion reports it with what is allowed
         if not math.isfinite(number):
             raise refusal(root, path, f"{number} is no quantity")
 
 
-def _culprit(
+def _find_smallest_error(
     node: SettingNode, kind: Any, lax: bool
 ) -> tuple[list[str | int], Any, Exception] | None:
-    """(path, type, error) of the smallest branch that cannot be converted; None: all can be."""
-    for step, below, inner in _below(node, kind):
-        found = _culprit(below, inner, lax)
+    """Find (path, type, error) of the smallest branch that cannot be converted; None: none."""
+    for step, below, inner in _walk_values(node, kind):
+        found = _find_smallest_error(below, inner, lax)
         if found is not None:
             return [step, *found[0]], found[1], found[2]
     try:
         msgspec.convert(node.plain(), kind, strict=not lax)
-    except _REFUSED as error:
+    except _CONVERSION_ERRORS as error:
         return [], kind, error
     return None
 
 
-def _said(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | int]) -> str:
-    """What msgspec says of a branch, in a user's words."""
+def _explain(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | int]) -> str:
+    """Translate msgspec's error on a branch into a user's words."""
     message = str(error)
     if not isinstance(error, msgspec.ValidationError):
         return message
@@ -277,16 +277,16 @@ def _said(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | i
     if missing:
         return f"needs a key {missing[1]!r}"
     value = node.plain()
-    bare = _bare(kind, value)
+    bare = _strip_type(kind, value)
     if typing.get_origin(bare) is Literal:
         choices = [str(c) for c in typing.get_args(bare)]
         near = difflib.get_close_matches(str(value).lower(), choices, 1, 0.6)
         ask = f"; did you mean {near[0]}?" if near else ""
         return f"{shown(value)} is not one of {', '.join(choices)}{ask}"
     if "matching regex" in message:
-        return f"{shown(value)} is no {_described(kind)}"
-    if message.startswith("Expected `array`") and (wanted := _list_of(bare)):
-        return f"expected {wanted}, got {shown(value)}"
+        return f"{shown(value)} is no {_describe_text(kind)}"
+    if message.startswith("Expected `array`") and (expected := _describe_list(bare)):
+        return f"expected {expected}, got {shown(value)}"
     if "of length" in message:
         return "must not be empty" if value in ("", [], {}) else "is too long"
     if not message.startswith("Expected "):
@@ -299,16 +299,16 @@ def _said(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | i
     return f"{message}, got {shown(value)}" + (f" (in {unit})" if unit else "")
 
 
-def _described(kind: Any) -> str:
-    """What text is that must match a pattern: the note of its type says so."""
+def _describe_text(kind: Any) -> str:
+    """Describe text that must match a pattern, by the description in its type."""
     for note in typing.get_args(kind)[1:] if typing.get_origin(kind) is Annotated else ():
         if isinstance(note, msgspec.Meta) and note.description:
             return note.description
     return "such text"
 
 
-def _list_of(kind: Any) -> str:
-    """What a list is to hold, in words; empty: its length is bounded, which is told otherwise."""
+def _describe_list(kind: Any) -> str:
+    """Describe a list of fixed length in words; empty for any other type."""
     items = typing.get_args(kind)
     if typing.get_origin(kind) is not tuple or items[1:] == (Ellipsis,):
         return ""
@@ -317,7 +317,7 @@ def _list_of(kind: Any) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value in a message: short, and without what would break the line."""
+    """Format a value for a message: at most 60 characters, without line breaks."""
     if isinstance(value, date | time):
         return value.isoformat()
     return f"{value!r:.60}"

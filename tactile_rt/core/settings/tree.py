@@ -1,7 +1,7 @@
-"""What was written, as a tree in which every value knows the file and the line that it came from.
+"""Settings as a tree in which every value has the file and line that it came from.
 
-`tomllib` tells values but not where they stand, so the lines are found beside it: `find_lines` has
-it read a valid document a second time, statement by statement.
+`tomllib` gives values but not their lines, so `find_lines` parses a valid document a second time,
+statement by statement.
 """
 
 import os
@@ -14,8 +14,8 @@ from typing import Any
 
 from tactile_rt.core.errors import ConfigError
 
-LARGEST = 1 << 26  # bytes of a file that people write, or have a program write for them
-# Strings and comments, in which a bracket or a line's end means nothing; and what ends a statement.
+LARGEST = 1 << 26  # bytes of a file that a person or a program writes
+# Strings and comments, in which brackets and line ends have no meaning; brackets and line ends.
 TOKEN = re.compile(
     r'"""(?:\\.|[^\\])*?"""(?!")|"(?:\\.|[^"\\])*"'
     r"|'''.*?'''(?!')|'[^']*'|#[^\n]*|[][{}\n]",
@@ -26,13 +26,13 @@ INT64 = 2**63
 
 @dataclass
 class SettingNode:
-    """A value, and where it was written.
+    """Value with the place where it was written.
 
     Attributes:
-        value: The value; of a table a dict of nodes, of a list a list of nodes.
+        value: The value; for a table a dict of nodes, for a list a list of nodes.
         file: The file as the user named it, ``--set ...``, or the URL whose options these are.
-        line: The line of the file, counted from 1; 0 where there are no lines.
-        folder: The folder that relative paths in the file are meant from.
+        line: The line of the file, counted from 1; 0: not from a file with lines.
+        folder: The folder to which paths in the file are relative.
     """
 
     value: Any
@@ -42,11 +42,11 @@ class SettingNode:
 
     @property
     def where(self) -> str:
-        """For a message."""
+        """File and line for a message."""
         return f"{self.file}:{self.line}" if self.line else self.file
 
     def plain(self) -> Any:
-        """Without the nodes."""
+        """Return the value with plain dicts and lists instead of nodes."""
         if isinstance(self.value, dict):
             return {key: node.plain() for key, node in self.value.items()}
         if isinstance(self.value, list):
@@ -54,7 +54,7 @@ class SettingNode:
         return self.value
 
     def at(self, path: Sequence[str | int]) -> "SettingNode":
-        """The node at a path, or the last one there is on the way."""
+        """Return the node at a path, or the last existing node on the way."""
         node = self
         for step in path:
             try:
@@ -64,7 +64,7 @@ class SettingNode:
         return node
 
     def walk(self, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-        """(path, node) of this and all below."""
+        """Yield (path, node) of this node and all below."""
         yield path, self
         if isinstance(self.value, dict):
             for key, node in self.value.items():
@@ -75,23 +75,23 @@ class SettingNode:
 
 
 def named(path: Sequence[str | int]) -> str:
-    """A path as in a message: ``source[0].url``."""
+    """Format a path for a message: ``source[0].url``."""
     return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
 
 
 def make_node(value: Any, file: str, line: int, folder: Path) -> SettingNode:
-    """Nodes of a plain value, all of one line."""
+    """Make a tree of a plain value, whose nodes all have one line."""
     return _build(value, (), {(): line}, file, folder, line)
 
 
 def read_text(path: Path, largest: int = LARGEST) -> str:
-    """The text of a file that a user names, without a byte order mark.
+    """Read the text of a file that a user names, without a byte order mark.
 
     Args:
-        largest: number of bytes that it may have.
+        largest: largest size of the file, bytes.
 
     Raises:
-        ConfigError: not there, not readable, too large, or not UTF-8; names file and line.
+        ConfigError: missing, not readable, too large, or not UTF-8; names file and line.
     """
     try:
         with path.open("rb") as file:
@@ -107,7 +107,7 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
     if len(data) > largest:
         raise ConfigError(f"{path}: larger than {largest >> 20} MB: not such a file")
     try:
-        return data.decode().removeprefix("\ufeff")  # which some editors write before the text
+        return data.decode().removeprefix("\ufeff")  # some editors write this mark first
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise ConfigError(f"{path}:{line}: not UTF-8 text") from None
@@ -120,25 +120,25 @@ def read_toml(path: Path, largest: int = LARGEST) -> SettingNode:
 
 
 def parse_toml(text: str, where: str, folder: Path = Path()) -> SettingNode:
-    """A TOML document as a tree.
+    """Parse a TOML document into a tree.
 
     Args:
-        folder: what relative paths in it are meant from.
+        folder: the folder to which paths in the document are relative.
 
     Raises:
-        ConfigError: not TOML, or a number that no key can mean; names the line.
+        ConfigError: not TOML, or a number that no key may have; names the line.
     """
     try:
         parsed = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(_syntax(where, str(error), text)) from None
-    except (RecursionError, ValueError):  # lists in lists in lists; a number of 10,000 digits
+        raise ConfigError(_describe_syntax_error(where, str(error), text)) from None
+    except (RecursionError, ValueError):  # deeply nested lists; a number of 10,000 digits
         raise ConfigError(f"{where}: nested too deeply, or a number too long") from None
     return _build(parsed, (), find_lines(text), where, folder, 0)
 
 
 def plain_value(written: str) -> Any:
-    """A TOML value, or else text, so that it need not be quoted twice."""
+    """Parse a TOML value; take anything else as text, so that it needs no quotes."""
     try:
         return tomllib.loads(f"value = {written}")["value"]
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
@@ -168,7 +168,7 @@ def _build(
     return node
 
 
-def _syntax(path: str, message: str, text: str) -> str:
+def _describe_syntax_error(path: str, message: str, text: str) -> str:
     found = re.search(r" \(at line (\d+), column (\d+)\)$", message)
     if found:
         return f"{path}:{found[1]}: not TOML: {message[: found.start()]} (column {found[2]})"
@@ -177,13 +177,13 @@ def _syntax(path: str, message: str, text: str) -> str:
     return f"{path}: not TOML: {message}"
 
 
-# where a key stands
+# lines of keys
 
 
 def find_lines(text: str) -> dict[tuple[str | int, ...], int]:
     """Find the line of every key and header of a valid TOML document, by path.
 
-    Values in brackets have the line of the key before them.
+    Values inside brackets get the line of their key.
     """
     text += "\n"
     lines: dict[tuple[str | int, ...], int] = {}
@@ -205,7 +205,7 @@ def find_lines(text: str) -> dict[tuple[str | int, ...], int]:
             for key in keys:
                 table = (*table, counts[table]) if table in counts else table
                 table = (*table, key)
-            if isinstance(below, list):  # [[one of several]]
+            if isinstance(below, list):  # [[table in a list]]
                 counts[table] = counts.get(table, -1) + 1
                 lines.setdefault(table, line)
                 table = (*table, counts[table])

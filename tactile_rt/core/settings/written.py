@@ -1,4 +1,4 @@
-"""Settings that are text alone: ``--set key=value``, a URL's options, the rows of a CSV file."""
+"""Settings that are text only: ``--set key=value``, a URL's options, the rows of a CSV file."""
 
 import csv
 import re
@@ -21,22 +21,22 @@ from tactile_rt.core.settings.structs import (
 from tactile_rt.core.settings.tree import SettingNode, make_node, named, plain_value, read_text
 
 LONGEST_URL = 4096  # characters
-NAMES = ("name", "kind")  # keys that an item of a list goes by
+NAMES = ("name", "kind")  # keys whose value identifies an item of a list
 
 
 # --set
 
 
 def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
-    """A tree in which one key is otherwise.
+    """Set one key of a tree, which is returned.
 
     Args:
-        nodes: the tree; it is changed.
-        text: ``a.b=value``, of which ``source.NAME.url=...`` or ``source.0.url=...`` names an item
-            of a list. The value is TOML, or text that need not be quoted.
+        nodes: the tree; it is changed in place.
+        text: ``a.b=value``; ``source.NAME.url=...`` or ``source.0.url=...`` selects an item of a
+            list. The value is TOML, or text that need not be quoted.
 
     Raises:
-        ConfigError: not of that form, or no such item.
+        ConfigError: the text has another form, or no such item exists.
     """
     key, equals, written = text.partition("=")
     origin = f"--set {text}"
@@ -48,7 +48,7 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
     for i, step in enumerate(steps):
         last = i == len(steps) - 1
         if isinstance(at.value, list):
-            place = _item(at, step, origin, named(path))
+            place = _find_item(at, step, origin, named(path))
             path.append(place)
             if last:
                 raise ConfigError(f"{origin}: {named(path)} is a table: say which key of it")
@@ -71,12 +71,12 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
 def set_keys(
     nodes: SettingNode, sets: Sequence[str], kind: Any, known: Sequence[str] | None = None
 ) -> SettingNode:
-    """A tree in which some keys are otherwise, each as `set_key` has it.
+    """Set several keys of a tree, which is returned; see `set_key`.
 
     Args:
-        nodes: the tree; it is changed.
-        sets: ``a.b=value`` each; of the same key twice the last holds.
-        known: its keys that may be set; None: all.
+        nodes: the tree; it is changed in place.
+        sets: ``a.b=value`` each; the last value of a repeated key is used.
+        known: the keys that may be set; None: all.
     """
     known = list(types_of(kind)) if known is None else known
     for text in sets:
@@ -93,10 +93,10 @@ def set_keys(
 def take_sets(
     what: str, sets: Sequence[str], *kinds: type[Any], usual: Mapping[str, Any] | None = None
 ) -> tuple[Any, ...]:
-    """Settings of a command shared out among dataclasses: each takes those that it knows.
+    """Distribute settings of a command to dataclasses, each of which takes its own keys.
 
     Args:
-        usual: values where nothing is set, beside the dataclasses' own.
+        usual: default values, which take precedence over those of the dataclasses.
     """
     known = {name: kind for kind in kinds for name in types_of(kind)}
     made = []
@@ -108,8 +108,8 @@ def take_sets(
     return tuple(made)
 
 
-def _item(node: SettingNode, step: str, origin: str, where: str) -> int:
-    """Which item of a list is meant: by its name, or by its number from 0."""
+def _find_item(node: SettingNode, step: str, origin: str, where: str) -> int:
+    """Find the index of an item in a list, by its name or index."""
     tables = [n.value if isinstance(n.value, dict) else {} for n in node.value]
     names = [[t[key].value for key in NAMES if key in t] for t in tables]
     for i, known in enumerate(names):
@@ -125,13 +125,13 @@ def _item(node: SettingNode, step: str, origin: str, where: str) -> int:
 
 
 def split_url(url: str) -> tuple[str, str, dict[str, str]]:
-    """Take ``scheme:target?option=value&option=value`` apart.
+    """Split a URL, ``scheme:target?option=value&option=value``.
 
     Returns:
-        Scheme (empty: there is none), target, and the options as written.
+        Scheme (empty: none), target, and the options as written.
 
     Raises:
-        ConfigError: it holds what cannot be printed, is too long, is no URL, or gives an option
+        ConfigError: the text has unprintable characters, is too long, is no URL, or gives an option
             twice.
     """
     if not url.isprintable():
@@ -142,7 +142,7 @@ def split_url(url: str) -> tuple[str, str, dict[str, str]]:
         parts = urlsplit(url, allow_fragments=False)  # a file's name may hold a #
     except ValueError as error:
         raise ConfigError(f"{url!r}: {error}") from None
-    # A + is a +, as in a file's name, not the space that web forms make of it.
+    # A + stays a +, as in a file's name, unlike in web forms, where it is a space.
     pairs = parse_qsl(parts.query.replace("+", "%2B"), keep_blank_values=True)
     fields: dict[str, str] = {}
     for name, value in pairs:
@@ -153,13 +153,13 @@ def split_url(url: str) -> tuple[str, str, dict[str, str]]:
 
 
 def take_options(what: str, fields: Mapping[str, str], *kinds: type[Any]) -> tuple[Any, ...]:
-    """The options shared out among dataclasses: each takes those that it knows.
+    """Distribute options of a URL to dataclasses, each of which takes its own keys.
 
     Args:
         fields: as written; numbers may be hexadecimal, as CAN identifiers are.
 
     Raises:
-        ConfigError: an option that none knows, or ill-typed.
+        ConfigError: an option is unknown, or has the wrong type.
     """
     known = list(dict.fromkeys(name for kind in kinds for name in types_of(kind)))
     for name in fields:
@@ -167,13 +167,13 @@ def take_options(what: str, fields: Mapping[str, str], *kinds: type[Any]) -> tup
             raise ConfigError(f"{what} has no option {name!r}; {hint(name, known)}")
     made = []
     for kind in kinds:
-        mine = {k: _decimal(v) for k, v in fields.items() if k in types_of(kind)}
+        mine = {k: _convert_hexadecimal(v) for k, v in fields.items() if k in types_of(kind)}
         made.append(convert(make_node(mine, what, 0, Path()), kind, lax=True))
     return tuple(made)
 
 
-def _decimal(value: str) -> str:
-    """A hexadecimal number in decimal; of more than 64 bits there is none."""
+def _convert_hexadecimal(value: str) -> str:
+    """Convert a hexadecimal number of at most 64 bits to decimal; keep other text."""
     return str(int(value, 16)) if re.fullmatch(r"0[xX][0-9a-fA-F]{1,16}", value) else value
 
 
@@ -182,7 +182,7 @@ def _decimal(value: str) -> str:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """A CSV file as read."""
+    """Contents of a CSV file."""
 
     where: str
     columns: tuple[str, ...]
@@ -190,14 +190,14 @@ class CsvTable:
 
 
 def read_csv(path: Path) -> CsvTable:
-    """Read a CSV file whose first line names the columns; lines that begin with # are remarks.
+    """Read a CSV file whose first line names the columns. Lines that begin with # are remarks.
 
     Raises:
-        ConfigError: it cannot be read, has no line, a column twice, or a row of another length;
-            names file and line.
+        ConfigError: the file cannot be read, is empty, or has a column twice or a row of another
+            length; names file and line.
     """
     lines = [
-        (number, _cells(line, f"{path}:{number}"))
+        (number, _split_cells(line, f"{path}:{number}"))
         for number, line in enumerate(read_text(path).splitlines(), start=1)
         if line.strip(" ,") and not line.startswith("#")  # spreadsheets keep empty rows as commas
     ]
@@ -219,15 +219,15 @@ def read_csv(path: Path) -> CsvTable:
     return CsvTable(where, tuple(columns), tuple(rows))
 
 
-def _cells(line: str, where: str) -> list[str]:
+def _split_cells(line: str, where: str) -> list[str]:
     try:
         return [cell.strip() for cell in next(csv.reader([line]))]
-    except csv.Error as error:  # a cell that is too long for one
+    except csv.Error as error:  # a cell is too long
         raise ConfigError(f"{where}: {error}") from None
 
 
 def check_columns(table: CsvTable, known: Sequence[str], needed: Sequence[str] = ()) -> None:
-    """Refuse a column that is not known, and the lack of one that is needed."""
+    """Refuse unknown columns, and the lack of a needed one."""
     for column in table.columns:
         if column not in known:
             raise ConfigError(f"{table.where}: no column {shown(column)}; {hint(column, known)}")

@@ -1,4 +1,4 @@
-"""The types that move through the program: few, frozen, SI.
+"""Types that move through the program: few, frozen, in SI units.
 
     Source --read()--> Chunk --push()--> Classifier --> Classification
 
@@ -36,7 +36,7 @@ __all__ = [
 
 NS_PER_S = 1_000_000_000
 SPEC_VERSION = 1
-POSE_TOLERANCE = 1e-6  # m and quaternion units: below what anyone can mount or measure
+POSE_TOLERANCE = 1e-6  # m and quaternion units: below what can be mounted or measured
 
 
 class EndOfStream(Exception):
@@ -45,7 +45,7 @@ class EndOfStream(Exception):
 
 @dataclass(frozen=True)
 class ArraySpec:
-    """What a sensor array is. Hashable; travels inside recordings and models.
+    """Description of a sensor array. Hashable; stored in recordings and models.
 
     Attributes:
         elements: The names of the elements, whiskers or taxels, in the order of every sample.
@@ -103,11 +103,11 @@ class ArraySpec:
         cls, name: str, rate_hz: float, channels: Mapping[str, str], frame: str = "sensor",
         elements: Mapping[str, tuple[int, int]] = MappingProxyType({"sensor": (0, 0)}),
     ) -> "ArraySpec":  # fmt: skip
-        """Describe an array whose elements are all at the frame's origin, as far as is known.
+        """Describe an array of unknown geometry, with all elements at the frame's origin.
 
         Args:
-            channels: the SI unit of each.
-            elements: the place of each on the grid, (row, column).
+            channels: the SI unit of each channel.
+            elements: the place (row, column) of each element on the grid.
         """
         n = len(elements)
         return cls(
@@ -127,7 +127,7 @@ class ArraySpec:
         return max(rows) + 1, max(columns) + 1
 
     def differences(self, other: "ArraySpec", ignore: tuple[str, ...] = ()) -> list[str]:
-        """Say where `other` differs from this spec, one phrase each; [] when they match.
+        """List where `other` differs from this spec, one phrase each; [] when they match.
 
         Args:
             ignore: attribute names not to compare (a model ignores ``name`` and ``rate_hz``).
@@ -138,7 +138,7 @@ class ArraySpec:
             if what in ignore or mine == theirs:
                 continue
             if what == "units" and len(mine) != len(theirs):
-                continue  # which the channels tell
+                continue  # reported for the channels
             if isinstance(mine, tuple) and len(mine) == len(theirs):
                 pose = what in ("positions", "orientations")
                 for at, (a, b) in enumerate(zip(mine, theirs, strict=True)):
@@ -154,7 +154,7 @@ class ArraySpec:
         return found
 
     def to_json(self) -> str:
-        """One line of JSON with a schema version, for recordings and model metadata."""
+        """Write one line of JSON with a schema version, for recordings and models."""
         return msgspec.json.encode({"version": SPEC_VERSION, **msgspec.to_builtins(self)}).decode()
 
     @classmethod
@@ -178,7 +178,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class Chunk:
-    """n >= 1 consecutive samples: the only payload that moves through the program.
+    """Payload of n >= 1 consecutive samples, the only one in the program.
 
     Attributes:
         seq: (n,) int64 sequence number of each sample; a gap means lost samples.
@@ -241,9 +241,9 @@ class SourceStats:
     duplicates: int = 0
 
 
-@dataclass(eq=False)  # two streams of one array are two things, and can be told apart in a set
+@dataclass(eq=False)  # compared by identity: two streams of one array are distinct in a set
 class Source(abc.ABC):
-    """Where samples come from. Implementations give `spec`, `read` and `close`.
+    """Source of samples. Implementations provide `spec`, `read` and `close`.
 
     A source is its own context manager and iterates over its chunks until it ends.
 
@@ -277,9 +277,9 @@ class Source(abc.ABC):
         """Release the device; safe to call twice. Reading afterwards raises `EndOfStream`."""
 
     def fileno(self) -> int:
-        """A descriptor to wait for with `select` and its like: once it is readable, `read` with a
-        timeout of 0 takes what has come. It changes when a line is lost and opened again; -1: there
-        is none now, or never."""
+        """Return a file descriptor for `select` and the like; -1: none at present, or never. Once
+        it is readable, `read` with a timeout of 0 takes the samples that have come. It changes when
+        a line is lost and opened again."""
         return -1
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -298,24 +298,24 @@ class Source(abc.ABC):
         self.close()
 
 
-STEPS, STEP_MS = 22, 45.0  # of a window (Chung et al. 2025)
+STEPS, STEP_MS = 22, 45.0  # steps of a window, and length of a step (Chung et al. 2025)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Steps of a window, with a decision after each, of `substeps` samples."""
+    """Timing of a window: its steps, each of `substeps` samples and followed by a decision."""
 
     steps: int = STEPS
     substeps: int = 5
 
     @classmethod
     def of(cls, period_ns: int) -> "Timing":
-        """Return steps as near to 45 ms as whole samples of this period come."""
+        """Return a timing with steps as near to 45 ms as whole samples allow."""
         return cls(substeps=max(1, round(STEP_MS * 1e6 / period_ns)))
 
     @property
     def samples(self) -> int:
-        """The number of samples of a window."""
+        """Number of samples of a window."""
         return self.steps * self.substeps
 
 
@@ -323,14 +323,14 @@ MOUSE = Timing()  # 22 steps of five 9 ms samples
 
 
 def quaternion_product(p: ArrayLike, q: ArrayLike) -> NDArray[np.float64]:
-    """Hamilton's product of two quaternions (w, x, y, z)."""
+    """Return the Hamilton product of two quaternions (w, x, y, z)."""
     w, x, y, z = np.asarray(p, dtype=np.float64)
     rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return np.asarray(np.array(rows) @ np.asarray(q, dtype=np.float64))
 
 
 def rotation_matrices(quaternions: ArrayLike) -> NDArray[np.float64]:
-    """Turn unit quaternions (..., 4), w first, into rotation matrices (..., 3, 3)."""
+    """Convert unit quaternions (..., 4), w first, to rotation matrices (..., 3, 3)."""
     q = np.asarray(quaternions, dtype=np.float64)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [

@@ -1,8 +1,8 @@
-"""What a sensor makes of a whisker, as its data sheet says: channels, rate, noise, limits.
+"""Description of a sensor by its data sheet: channels, rate, noise, limits.
 
-An array's file describes it (`sim_backend.arrays.files`), the simulation reads as it does, and it
-travels in sweep sets and models. What a network may believe of a channel follows from it: how
-noisy it is, what is silence, what is beyond its range (`ChannelLimits`).
+An array's file contains it (`sim_backend.arrays.files`), the simulation reproduces the sensor, and
+sweep sets and models store it. The limits within which a network trusts a channel follow from it:
+noise, silence, range (`ChannelLimits`).
 """
 
 import math
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream import NS_PER_S, ArraySpec
 
-# What a sensor can be sensitive to: the base loads, N and N m, and by how much the base of a
-# whisker whose mount gives is turned about the element's y and z, rad.
+# Quantities that a sensor can measure: the base loads, N and N m, and the rotation of the base of a
+# compliantly mounted whisker about the element's y and z, rad.
 LOADS = {
     **dict.fromkeys(("fx", "fy", "fz"), "N"),
     **dict.fromkeys(("mx", "my", "mz"), "N m"),
@@ -26,27 +26,27 @@ LOADS = {
 FIELD = ("x", "y", "z")
 Point = tuple[float, float, float]
 
-# Of arrays that say nothing of their sensor, as a mouse's: noise per sample of the network, one
-# standard deviation; the largest load that is believed; the smallest scale of the logarithm, three
-# times that noise; and the least that the contact detector takes for noise, for sources without
-# any. All SI.
+# For arrays without a description of their sensor, as a mouse's: noise per sample of the network,
+# one standard deviation; the largest trusted load; the smallest scale of the logarithm, three
+# times that noise; and the smallest noise that the contact detector assumes, for sources without
+# noise. All SI.
 RATED_NOISE = {"N": 10e-6, "N m": 5e-8}
 CLIP = {"N": 5e-3, "N m": 5e-6}
 SCALE = {"N": 3e-5, "N m": 1.5e-7}
 CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
-SILENT = 0.2  # that least, of the noise of a sensor that is described
-# Of the drift: an offset that has wandered for 10 s since the baseline (by 0.6 of its spread, if it
-# forgets in a minute) is then no contact that never ends, also of the worst of dozens.
+SILENT = 0.2  # smallest noise assumed by the detector, in parts of a described sensor's noise
+# Likewise in parts of the drift: an offset that has wandered for 10 s since the baseline (by 0.6 of
+# its spread, if it forgets in a minute) is then no endless contact, also for the worst of dozens.
 WANDERED = 1.5
 ROUNDING = 1 / math.sqrt(12)  # standard deviation of a rounding error, in steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSpec:
-    """One channel of every whisker.
+    """Channel of every whisker of an array.
 
-    It reads the sum of loads, each times its sensitivity, or one component of a magnet's field; a
-    channel that is called as a load and has its unit reads that load.
+    It reads the sum of loads, each times its sensitivity, or one component of a magnet's field. A
+    channel with the name and unit of a load reads that load by default.
 
     Attributes:
         name: The name of the channel, e.g. ``my``, ``bx`` or ``bridge_1``.
@@ -57,13 +57,13 @@ class ChannelSpec:
         range: The largest reading of either sign, where it saturates.
         noise_density: The white noise: the square root of its one-sided spectral density, in the
             unit per root of a hertz.
-        resolution: The step that readings are rounded to; 0: none.
-        offset: The offset that is left after the device's own tare: one standard deviation.
+        resolution: The step to which readings are rounded; 0: none.
+        offset: The offset that remains after the device's own tare: one standard deviation.
         drift: The wandering offset: its standard deviation at any one time.
 
     Raises:
-        ConfigError: nothing says what it reads, or two things do; an unknown load or component; a
-            negative number, no range, or neither noise nor resolution.
+        ConfigError: the measured quantity is not given, or given twice; an unknown load or
+            component; a negative number, no range, or neither noise nor resolution.
     """
 
     name: str
@@ -107,27 +107,27 @@ class ChannelSpec:
 
     @property
     def sensitivity(self) -> NDArray[np.float64]:
-        """(load,) reading per N, N m and rad, in the order of `LOADS`."""
+        """Reading per N, N m and rad, (load,), in the order of `LOADS`."""
         of = self.of or ({} if self.field else {self.name: 1.0})
         return np.array([of.get(load, 0.0) for load in LOADS])
 
 
 @dataclass(frozen=True, kw_only=True)
 class MagnetSpec:
-    """A magnet on a whisker whose mount gives, and the magnetometer that it turns above.
+    """Magnet on a compliantly mounted whisker, and the magnetometer below it.
 
     Both are points in the element's frame at rest, mm from the base point, about which the magnet
-    turns with the whisker. The field is a dipole's.
+    turns with the whisker. The field is that of a dipole.
 
     Attributes:
         moment_a_m2: The magnetic moment, A m^2: remanence times volume over the vacuum's
             permeability, 1.25 T x 0.79 mm^3 -> 7.8e-4.
-        position_mm: The magnet's place at rest.
-        sensor_mm: The place in which the field is measured.
+        position_mm: The magnet's position at rest.
+        sensor_mm: The position at which the field is measured.
 
     Raises:
         ConfigError: no moment, no direction, a number that is not finite, or the magnet and its
-            sensor in one place.
+            sensor at one position.
     """
 
     moment_a_m2: float
@@ -147,20 +147,20 @@ class MagnetSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSpec:
-    """The sensor of every whisker of an array.
+    """Sensor of every whisker of an array.
 
     Attributes:
         rate_hz: The sample rate of the device, Hz.
-        bandwidth_hz: The corner frequency of its first-order low-pass, Hz; 0: it has none.
+        bandwidth_hz: The corner frequency of its first-order low-pass, Hz; 0: no low-pass.
         latency_ms: The time from a sample to its receipt by the host, ms.
-        magnet: The magnet of every whisker; None: it has none.
+        magnet: The magnet of every whisker; None: no magnet.
         matrix: The calibrated sensitivities of single whiskers, by name: a row for each channel, a
-            column for each of `LOADS` (the two turns may be left out); it takes the place of what
-            the channels say.
+            column for each of `LOADS` (the two turns may be left out); they replace those of the
+            channels.
 
     Raises:
-        ConfigError: no channels, two of one name, a rate that is not positive, a negative number, a
-            field without a magnet, or a matrix of another shape.
+        ConfigError: no channels, two with one name, a rate that is not positive, a negative number,
+            a field without a magnet, or a matrix of another shape.
     """
 
     channels: tuple[ChannelSpec, ...]
@@ -204,38 +204,38 @@ class SensorSpec:
 
     @property
     def feels_turns(self) -> bool:
-        """Whether anything of it depends on how far the bases are turned."""
+        """True if any reading depends on the rotation of the whiskers' bases."""
         rows = [self.sensitivity(name) for name in ("", *self.matrix)]
         return self.magnet is not None or any(row[:, 6:].any() for row in rows)
 
     @property
     def noise_bandwidth_hz(self) -> float:
-        """The width of the spectrum of white noise that is in a sample, Hz."""
+        """Noise bandwidth of a sample, Hz: the spectral width of white noise in it."""
         passed = self.rate_hz / 2
-        # what a first-order low-pass lets through
+        # equivalent noise bandwidth of a first-order low-pass
         return min(passed, self.bandwidth_hz * math.pi / 2) if self.bandwidth_hz else passed
 
     def sensitivity(self, whisker: str) -> NDArray[np.float64]:
-        """(channel, load) reading per N, N m and rad of a whisker, in the order of `LOADS`."""
+        """Return (channel, load) a whisker's reading per N, N m and rad, ordered as `LOADS`."""
         if whisker in self.matrix:
             rows = np.array(self.matrix[whisker])
             return np.pad(rows, ((0, 0), (0, len(LOADS) - rows.shape[1])))
         return np.array([channel.sensitivity for channel in self.channels])
 
     def noise(self) -> NDArray[np.float64]:
-        """(channel,) standard deviation of the white noise of one of the device's samples."""
+        """Return (channel,) the standard deviation of the white noise of a device's sample."""
         density = np.array([c.noise_density for c in self.channels])
         return density * math.sqrt(self.noise_bandwidth_hz)
 
 
 class ChannelLimits(NamedTuple):
-    """What a network may believe of an array's channels: (channel,) each, SI.
+    """Limits within which a network trusts an array's channels: (channel,) each, SI.
 
     Attributes:
         noise: The rated noise per sample of the network, one standard deviation.
         floor: The smallest noise that the contact detector assumes.
-        clip: The largest magnitude that is believed.
-        scale: The smallest scale of the logarithm that loads are compressed with.
+        clip: The largest trusted magnitude.
+        scale: The smallest scale of the logarithm that compresses loads.
     """
 
     noise: NDArray[np.float32]
@@ -247,22 +247,22 @@ class ChannelLimits(NamedTuple):
 def channel_limits(
     spec: ArraySpec, sensor: SensorSpec | None = None, period_ns: int = 0
 ) -> ChannelLimits:
-    """What a network may believe of each channel.
+    """Return the limits within which a network trusts each channel.
 
     Args:
-        sensor: what it is read by; None: by one that is as quiet as a mouse's whiskers need.
-        period_ns: of the network's samples; the noise of a sensor that samples faster is averaged
-            by the resampler.
+        sensor: the array's sensor; None: a sensor that is as quiet as a mouse's whiskers need.
+        period_ns: period of the network's samples; the noise of a sensor that samples faster is
+            averaged by the resampler.
 
     Raises:
         ConfigError: no sensor, and a channel is neither a force nor a moment.
     """
     if sensor is not None:
         rounding = np.array([c.resolution for c in sensor.channels]) * ROUNDING
-        noise = np.hypot(sensor.noise(), rounding) * _averaged(sensor.rate_hz, period_ns)
+        noise = np.hypot(sensor.noise(), rounding) * _noise_factor(sensor.rate_hz, period_ns)
         clip = np.array([c.range for c in sensor.channels])
         drift = np.array([c.drift for c in sensor.channels])
-        # Below its step a sensor at rest reads the same for ever, and is not as quiet as that.
+        # Within a rounding step a resting sensor reads a constant; its true noise is not 0.
         floor = np.maximum(np.maximum(SILENT * noise, rounding), WANDERED * drift)
         return ChannelLimits(*(a.astype(np.float32) for a in (noise, floor, clip, 2 * noise)))
     if unknown := sorted(set(spec.units) - set(RATED_NOISE)):
@@ -277,9 +277,9 @@ def channel_limits(
     return ChannelLimits(of(RATED_NOISE), of(CHANNEL_FLOOR), of(CLIP), of(SCALE))
 
 
-def _averaged(rate_hz: float, period_ns: int) -> float:
-    """What the resampler leaves of white noise: see `classifier.resampler.Resampler`."""
-    reach = max(period_ns / NS_PER_S * rate_hz, 1.0)  # of the kernel either side, in samples
+def _noise_factor(rate_hz: float, period_ns: int) -> float:
+    """Return the factor by which `classifier.resampler.Resampler` reduces white noise."""
+    reach = max(period_ns / NS_PER_S * rate_hz, 1.0)  # half width of the kernel, in samples
     apart: Iterable[float] = np.arange(-math.ceil(reach) + 1, math.ceil(reach))
     weights = 1 + np.cos(np.pi * np.asarray(apart) / reach)
     return float(np.sqrt(np.square(weights).sum()) / weights.sum())

@@ -1,4 +1,4 @@
-"""The six stimuli of the barrel-cortex recordings (Rodgers 2022): an axis that rooms share."""
+"""Names of the six stimuli of the barrel-cortex recordings (Rodgers 2022)."""
 
 SHAPES = ("convex", "concave")
 DISTANCES = ("close", "medium", "far")

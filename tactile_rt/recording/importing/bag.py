@@ -1,8 +1,8 @@
 """Topics of ROS 1 and ROS 2 bags, by the library rosbags, without ROS.
 
-A message is a row, its fields are columns by their paths (``wrench.force.x``, ``data.3``). Messages
-of known types need no more: wrenches, arrays of numbers, magnetic fields and the like, and our own.
-The time is that of the header, where there is one that is set, else that of the bag.
+A message is a row, its fields are columns by their paths (``wrench.force.x``, ``data.3``). The
+columns of known types are built in: wrenches, arrays of numbers, magnetic fields and the like, and
+our own. The time is that of the message's header if it is set, else that of the bag.
 """
 
 import re
@@ -37,9 +37,9 @@ from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2_form import ARRAY
 
-LOOKED_AT: Final = 1 << 28  # bytes of a topic, before it is known which one is wanted
-MOST: Final = 4096  # fields of a message that are columns
-# What messages are of: columns by the end of the type's name, with {} for the frame's name.
+LOOKED_AT: Final = 1 << 28  # bytes of each topic that are read to choose one
+MOST: Final = 4096  # fields of a message that become columns
+# Columns by message type, with {0} for the name of the frame.
 KNOWN: Final = {
     "geometry_msgs/msg/WrenchStamped": "wrench.force.x={0}.fx:N,wrench.force.y={0}.fy:N,"
     "wrench.force.z={0}.fz:N,wrench.torque.x={0}.mx:Nm,wrench.torque.y={0}.my:Nm,"
@@ -65,14 +65,14 @@ class BagTopic:
     name: str
     type: str
     messages: int
-    # what each is a sample of, in the words of ``--columns``; empty where only a user can tell
+    # columns of a known type, in the words of ``--columns``; empty where only a user knows them
     columns: str
-    # columns for a user to check where only a user can tell; empty if no message holds a number
+    # columns of an unknown type for a user to check; empty if no message holds a number
     proposed: str = ""
 
 
 def bag_topics(path: Path) -> list[BagTopic]:
-    """The topics of a bag that hold messages."""
+    """List the topics of a bag that have messages."""
     found = []
     with open_bag(path) as bag:
         for name, about in sorted(bag.reader.topics.items()):
@@ -82,7 +82,7 @@ def bag_topics(path: Path) -> list[BagTopic]:
 
 
 def is_recording(path: Path) -> bool:
-    """Tell whether an MCAP file is a recording of ours."""
+    """Return whether an MCAP file is a recording of tactile-rt."""
     try:
         return path.is_file() and path.suffix == ".mcap" and bool(Recording(path).description)
     except (RecordingError, ConfigError):
@@ -95,19 +95,19 @@ def import_bag(
     """Write a topic of a bag as a recording.
 
     Args:
-        output: the recording; it is there whole or not at all.
-        topic: its name; empty where only one can be a recording.
-        columns: which fields of a message are what, or a TOML file of it; empty for what is known
-            of the type.
+        output: the recording to write, whole or not at all.
+        topic: its name; empty: the only one that can become a recording.
+        columns: the meaning of a message's fields, in words or as a TOML file; empty: the built-in
+            columns of the type.
         rate_hz: rate of the samples, Hz; 0: by their times.
 
     Raises:
-        ConfigError: no such topic, columns that cannot be, or the extra is not installed.
+        ConfigError: no such topic, invalid columns, or the extra is not installed.
         RecordingError: the bag is damaged, or holds no sample.
     """
     if is_recording(path):
         raise ConfigError(f"{path} is a recording already: `tactile-rt replay` and run take it")
-    chosen = _chosen(path, bag_topics(path), topic, columns)
+    chosen = _choose_topic(path, bag_topics(path), topic, columns)
     with open_bag(path) as bag:
         if chosen.type == messages.SAMPLES and not columns:
             return _import_own(path, bag, chosen, output)
@@ -124,14 +124,14 @@ def import_bag(
         wanted = {c.label.strip().lower() for c in columns_read if c.label}
         steps = [_split_path(p) if p.lower() in wanted or not wanted else None for p in paths]
         table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
-        table.rows = _rows(table, bag, chosen.name, steps, channels)
+        table.rows = _read_rows(table, bag, chosen.name, steps, channels)
         made = import_table(table, output, words, rate_hz)
         made.out_of_order = bag.back
         return _count_messages(made, chosen)
 
 
 def _count_messages(made: Import, topic: BagTopic) -> Import:
-    """Count the messages that the bag's index tells, also those that were not read."""
+    """Count the messages by the bag's index, also those that were not read."""
     unread = topic.messages - made.intact - made.corrupt
     made.unit, made.total = "messages", max(topic.messages, made.intact + made.corrupt)
     made.passed_over = made.total - made.read
@@ -140,7 +140,7 @@ def _count_messages(made: Import, topic: BagTopic) -> Import:
     return made
 
 
-def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> BagTopic:
+def _choose_topic(path: Path, topics: list[BagTopic], topic: str, columns: str) -> BagTopic:
     if topic:
         for one in topics:
             if one.name in (topic, f"/{topic}"):
@@ -149,20 +149,20 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     fitting = topics if columns else [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if len(fitting) == 1:
         return fitting[0]
-    told = ", ".join(f"{t.name} ({t.type})" for t in fitting or topics) or "none"
+    listed = ", ".join(f"{t.name} ({t.type})" for t in fitting or topics) or "none"
     none = "of none is known what is what: `tactile-rt sniff` proposes --topic and --columns"
     what = "name one with --topic" if fitting else none
-    raise ConfigError(f"{path} has the topics {told}: {what}")
+    raise ConfigError(f"{path} has the topics {listed}: {what}")
 
 
-def _columns_of(kind: str, message: Any) -> str:
-    """Describe the columns of a known type; empty where only a user can tell."""
+def _known_columns(kind: str, message: Any) -> str:
+    """Return the columns of a known type; empty: only a user knows them."""
     if kind in KNOWN:
         frame = getattr(getattr(message, "header", None), "frame_id", "")
         return KNOWN[kind].format(_NO_NAME.sub("_", frame).strip("_") or "sensor")
     if not NUMBERS.fullmatch(kind) or not len(message.data):
         return ""
-    channels = _channels_of(message)
+    channels = _count_channels(message)
     names = ["value"] if channels == 1 else [f"c{k}" for k in range(channels)]
     n = len(message.data) // channels
     return compress_columns(
@@ -170,8 +170,8 @@ def _columns_of(kind: str, message: Any) -> str:
     )
 
 
-def _channels_of(message: Any) -> int:
-    """Return the number of channels of an array by its layout; 0 if empty."""
+def _count_channels(message: Any) -> int:
+    """Count the channels of an array message by its layout; 0 if it is empty."""
     sizes, n = [d.size for d in message.layout.dim], len(message.data)
     fits = len(sizes) > 1 and int(np.prod(sizes)) == n
     return min(n, sizes[-1] if fits else 1)
@@ -180,8 +180,8 @@ def _channels_of(message: Any) -> int:
 def _describe(
     bag: OpenBag, name: str, kind: str, n: int, most: float = np.inf
 ) -> tuple[BagTopic, list[str], int]:
-    """Describe a topic, with the paths of its numbers and the channels of arrays."""
-    if kind in KNOWN:  # of one size
+    """Describe a topic; return the paths of its numbers and the channels of arrays, too."""
+    if kind in KNOWN:  # all messages have one size
         whole = (message for _, _, message in bag.messages(name) if message is not None)
         found = list(islice(whole, 1))
     else:
@@ -194,10 +194,10 @@ def _describe(
         for steps in [_split_path(leaf)]
     }
     listed = sorted(paths, key=paths.__getitem__)
-    columns = _columns_of(kind, found[0]) if found else ""
-    few = not columns and len(listed) < MOST  # no picture
+    columns = _known_columns(kind, found[0]) if found else ""
+    few = not columns and len(listed) < MOST  # a message with more numbers is a picture
     proposed = "" if not few else propose_fields([p for p in listed if not p.startswith(BESIDE)])
-    channels = _channels_of(found[0]) if found and NUMBERS.fullmatch(kind) else 0
+    channels = _count_channels(found[0]) if found and NUMBERS.fullmatch(kind) else 0
     return BagTopic(name, kind, n, columns, proposed), listed, channels
 
 
@@ -217,20 +217,20 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
         yield at
 
 
-def _rows(
+def _read_rows(
     table: Table, bag: OpenBag, topic: str, steps: list[list[int | str] | None], channels: int
 ) -> Iterator[Sequence[Any]]:
-    """Read the rows of a topic; note messages that lack numbers or have other channels."""
+    """Yield the rows of a topic; note messages that lack numbers or have other channels."""
     times = table.times_ns
     assert times is not None
     fewer, other = Occurrences("message"), Occurrences("message")
     bag.back = 0
     for number, (t_ns, _, message) in enumerate(bag.messages(topic), 1):
         before = times[-1:]
-        times[:] = [_stamp(message) or t_ns]
+        times[:] = [_header_ns(message) or t_ns]
         bag.back += before > times
-        row, missing = _row(message, steps) if message is not None else ([], 0)
-        if row and channels > 1 and _channels_of(message) not in (0, 1, channels):
+        row, missing = _read_row(message, steps) if message is not None else ([], 0)
+        if row and channels > 1 and _count_channels(message) not in (0, 1, channels):
             other.add(number)
             row = []
         elif missing:
@@ -242,11 +242,11 @@ def _rows(
         bag.notes.append(f"messages that lack some of the numbers, which are invalid: {fewer}")
 
 
-def _row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], int]:
+def _read_row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], int]:
     """Take the numbers of a message, NaN for one that it lacks, and count those.
 
     Args:
-        steps: path of each number; None for one that is not wanted.
+        steps: path of each number; None: the number is left out, as NaN.
     """
     row, missing = [], 0
     for path in steps:
@@ -260,16 +260,16 @@ def _row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], 
     return row, missing
 
 
-def _stamp(message: Any) -> int:
-    """Return the time of the message's header, ns; 0 if it has none, or it is not set."""
+def _header_ns(message: Any) -> int:
+    """Return the time in a message's header, ns; 0 if missing or not set."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec) if stamp else 0
 
 
 def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
-    """Write samples of ours, in a bag of others, bit for bit."""
+    """Write our own samples from a bag as a recording, bit for bit."""
     account = Import(notes=bag.notes)
-    told = _find_array(bag, topic.name)
+    array = _find_array(bag, topic.name)
     chunks: list[Chunk] = []
     read = offset = 0
     for t_ns, raw, message in bag.messages(topic.name):
@@ -277,15 +277,15 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
         if message is None:
             continue
         shape = int(message.elements), int(message.channels)
-        if told is not None and shape != told.shape:
+        if array is not None and shape != array.shape:
             raise ConfigError(
-                f"{path}: its array is of {told.shape[0]} x {told.shape[1]}, "
+                f"{path}: its array is of {array.shape[0]} x {array.shape[1]}, "
                 f"{topic.name} of {shape[0]} x {shape[1]}"
             )
         with suppress(ValueError):
             chunk = decode_samples(messages.unstamped(raw), shape)
             if not chunks:
-                offset = (_stamp(message) or t_ns) - int(chunk.t_ns[-1])
+                offset = (_header_ns(message) or t_ns) - int(chunk.t_ns[-1])
             if not chunks or chunk.values.shape[1:] == chunks[0].values.shape[1:]:
                 chunks.append(chunk)
     account.intact, account.corrupt = len(chunks), read - len(chunks)
@@ -293,7 +293,7 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
         raise RecordingError(f"{path}: no message of {topic.name} is whole")
     whole = concatenate(chunks)
     account.missing = int((np.diff(whole.seq) - 1).clip(0).sum())
-    spec = told or _name_array(path.stem, whole)
+    spec = array or _make_array(path.stem, whole)
     zero = max(0, offset if offset >= 0 else clock_of(int(whole.t_ns[0])))
     about = Description(
         spec, zero, f"{path.name}:{topic.name}",
@@ -303,7 +303,7 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
 
 
 def _find_array(bag: OpenBag, samples: str) -> ArraySpec | None:
-    """Find what the bag says of the array of a topic of samples."""
+    """Read the array of a topic of samples from the topic beside it; None: missing."""
     beside = f"{samples.rpartition('/')[0]}/{ARRAY}"
     if beside not in bag.reader.topics or bag.reader.topics[beside].msgtype != messages.ARRAY:
         return None
@@ -313,8 +313,8 @@ def _find_array(bag: OpenBag, samples: str) -> ArraySpec | None:
     return None
 
 
-def _name_array(name: str, chunk: Chunk) -> ArraySpec:
-    """Describe an array of which only its shape and rate are known."""
+def _make_array(name: str, chunk: Chunk) -> ArraySpec:
+    """Make the spec of an array of which only shape and rate are known."""
     _, elements, channels = chunk.values.shape
     steps = np.diff(chunk.t_ns)
     rate = NS_PER_S / float(np.median(steps)) if len(steps) else 1.0

@@ -1,7 +1,7 @@
-"""Files and folders of ROS bags, opened by the library rosbags, also when they are damaged.
+"""Files and folders of ROS bags, opened by the library rosbags, also if they are damaged.
 
-An MCAP file that has lost its end has no index, which every library reads first. Its records are
-still there one after the other, also those of a chunk that is cut short.
+An MCAP file that has lost its end lacks the index, which every library reads first. Its records
+are still there one after the other, also those of a chunk that is cut short.
 """
 
 import struct
@@ -21,14 +21,14 @@ from tactile_rt.recording.records import MAGIC
 
 SQLITE: Final = b"SQLite format 3\0"
 ROS1: Final = b"#ROSBAG V2.0\n"
-SIZES: Final = 64  # of messages of one topic that are looked at, the largest
-LARGEST: Final = 1 << 30  # bytes of a record, and of what a chunk unpacks to
+SIZES: Final = 64  # most message sizes of a topic that are sampled, the largest ones
+LARGEST: Final = 1 << 30  # bytes of a record, and of an unpacked chunk
 MESSAGE, CHUNK, DATA_END, FOOTER = 5, 6, 15, 2
 TIMES_AND_SUM: Final = 8 + 8 + 8 + 4  # bytes of a chunk before the name of its compression
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether this is a bag of ROS, or an MCAP file."""
+    """Return whether this is a ROS bag, or an MCAP file."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     with open_regular(path) as file:
@@ -40,14 +40,14 @@ def is_bag(path: Path) -> bool:
 
 @dataclass
 class OpenBag:
-    """A bag that is open."""
+    """An open bag."""
 
     reader: Any
     notes: list[str] = field(default_factory=list)
-    back: int = 0  # times that go back
+    back: int = 0  # number of times that go back
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
-        """Read (time in ns, bytes, message) of a topic; a damaged message is None."""
+        """Yield (time in ns, bytes, message) of a topic; a damaged message is None."""
         for connection, t_ns, raw in self._read_stored(topic):
             yield t_ns, bytes(raw), self._decode(connection, raw)
 
@@ -55,7 +55,7 @@ class OpenBag:
         """Read one message of each size, the largest first; see `SIZES`.
 
         Args:
-            most: number of bytes of the topic to look at.
+            most: number of bytes of the topic to read.
         """
         sizes: dict[int, tuple[Any, bytes]] = {}
         for connection, _, raw in self._read_stored(topic):
@@ -72,14 +72,14 @@ class OpenBag:
         which = [c for c in self.reader.connections if c.topic == topic]
         try:
             yield from self.reader.messages(connections=which)
-        except Exception as error:  # so it does where a chunk is damaged
+        except Exception as error:  # rosbags raises anything where a chunk is damaged
             note = f"it is damaged, and read up to there ({describe_error(error)})"
             self.notes += [note] if note not in self.notes else []
 
     def _decode(self, connection: Any, raw: bytes) -> Any:
         try:
             return self.reader.deserialize(raw, connection.msgtype)
-        except Exception:  # rosbags raises anything on bytes that are no such message
+        except Exception:  # likewise on bytes that are no such message
             return None
 
 
@@ -88,7 +88,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
     """Open a bag of ROS 1 or ROS 2.
 
     Raises:
-        RecordingError: it is damaged, or has lost its end.
+        RecordingError: the bag is damaged, or has lost its end.
     """
     with require_extra("bags need", "import"):
         from rosbags.highlevel import AnyReader
@@ -101,7 +101,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         reader = None
         try:
             reader = stack.enter_context(AnyReader([path], default_typestore=store))
-        except Exception as error:  # rosbags and what it reads by raise anything on a damaged bag
+        except Exception as error:  # rosbags and its libraries raise anything on a damaged bag
             why = describe_error(error)
             notes = [f"its end is missing or damaged ({why}): what is whole before it was read"]
             new = Path(stack.enter_context(TemporaryDirectory())) / "mended.mcap"
@@ -117,11 +117,11 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
 
 def _mend_bag(path: Path, new: Path) -> int:
-    """Copy the records that are whole, without an index; return the number of messages."""
+    """Copy the intact records without an index; return the number of messages."""
     n = 0
     with open_regular(path) as file, new.open("wb") as made:
         made.write(file.read(len(MAGIC)))
-        with suppress(Exception):  # where it is damaged: anything may be raised of such bytes
+        with suppress(Exception):  # damaged bytes may raise anything
             for opcode, data in _split_records(file):
                 made.write(struct.pack("<BQ", opcode, len(data)) + data)
                 n += opcode == MESSAGE
@@ -130,20 +130,20 @@ def _mend_bag(path: Path, new: Path) -> int:
 
 
 def _split_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Read (opcode, record) of all records before the summary, also those in chunks."""
+    """Yield (opcode, record) of all records before the summary, also those in chunks."""
     while len(head := file.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", head)
         data = file.read(min(length, LARGEST))
         if opcode == DATA_END:
             return
-        if opcode == CHUNK:  # how much it says that it holds is not what is there
+        if opcode == CHUNK:  # may hold less than it declares
             yield from _split_records(BytesIO(_unpack_chunk(data)))
         elif len(data) == length:
             yield opcode, data
 
 
 def _unpack_chunk(data: bytes) -> bytes:
-    """Unpack what is in a chunk, as far as it is there."""
+    """Unpack the data of a chunk, as far as they are present."""
     (n,) = struct.unpack_from("<I", data, TIMES_AND_SUM)
     begin = TIMES_AND_SUM + 4 + n
     kind, packed = data[TIMES_AND_SUM + 4 : begin], data[begin + 8 :]

@@ -1,4 +1,4 @@
-"""What came of an import, as a recording and in text."""
+"""Result of an import, as a recording and as a report in text."""
 
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -17,15 +17,15 @@ from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
 
 BLOCK: Final = 4096  # chunks that are measured together
-CHUNK_S: Final = 0.01  # of a chunk, as live sources have it
-FEWEST: Final = 100_000  # chunks beyond which they are longer
-UTC_FROM_NS: Final = 10**17  # a time that is larger counts from 1970
-SHOWN: Final = 8  # channels in text
+CHUNK_S: Final = 0.01  # length of a chunk, as of live sources
+FEWEST: Final = 100_000  # most chunks of that length; for more samples, chunks are longer
+UTC_FROM_NS: Final = 10**17  # larger times count from 1970
+SHOWN: Final = 8  # most channels in the text
 
 
 @dataclass
 class Import:
-    """What a file held, and what of it became samples."""
+    """Contents of an imported file: what was read, lost and left out, and the samples."""
 
     samples: int = 0
     intact: int = 0
@@ -39,14 +39,14 @@ class Import:
     total: int = 0
     read: int = 0
     passed_over: int = 0
-    out_of_order: int | None = None  # how many times go back; None where nobody counted
+    out_of_order: int | None = None  # number of times that go back; None: not counted
     first: str = ""
     last: str = ""
-    found_hz: float | None = None  # rate by the times of the file; None where it has none
-    # rate that the codec or a user says; None where only times tell it
+    found_hz: float | None = None  # rate by the times of the file; None: it has no times
+    # rate by the codec or the user; None: only the times give a rate
     said_hz: float | None = None
-    first_missing: int | None = None  # number of the sample before the first one that is missing
-    invalid: int = 0  # number of samples of which an element is invalid
+    first_missing: int | None = None  # number of the sample before the first missing one
+    invalid: int = 0  # number of samples with an invalid element
     units: dict[str, str] = field(default_factory=dict)  # SI unit of each channel
     # smallest and largest valid value of each column, SI, by ELEMENT.CHANNEL
     ranges: dict[str, tuple[float, float] | None] = field(default_factory=dict)
@@ -81,7 +81,7 @@ def measure_samples(account: Import, path: Path) -> None:
 
 
 def show_time(t_ns: int) -> str:
-    """Write a time as UTC where it counts from 1970, else in seconds."""
+    """Write a time (ns) as UTC if it counts from 1970, else in seconds."""
     if t_ns < UTC_FROM_NS:
         return f"{round(t_ns / NS_PER_S, 6):.12g} s"
     return datetime.fromtimestamp(t_ns // NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S") + (
@@ -118,7 +118,7 @@ def report_lines(report: Import) -> list[str]:
 
 
 def clock_of(first_ns: int) -> int:
-    """Return what to take off a file's times, ns: all if they count from 1970."""
+    """Return the offset to subtract from a file's times, ns. 0 unless they count from 1970."""
     return first_ns if first_ns >= UTC_FROM_NS else 0
 
 
@@ -128,8 +128,8 @@ def write_chunks(
     """Write a recording of these samples, cut as a live source would.
 
     Args:
-        output: the file to write; it is there whole or not at all.
-        account: what became of the file; samples, seconds and rate are filled in.
+        output: the file to write, whole or not at all.
+        account: result of the import; samples, seconds, rate and the like are filled in.
 
     Raises:
         RecordingError: no sample is valid.

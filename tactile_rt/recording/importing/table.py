@@ -1,15 +1,15 @@
-"""Rows of numbers as a recording: columns in words, a time or a rate, losses by a counter.
+"""Conversion of rows of numbers to a recording: columns in words, times or a rate, lost samples.
 
     time=time:s,(x{0..3}=T{0..3}.fx:mN,y{0..3}=T{0..3}.fy:mN)
 
-What a column may be is told in `ascii_mapping`; here a time may have decimals in every unit, does
-not wrap, and may be of two columns: seconds and the rest in us or ns, or a date and a time of day,
-both time:iso. Columns are found by their names or, without names, by their places.
+`ascii_mapping` describes the kinds of columns. Here a time may have decimals in every unit, does
+not wrap, and may be split into two columns: seconds and the rest in us or ns, or a date and a time
+of day, both time:iso. Columns are found by their names or, without names, by their places.
 
-Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Rows
-that changed places are sorted, and a stamp that is early or late among others that are right is
-replaced by one between its neighbours. A time that goes back for good begins another stretch, one
-period after the row before; a time of day that falls by more than half a day is of the next day.
+Times. Rows that share one time (of a coarse clock) are spread evenly up to the next time. Rows that
+are out of order are sorted, and a single time that is too early or too late among correct ones is
+interpolated. A time that goes back for good begins another stretch, one period after the row
+before; a time of day that falls by more than half a day is of the next day.
 """
 
 import re
@@ -43,45 +43,44 @@ from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.report import Import, clock_of, write_chunks
 
 NS: Final = {"s": NS_PER_S, "iso": NS_PER_S, "ms": 10**6, "us": 1000, "ns": 1}
-GAP: Final = 10  # typical steps: what is longer is no period
-BLOCK: Final = 1024  # rows that are kept as Python's numbers
-BESIDE: Final = ("header.", "layout.", "field.header.")  # of a message, besides what it tells
-NEAR: Final = 64  # rows within which a time that went back is made good for
-MADE_GOOD: Final = 0.4  # part of a step back
-EVEN: Final = (0.6, 1.5)  # periods between rows that were only sorted
-FAR: Final = 2  # rows that all move for one that does not fit
-MOST_LOOSE: Final = 1 / 3  # of the rows have wrong times
+GAP: Final = 10  # typical steps: a longer step is a pause, not a period
+BLOCK: Final = 1024  # rows that are kept as Python numbers
+BESIDE: Final = ("header.", "layout.", "field.header.")  # fields of a message that are no data
+NEAR: Final = 64  # rows within which a step forward may undo a step back of time
+MADE_GOOD: Final = 0.4  # least part of a step back that it must undo
+EVEN: Final = (0.6, 1.5)  # periods between rows that only needed sorting
+FAR: Final = 2  # rows that sorting moves per outlier; more: the outliers' times are wrong
+MOST_LOOSE: Final = 1 / 3  # largest share of rows with wrong times
 DAY_NS: Final = 86_400 * NS_PER_S
-EXACT: Final = 2.0**53  # whole numbers up to here are exact
+EXACT: Final = 2.0**53  # whole numbers up to here are exact in float64
 _ZONE: Final = re.compile(r"(?i)utc|gmt|:\d\d.*(?:z|[+-]\d\d:?\d\d)\s*$")
-SHOWN: Final = 600  # characters of the names that a message tells
+SHOWN: Final = 600  # characters of names in a message
 
 
 @dataclass
 class Table:
-    """Rows as they are read."""
+    """Table whose rows are read one after the other."""
 
     path: Path
     names: tuple[str, ...]
     # rows, each with as many cells as there are columns: texts or numbers
     rows: Iterable[Sequence[Any]]
-    # times of the rows that were read so far, ns, of a table that has times beside its columns;
-    # None for one that has not
+    # times of the rows read so far, ns, if the table has times beside its columns; else None
     times_ns: list[int] | None = None
-    # what could not be read, a sentence each; complete once all rows were read
+    # sentences on what could not be read; complete once all rows were read
     notes: list[str] = field(default_factory=list)
-    line: int = 0  # number of the line of a text that was read last
-    width: int = 0  # number of cells of every row that is whole; 0 where rows may be of any
+    line: int = 0  # number of the text line that was read last
+    width: int = 0  # number of cells of every complete row; 0: any number
 
 
 def shown_names(names: Sequence[str]) -> str:
-    """The names of columns, shortened, for a message."""
+    """List the names of columns for a message, shortened."""
     text = compress_columns([f'"{n}"' if "," in n else n for n in names])
     return text if len(text) <= SHOWN else f"{text[:SHOWN]} ..."
 
 
 def mapping_of(columns: str, name: str) -> LineMapping:
-    """What a user says of the columns: words, or a TOML file as docs/codecs/ascii_line.toml."""
+    """Return a mapping of columns from words, or a TOML file as docs/codecs/ascii_line.toml."""
     if columns.endswith(".toml"):
         return read_mapping(columns, LineMapping)
     return LineMapping(columns=(columns,), name=name)
@@ -90,10 +89,10 @@ def mapping_of(columns: str, name: str) -> LineMapping:
 def place_columns(
     columns: Sequence[Column], names: Sequence[str], where: str
 ) -> tuple[list[int], list[str]]:
-    """Where each column stands among the cells of a row, and what is told of those left out.
+    """Find the cell of each column in a row. Return a note on unused cells, too.
 
     Raises:
-        ConfigError: no column of that name, or of that place.
+        ConfigError: no column has that name or place.
     """
     labelled = [c.label for c in columns if c.label]
     if labelled and len(labelled) < len(columns):
@@ -118,19 +117,19 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     """Write rows of numbers as a recording.
 
     Args:
-        output: the recording; it is there whole or not at all.
-        columns: what is in which column: words, or the path of a TOML file.
+        output: the recording to write, whole or not at all.
+        columns: the meaning of the columns: words, or the path of a TOML file.
         rate_hz: rate of the samples, Hz; 0: by their times.
 
     Raises:
-        ConfigError: the columns cannot be, or nothing tells the time.
+        ConfigError: the columns are invalid, or neither times nor a rate are given.
     """
     parsed, spec, read, notes = read_samples(table, columns, rate_hz)
     account = Import(intact=len(read.values), corrupt=read.corrupt, notes=[*table.notes, *notes])
     values, times, count = read.values, read.times, read.count
     if times is not None:
         if any(c.kind == "iso" for c in parsed) and times.max() < DAY_NS:
-            # a wrong stamp is no midnight, so the days are counted of medians
+            # medians, so that a single wrong time does not count as midnight
             around = np.lib.stride_tricks.sliding_window_view(np.pad(times, 2, mode="edge"), 5)
             middle = np.median(around, axis=1).astype(np.int64)
             steps = np.diff(middle, prepend=middle[0])
@@ -139,7 +138,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
             times = times + DAY_NS * np.round(late / DAY_NS).astype(np.int64)
         order, times = _sort_rows(times, account)
         values, count = values[order], None if count is None else count[order]
-    seq, keep = _numbers(count, parsed, len(values), account)
+    seq, keep = _number_rows(count, parsed, len(values), account)
     values, times = values[keep], None if times is None else times[keep]
     if read.complaint and read.corrupt:
         account.notes.append(f"the first line that is no sample: {read.complaint}")
@@ -147,12 +146,12 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         t_ns, zero = np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64), 0
     else:
         zero = clock_of(int(times[0]))
-        t_ns, told = _strictly(times - zero, rate_hz, account)
-        if rate_hz and not 0.8 < told / rate_hz < 1.2:
-            account.notes.append(f"its times tell {told:.4g} Hz, not the {rate_hz:g} Hz of --rate")
-        if told > FASTEST_HZ:
-            account.notes.append(f"{told:.4g} Hz by its times is too fast: another unit of time?")
-        spec = replace(spec, rate_hz=rate_hz or told)
+        t_ns, own = _make_increasing(times - zero, rate_hz, account)
+        if rate_hz and not 0.8 < own / rate_hz < 1.2:
+            account.notes.append(f"its times tell {own:.4g} Hz, not the {rate_hz:g} Hz of --rate")
+        if own > FASTEST_HZ:
+            account.notes.append(f"{own:.4g} Hz by its times is too fast: another unit of time?")
+        spec = replace(spec, rate_hz=rate_hz or own)
     valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     session = {"imported": table.path.name, "columns": columns}
     about = Description(spec, zero, table.path.name, session=session)
@@ -166,16 +165,16 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
 def read_samples(
     table: Table, columns: str, rate_hz: float = 0.0
 ) -> tuple[tuple[Column, ...], ArraySpec, "ReadRows", list[str]]:
-    """Read the rows of a table: its columns, the array, what was read, and notes."""
+    """Read the rows of a table; return its columns, the array, the rows, and notes."""
     mapping = mapping_of(columns, table.path.stem)
     where = columns if columns.endswith(".toml") else "--columns"
     parsed = parse_columns(mapping.columns, where)
     places, notes = place_columns(parsed, table.names, where)
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
-    parts = ("us", "ns") if any(c.kind == "s" for c in parsed) else ()  # of its seconds
+    parts = ("us", "ns") if any(c.kind == "s" for c in parsed) else ()  # fractions of seconds
     dated = [c for c in parsed if c.kind == "iso"]
-    second = dated[1] if len(dated) == 2 else None  # a time of day beside its date
+    second = dated[1] if len(dated) == 2 else None  # a time of day whose date is another column
     rest = tuple(c for c in parsed if c.kind not in parts and c is not second)
     spec = array_of(mapping, rest, where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
@@ -192,14 +191,14 @@ def read_samples(
 
 @dataclass
 class ReadRows:
-    """What the rows of a table hold."""
+    """Contents of the rows of a table."""
 
     values: NDArray[np.float32]
     times: NDArray[np.int64] | None
     count: NDArray[np.int64] | None
     corrupt: int
     complaint: str
-    local: bool  # whether its times are dates of no time zone
+    local: bool  # whether the times are dates without a time zone
 
 
 def _read(
@@ -221,7 +220,7 @@ def _read(
     counts: list[int] = []
     corrupt, complaint, local = 0, "", False
 
-    def close() -> None:
+    def finish_block() -> None:
         with np.errstate(over="ignore", invalid="ignore"):
             block = np.array(rows, np.float64).reshape(len(rows), len(order)) * scale + offset
             blocks.append(block.astype(np.float32).reshape(len(rows), *spec.shape))
@@ -231,8 +230,8 @@ def _read(
         try:
             if len(cells) < least or (len(cells) > width and (table.width or table.names)):
                 raise ValueError(f"{len(cells)} columns, not {width}")
-            row = [_number(cells[k]) for k in measured]
-            each = [_time(cells[place], column, dated) for place, column in clocks]
+            row = [_parse_number(cells[k]) for k in measured]
+            each = [_parse_time(cells[place], column, dated) for place, column in clocks]
             if dated and sum(ns >= DAY_NS for ns in each) != 1:
                 raise ValueError(
                     f"{[cells[p] for p, _ in clocks]!r:.60} is no date and time of day"
@@ -241,7 +240,7 @@ def _read(
             if not clocks and table.times_ns is not None:
                 t_ns = table.times_ns[-1]
             if counter is not None:
-                count = _number(cells[counter])
+                count = _parse_number(cells[counter])
                 if not count.is_integer() or abs(count) >= EXACT:
                     raise ValueError(f"{cells[counter]!r:.40} is no count")
                 counts.append(int(count))
@@ -250,15 +249,15 @@ def _read(
             complaint = complaint or (f"line {table.line}: " if table.line else "") + str(error)
             continue
         if not times:
-            said = " ".join(
+            dates = " ".join(
                 f"{c.label} {cells[place]}" for place, c in clocks if c.kind == "iso" or c.offset
             )
-            local = bool(said) and not _ZONE.search(said)
+            local = bool(dates) and not _ZONE.search(dates)
         rows.append(row)
         times.append(t_ns)
         if len(rows) == BLOCK:
-            close()
-    close()
+            finish_block()
+    finish_block()
     timed = bool(clocks) or table.times_ns is not None
     return ReadRows(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
@@ -267,8 +266,8 @@ def _read(
     )  # fmt: skip
 
 
-def _number(cell: Any) -> float:
-    """What a cell measures; NaN where there is none."""
+def _parse_number(cell: Any) -> float:
+    """Parse the number of a cell; NaN if it is empty."""
     if not isinstance(cell, str):
         return float(cell)
     found = number(cell.strip() or "nan")
@@ -277,11 +276,11 @@ def _number(cell: Any) -> float:
     return found
 
 
-def _time(cell: Any, column: Column, dated: bool) -> int:
-    """A time in ns, exactly where it is written in decimals.
+def _parse_time(cell: Any, column: Column, dated: bool) -> int:
+    """Parse a time in ns; decimals are converted exactly.
 
     Args:
-        dated: whether it may be a date alone.
+        dated: whether the cell may be a date without a time of day.
     """
     text = str(cell).strip()
     if column.kind == "iso":
@@ -292,15 +291,15 @@ def _time(cell: Any, column: Column, dated: bool) -> int:
         if abs(ns) < 1 << 62:
             return round(ns)
         hint = f": too large for time:{column.kind}"
-    except InvalidOperation:  # it is no number
+    except InvalidOperation:  # not a number
         hint = "; time:mdy or time:dmy?" if "/" in text and not column.unit else ""
     raise ValueError(f"{cell!r:.40} is no time{hint}")
 
 
-def _numbers(
+def _number_rows(
     count: NDArray[np.int64] | None, columns: Sequence[Column], n: int, account: Import
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Sequence numbers, and which rows to keep; what is missing is counted."""
+    """Return sequence numbers and a mask of the rows to keep; count missing samples."""
     if count is None:
         return np.arange(n, dtype=np.int64), np.ones(n, np.bool_)
     wrap = 1 << next(c.bits for c in columns if c.kind == "count")
@@ -319,7 +318,7 @@ def _numbers(
 def _sort_rows(
     times: NDArray[np.int64], account: Import
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the order of rows, and times that go back only where another stretch begins."""
+    """Sort rows by time. Return their order, and times that go back only at a new stretch."""
     order, steps = np.arange(len(times)), np.diff(times)
     back = np.flatnonzero(steps < 0)
     if not len(back):
@@ -342,7 +341,7 @@ def _sort_rows(
             i, j = int(run[0]), int(run[-1]) + 1
             rank = np.argsort(part[i:j], kind="stable")
             between = np.diff(np.sort(part[max(0, i - 1) : j + 1]))
-            out, places = _leave_out(part[i:j].tolist()), int((rank != np.arange(j - i)).sum())
+            out, places = _find_outliers(part[i:j].tolist()), int((rank != np.arange(j - i)).sum())
             squeezed = between.min() < EVEN[0] * period or places > FAR * len(out)
             if squeezed and between.max() > EVEN[1] * period:
                 wrong += [i + k for k in out]
@@ -360,8 +359,8 @@ def _sort_rows(
     return order, times
 
 
-def _leave_out(times: Sequence[int]) -> list[int]:
-    """Return the fewest places without which times do not go back, the last of several."""
+def _find_outliers(times: Sequence[int]) -> list[int]:
+    """Return the fewest places whose removal leaves no step back; of several, the last."""
     ends: list[int] = []
     last: list[int] = []
     after = [-1] * len(times)
@@ -376,14 +375,14 @@ def _leave_out(times: Sequence[int]) -> list[int]:
     return [k for k in range(len(times)) if k not in kept]
 
 
-def _strictly(
+def _make_increasing(
     times: NDArray[np.int64], rate_hz: float, account: Import
 ) -> tuple[NDArray[np.int64], float]:
-    """Times that increase strictly, and the rate that they tell, Hz."""
+    """Return strictly increasing times, and their rate in Hz."""
     if len(times) == 1:
         return times, rate_hz or 1.0
     steps = np.diff(times)
-    ends = np.flatnonzero(steps)  # a coarse clock has several rows at a time
+    ends = np.flatnonzero(steps)  # with a coarse clock several rows share a time
     forward = steps[ends] > 0
     if not forward.any():
         raise ConfigError("all lines have one time: leave its column out, and give --rate")
@@ -393,7 +392,7 @@ def _strictly(
     rows = np.diff(ends, prepend=-1)
     long = steps[ends] > EVEN[1] * np.median((steps[ends] / rows)[usual]) * rows
     if (long & usual).sum() <= account.corrupt:
-        usual &= ~long  # rows are missing there
+        usual &= ~long  # rows are missing in long steps
     period = float(steps[ends][usual].sum() / rows[usual].sum())
     if stretches:
         account.notes.append(f"times go back {stretches} times: there they go on a period later")
@@ -406,12 +405,12 @@ def _strictly(
         account.notes.append(f"no rows for {steps[at] / NS_PER_S:.4g} s after row {at + 1}{more}")
     if repeats:
         account.notes.append(f"{repeats} lines have the time of the one before: spread evenly")
-        times = _spread(times, period)
+        times = _spread_evenly(times, period)
     return times, float(f"{NS_PER_S / period:.6g}")
 
 
-def _spread(times: NDArray[np.int64], period: float) -> NDArray[np.int64]:
-    """Rows of one time evenly up to the next time, or by the period where that is less."""
+def _spread_evenly(times: NDArray[np.int64], period: float) -> NDArray[np.int64]:
+    """Spread rows of equal time up to the next time, at most a period apart."""
     first = np.flatnonzero(np.concatenate([[True], np.diff(times) > 0]))
     lengths = np.diff(np.append(first, len(times)))
     room = np.diff(np.append(times[first], times[-1] + round(period * lengths[-1])))

@@ -1,11 +1,11 @@
-"""Tables of numbers in text, whoever wrote them: delimiter, decimal comma, header found by looking.
+"""Detection of the form of any table of numbers in text: delimiter, decimal mark, header.
 
-What is looked at is the beginning. Most of its lines are rows, so the delimiter is that which cuts
-most lines into one number of cells, most of them numbers. Names stand in the last line above the
-rows that has as many cells, a remark (``# time fx fy``) as well as not; what is above that is
-passed over, also where it comes again. All else but remarks and blank lines is a row, of as many
-cells as the table; those that many rows lack at their end are empty, a list is as many cells. Cells
-between spaces may stand in brackets and have units, as boards print them.
+The beginning of the file is examined. Most of its lines are rows, so the delimiter is the character
+that cuts most lines into the same number of cells, most of them numbers. The names are in the last
+line above the rows with as many cells, which may be a remark (``# time fx fy``); lines above it are
+skipped, also where they are repeated later. All lines other than remarks and blank lines are rows
+of as many cells as the table. Cells that many rows lack at their end are empty; a list counts as
+one cell per item. Cells between spaces may be in brackets and have units, as boards print them.
 """
 
 import csv
@@ -24,12 +24,12 @@ from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 from tactile_rt.drivers.logs import open_log_file
 from tactile_rt.recording.importing.table import Table
 
-LOOKED_AT: Final = 200  # lines
-ENOUGH: Final = 0.5  # of the lines that are looked at are rows
-OFTEN: Final = 0.2  # of the rows lack the same cells: they are not cut
+LOOKED_AT: Final = 200  # lines that are examined
+ENOUGH: Final = 0.5  # least share of rows among the examined lines
+OFTEN: Final = 0.2  # least share of rows of a width that is regular, not that of a cut row
 DELIMITERS: Final = (";", "\t", ",", "|", " ")
 NAMES: Final = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}
-_REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # no error of a spreadsheet
+_REMARK: Final = re.compile(r"%|//|#(?!N/?A\b|[A-Z/0]+[!?])")  # but no spreadsheet error: #N/A
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
 _UNIT: Final = re.compile(
@@ -41,20 +41,20 @@ _SENSOR: Final = re.compile(
     r"(?:[ _.-]?(?:id|name|no|nr|num|number|index|idx))?|name|key|id|device|node|board|finger",
     re.IGNORECASE,
 )
-MOST_SENSORS: Final = 64  # with numbers for names: a counter turns later
+MOST_SENSORS: Final = 64  # sensors with numbers as names; a counter repeats later
 _NAMES_LINE: Final = re.compile(
     r"[ \t\"]*[^\W\d][^:=\"]{0,40}(?:([,;\t|])[ \t\"]*[^\W\d][^:=\"]{0,40})+"
 )
 _GLUED: Final = re.compile(r"[+-]?\d+(?:[.,]\d+)?([a-zA-Z\u00b5]{1,3})")
 LONG_ROW: Final = 16  # cells
-IN_TURN: Final = 0.9  # of the rows
+IN_TURN: Final = 0.9  # least share of rows whose sensor repeats in a fixed order
 THOUSAND: Final = " (a thousand?)"
 _THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+\s*")
 _US_THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:,\d{3})+\.\d+\s*")
 _GERMAN_THOUSANDS: Final = re.compile(r"\s*[+-]?[1-9]\d{0,2}(?:\.\d{3})+,\d+\s*")
 _POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
 _DAY: Final = re.compile(r"\d{4}([-/.])\d\d?\1\d\d?|\d\d?([-/.])\d\d?\2\d{4}")
-_LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pairs of them
+_LIST: Final = re.compile(  # two numbers or more in brackets, which may be nested once
     r"[\[(](?=[\s\[(]*(?:[-+.]*\d|nan\b))(?=[^\])]*[\s,;])"
     r"(?:[-+.\deEnNaAiIfF\s,;]|[\[(][-+.\deEnNaAiIfF\s,;]*[\])])*[\])]"
 )
@@ -62,53 +62,53 @@ _LIST: Final = re.compile(  # of two numbers or more, in brackets or in two pair
 
 @dataclass(frozen=True)
 class CsvForm:
-    """How a table is written."""
+    """Form of a table in text."""
 
-    delimiter: str  # what stands between cells; a space stands for any of spaces and tabs
+    delimiter: str  # separator of cells; a space stands for any spaces and tabs
     comma: bool
     names: tuple[str, ...]
     first: int
     width: int
     lines: int = 1
     units: tuple[str, ...] = ()
-    # how many cells a row may have; those that it lacks of `width` are empty
+    # numbers of cells that a row may have; it is filled up to `width` with empty cells
     widths: frozenset[int] = frozenset()
     heads: frozenset[str] = frozenset()  # lines above the first row
-    note: str = ""  # what is odd of its header
+    note: str = ""  # oddity of the header
 
 
 def csv_form(
     path: Path, delimiter: str = "", decimal: str = "", skip: int = 0, lines: int = 1
 ) -> CsvForm:
-    """How a table is written, as its beginning shows.
+    """Detect the form of a table by its beginning.
 
     Args:
         path: the file; gzip is unpacked.
-        delimiter: what stands between cells, if it is told: a character, tab or space.
+        delimiter: separator of cells: a character, tab or space; empty: it is detected.
 
     Raises:
-        RecordingError: its lines are no table of numbers.
-        ConfigError: its rows are not samples.
+        RecordingError: the lines are no table of numbers.
+        ConfigError: the rows are not samples.
     """
-    with open_log_file(path) as file, _text(file) as text:
-        head = list(islice(_joined(text, skip, lines), LOOKED_AT))
+    with open_log_file(path) as file, _decode_text(file) as text:
+        head = list(islice(_join_lines(text, skip, lines), LOOKED_AT))
     _check_cells(path, head)
-    told = NAMES.get(delimiter, delimiter)
-    if len(told) > 1:
+    given = NAMES.get(delimiter, delimiter)
+    if len(given) > 1:
         raise ConfigError(f"--delimiter is one character, tab or space, not {delimiter!r}")
     fits: list[tuple[float, CsvForm]] = []
-    for one in (told,) if told else DELIMITERS:
+    for one in (given,) if given else DELIMITERS:
         for comma in (decimal == ",",) if decimal else (False, True):
             if comma and one == ",":
-                cells = [c for x in head for c in _cells(x, one, False)]
+                cells = [c for x in head for c in _split_cells(x, one, False)]
                 if not any(map(_COMMA.fullmatch, cells)):
                     continue
                 if not decimal and any(map(_POINT.fullmatch, cells)):
-                    continue  # 0.5,"1,000": a thousand
-            between = 2 * sum(map(_between_digits, head)) > len(head)
+                    continue  # 0.5,"1,000": the comma groups thousands
+            between = 2 * sum(map(_has_decimal_commas, head)) > len(head)
             if not comma and not decimal and one == " " and between:
-                continue  # 5,01 -7 0,25
-            fits += _fit(head, one, comma)
+                continue  # 5,01 -7 0,25: the commas are decimal marks
+            fits += _fit_form(head, one, comma)
     if not fits:
         raise RecordingError(
             f"{path} is no table of numbers: no delimiter cuts most of its lines into as many "
@@ -131,17 +131,17 @@ def _check_cells(path: Path, head: list[str]) -> None:
 
 
 def _compare_header(path: Path, above: list[str], form: CsvForm) -> CsvForm:
-    """Take names apart by another mark; note where they are too few or many.
+    """Split a header by another delimiter than the rows. Note too few or too many names.
 
     Raises:
-        ConfigError: the decimal mark may be what stands between cells.
+        ConfigError: the decimal mark may be the delimiter, too.
     """
     line = above[-1].strip() if above else ""
     if form.names or form.delimiter == " " or not (found := _NAMES_LINE.fullmatch(line)):
         return form
     names = [name.strip(' "') for name in line.split(found[1])]
     if len(names) == form.width:
-        return replace(form, names=tuple(_distinct(names)))
+        return replace(form, names=tuple(_make_distinct(names)))
     odd = f"its header, {line!r:.40}, names {len(names)} columns, its rows have {form.width} cells"
     if form.delimiter == "," and len(names) < form.width <= 2 * len(names):
         raise ConfigError(f"{path}: {odd}: if , is a decimal mark, too, put ; between the cells")
@@ -149,16 +149,16 @@ def _compare_header(path: Path, above: list[str], form: CsvForm) -> CsvForm:
 
 
 def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
-    """Raise ConfigError where each row is a channel, or of one sensor of several."""
-    cells = (_cells(x, form.delimiter, form.comma) for x in head[form.first :])
+    """Raise ConfigError where each row is a channel, or belongs to one sensor of several."""
+    cells = (_split_cells(x, form.delimiter, form.comma) for x in head[form.first :])
     rows = [[c.strip(' "') for c in row] for row in cells if len(row) == form.width]
     names = list(dict.fromkeys(row[0] for row in rows if row[0][:1].isalpha()))
     wide = form.width > max(LONG_ROW, 2 * len(rows)) and len(head) < LOOKED_AT
     across = bool(_SENSOR.fullmatch(form.names[0])) if form.names else wide
-    if across and len(names) == len(rows) > 1 and not any(map(_is_there, names)):
-        told = ", ".join(names)
+    if across and len(names) == len(rows) > 1 and not any(map(_is_cell, names)):
+        listed = ", ".join(names)
         raise ConfigError(
-            f"{path}: each row is a channel ({told:.40} ...), not a sample: transpose it"
+            f"{path}: each row is a channel ({listed:.40} ...), not a sample: transpose it"
         )
     for k, column in enumerate(form.names):
         of = [row[k] for row in rows]
@@ -166,30 +166,30 @@ def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
         if not _SENSOR.fullmatch(column) or not 1 < n <= min(len(of) / 2, MOST_SENSORS):
             continue
         turns = sum(a == b for a, b in zip(of, of[n:], strict=False)) >= IN_TURN * (len(of) - n)
-        words = not any(map(_is_there, kinds)) and 2 * sum(map(str.__ne__, of, of[1:])) > len(of)
+        words = not any(map(_is_cell, kinds)) and 2 * sum(map(str.__ne__, of, of[1:])) > len(of)
         if words or (turns and all(map(str.isdecimal, kinds))):
-            told = f"column {column!r:.40} says of which sensor a row is ({', '.join(kinds):.40})"
-            raise ConfigError(f"{path}: {told}: pivot it, one row per time, a column for each")
+            why = f"column {column!r:.40} says of which sensor a row is ({', '.join(kinds):.40})"
+            raise ConfigError(f"{path}: {why}: pivot it, one row per time, a column for each")
 
 
 def read_table(path: Path, form: CsvForm) -> Table:
-    """The rows of a table."""
+    """Return a table whose rows are read from the file as they are iterated over."""
     table = Table(path, form.names, (), width=form.width)
     table.notes += [form.note] if form.note else []
-    table.rows = _rows(table, form)
+    table.rows = _read_rows(table, form)
     return table
 
 
-def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
-    order: list[int] = []  # of the columns, where another header stands
-    longest, ending = (0, 0), (0, 0)  # ends of all lines but the last; of the last
+def _read_rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
+    order: list[int] = []  # of the columns, after a later header with another order
+    longest, ending = (0, 0), (0, 0)  # `_measure_end` of all lines but the last; of the last
     cut: list[str] = []
-    with open_log_file(table.path) as file, _text(file) as text:
-        for k, line in enumerate(_joined(text, form.first, form.lines, cut), start=1):
+    with open_log_file(table.path) as file, _decode_text(file) as text:
+        for k, line in enumerate(_join_lines(text, form.first, form.lines, cut), start=1):
             if _REMARK.match(line) or not line.strip(" \t,;") or line.strip() in form.heads:
                 continue
             table.line = form.first + k * form.lines
-            cells = _cells(line, form.delimiter, form.comma)
+            cells = _split_cells(line, form.delimiter, form.comma)
             longest, ending = max(longest, ending), _measure_end(cells, form.width)
             words = [c.strip(' "') for c in cells]
             if len(words) == len(form.names) and set(words) == set(form.names):
@@ -209,36 +209,36 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
 
 
 def _measure_end(cells: Sequence[str], width: int) -> tuple[int, int]:
-    """Count the digits of a row's last cell: those after its point, else all."""
+    """Count the digits of a row's last cell: (after its point, all without a point)."""
     whole, point, rest = cells[-1].strip().partition(".") if len(cells) == width else ("", "", "")
     return len(rest), 0 if point else len(whole)
 
 
-def _text(file: Any) -> TextIOWrapper:
+def _decode_text(file: Any) -> TextIOWrapper:
     begins = file.peek(2)
     encoding = "utf-16" if begins[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
         getincrementaldecoder(encoding)().decode(begins)
     except UnicodeDecodeError:
-        encoding = "cp1252"  # of Windows in Europe
+        encoding = "cp1252"  # of Windows in western Europe
     return TextIOWrapper(file, encoding, "replace", newline="")
 
 
-def _joined(
+def _join_lines(
     text: TextIOWrapper, skip: int, lines: int, cut: list[str] | None = None
 ) -> Iterator[str]:
-    """The rows' texts, ``lines`` of the file each, after those that are skipped.
+    """Yield the text of each row, joined from ``lines`` lines, after the skipped ones.
 
     Args:
-        cut: gets the last line, if that has no end.
+        cut: gets the last line, if that has no line ending.
     """
     begun: list[str] = []
-    # a line ends as anybody ends lines; one that does not end is cut
+    # all kinds of line endings count; a line without one may be cut
     for line in islice(iter(lambda: text.readline(LONGEST), ""), skip, None):
         if cut is not None and line[-1] not in "\r\n" and len(line) < LONGEST:
             cut.append(line)
-        line = re.sub(r"\u2212(?=[.,]?\d)", "-", line)  # a minus of typographers
-        line = re.sub(r"(?<=\d)['\u2019](?=\d{3}(?!\d))", "", line)  # a thousand of the Swiss
+        line = re.sub(r"\u2212(?=[.,]?\d)", "-", line)  # the typographic minus
+        line = re.sub(r"(?<=\d)['\u2019](?=\d{3}(?!\d))", "", line)  # Swiss grouping of thousands
         for part in line.rstrip("\r\n").split("\r"):
             begun.append(part)
             if len(begun) == lines:
@@ -246,7 +246,7 @@ def _joined(
                 begun = []
 
 
-def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
+def _split_cells(line: str, delimiter: str, comma: bool) -> list[str]:
     lists = delimiter != " " and ("[" in line or "(" in line)
     if lists:
         line = _LIST.sub(lambda found: re.sub(r"[\s,;]+", " ", found[0]), line)
@@ -263,19 +263,19 @@ def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
     mark, grouped = (".", _GERMAN_THOUSANDS) if comma else (",", _US_THOUSANDS)
     if mark in line and (mark != delimiter or '"' in line):
         cells = [c.replace(mark, "") if grouped.fullmatch(c) else c for c in cells]
-    if comma:  # where 1.000 is a thousand, or the decimal mark is another after all
+    if comma:  # 1.000 may be a thousand, or the decimal mark may be the point after all
         cells = [c + THOUSAND if _THOUSANDS.fullmatch(c) else c for c in cells]
     return [c.replace(",", ".") if comma and _COMMA.fullmatch(c) else c for c in cells]
 
 
 def _split_list(cell: str) -> list[str]:
-    """Split a list of numbers; a cell that holds more is one."""
+    """Split a cell that is a list of numbers; any other cell stays one."""
     plain = cell.strip().strip('"')
     return re.sub(r"[\[\](),;]", " ", plain).split() if _LIST.fullmatch(plain) else [cell]
 
 
-def _is_there(cell: str) -> bool:
-    """Whether this may stand where numbers do."""
+def _is_cell(cell: str) -> bool:
+    """Return whether a cell may belong to a row: a number, a time, or empty."""
     return number(cell.strip() or "nan") is not None or _is_number(cell) or THOUSAND in cell
 
 
@@ -285,21 +285,21 @@ def _is_number(cell: str) -> bool:
     return (found is not None and found == found) or (":" in plain and in_seconds(plain) != plain)
 
 
-def _between_digits(line: str) -> bool:
-    """Whether a line has commas, all of them in numbers, and spaces between these."""
+def _has_decimal_commas(line: str) -> bool:
+    """Return whether a line is cut by spaces and has commas, all as decimal marks."""
     words = line.split()
     cut = [w for w in words if "," in w]
     return len(words) > 1 and bool(cut) and all(map(_COMMA.fullmatch, cut))
 
 
-def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvForm]]:
-    """Return how well this form fits the lines, and the form; empty: not."""
+def _fit_form(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvForm]]:
+    """Fit a form to the lines. Return its score and the form, or nothing if it does not fit."""
     rows = [
-        (k, _cells(x, delimiter, comma))
+        (k, _split_cells(x, delimiter, comma))
         for k, x in enumerate(head)
         if x.strip(" \t,;") and not _REMARK.match(x)
     ]
-    numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_there, c)) >= len(c) > 0]
+    numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_cell, c)) >= len(c) > 0]
     widths = Counter(len(c) for _, c in numeric)
     if not widths:
         return []
@@ -308,20 +308,20 @@ def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvF
     if (widths[width + 1] or named) and all(
         head[k].rstrip(" ").endswith(delimiter) for k, c in numeric if len(c) == width
     ):
-        width, often = width + 1, often + widths[width + 1]  # its last column is seldom there
+        width, often = width + 1, often + widths[width + 1]  # the last column is often empty
         numeric = [(k, [*c, ""] if len(c) == width - 1 else c) for k, c in numeric]
     whole = [c for _, c in numeric if len(c) == width]
-    for there in (_is_there, _is_number):  # what stands above may have words where nothing is
-        usual = [j for j in range(width) if 2 * sum(there(c[j]) for c in whole) > len(whole)]
+    for test in (_is_cell, _is_number):  # a header may have words above columns of empty cells
+        usual = [j for j in range(width) if 2 * sum(test(c[j]) for c in whole) > len(whole)]
         first = next(
-            (k for k, c in numeric if len(c) == width and all(_is_there(c[j]) for j in usual)),
+            (k for k, c in numeric if len(c) == width and all(_is_cell(c[j]) for j in usual)),
             numeric[0][0],
         )
-        spans = _spans(head[first], delimiter, comma)
-        names, units, below_names = _names(head[:first], delimiter, comma, width, spans)
+        spans = _count_items(head[first], delimiter, comma)
+        names, units, below_names = _find_names(head[:first], delimiter, comma, width, spans)
         if names:
             break
-    else:  # without names, words may stand in the first rows, too
+    else:  # without names, the first rows may hold words, too
         known = ((k, c) for k, c in numeric if len(c) == width)
         first = next((k for k, c in known if usual and _is_number(c[usual[0]])), first)
         begins = [k for k, _ in rows[:2]]
@@ -331,44 +331,42 @@ def _fit(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvF
     if often < ENOUGH * lines:
         return []
     share = (
-        sum(sum(_is_there(x) or bool(_DAY.fullmatch(x.strip())) for x in c) / width for c in whole)
+        sum(sum(_is_cell(x) or bool(_DAY.fullmatch(x.strip())) for x in c) / width for c in whole)
         / often
     )
     usual = [n for n, times in widths.items() if times >= OFTEN * len(numeric)]
-    if names:  # the first rows may lack what is usual, and all rows what is seldom there
+    if names:  # the first rows may lack usual cells, and all rows those that are rarely filled
         below = (k for k, c in rows if k >= below_names and any(map(_is_number, c)))
         first, width = next(below, first), len(names)
         usual = [n for n in usual if n <= width]
-    # one cell a line is a table, too, but only if nothing else is
+    # one cell per line is a table, too, but only if nothing else fits
     score = often / lines * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
-    if delimiter == " ":  # which cuts what all others cut, too
+    if delimiter == " ":  # spaces also cut lines that have another delimiter
         score -= 0.3 if 2 * sum(len(x.split()) > 1 for x in head) > len(head) else 0.6
-    heads = frozenset(
-        x.strip() for x in head[:first] if not all(map(_is_there, x.split(delimiter)))
-    )
+    heads = frozenset(x.strip() for x in head[:first] if not all(map(_is_cell, x.split(delimiter))))
     form = CsvForm(delimiter, comma, names, first, width, 1, units, frozenset(usual), heads)
     return [(score, form)]
 
 
-def _spans(line: str, delimiter: str, comma: bool) -> list[int]:
-    """Return how many cells each cell of a line is: a list is several."""
+def _count_items(line: str, delimiter: str, comma: bool) -> list[int]:
+    """Count the items of each cell of a line: a list has several. Empty: no cell is a list."""
     if delimiter == " " or not _LIST.search(line):
         return []
     packed = _LIST.sub(lambda found: "~" * len(_split_list(found[0])), line)
-    return [max(1, c.count("~")) for c in _cells(packed, delimiter, comma)]
+    return [max(1, c.count("~")) for c in _split_cells(packed, delimiter, comma)]
 
 
-def _names(
+def _find_names(
     above: list[str], delimiter: str, comma: bool, width: int, spans: list[int]
 ) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-    """The names of the columns, and the units below them; empty: there are none. The line after
-    these."""
+    """Find the names of the columns and the units below them (empty: none). Return the number of
+    the line below these, too."""
     units: tuple[str, ...] = ()
     end, next_above = 0, True
     for k, line in reversed(list(enumerate(above, start=1))):
         text = line.removeprefix("#").removeprefix("//")
         apart = re.findall(r'"[^"]*"|[^\s,;]+', text) if delimiter == " " else None
-        cells = [c.strip(' \t"') for c in apart or _cells(text, delimiter, comma)]
+        cells = [c.strip(' \t"') for c in apart or _split_cells(text, delimiter, comma)]
         if len(cells) != width and cells[:1] == ["%"]:
             del cells[0]
         if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
@@ -377,30 +375,30 @@ def _names(
             each = zip(cells, spans, strict=True)
             cells = [f"{c}.{i}" if n > 1 else c for c, n in each for i in range(n)]
         numbers = sum(bool(_is_number(c) or _COMMA.fullmatch(c)) for c in cells)
-        words = [c for c in cells if not (_is_there(c) or _COMMA.fullmatch(c))]
+        words = [c for c in cells if not (_is_cell(c) or _COMMA.fullmatch(c))]
         longer = next_above and delimiter != " " and width < len(cells) <= 1.5 * width
         next_above &= not line.strip() or 2 * numbers >= len(cells)
         if longer and line[:1] != "#" and len(set(words)) == len(cells):
-            return tuple(cells), units, k  # its last columns are seldom there
+            return tuple(cells), units, k  # the last columns are often empty
         if len(cells) != width or 2 * numbers >= width:
             continue
         known = sum(bool(_UNIT.fullmatch(c)) for c in words)
         most = 2 * known > len(words) and not units
         if 0 < known == len(words) or (
-            most and 0 < k - 1 == _names(above[: k - 1], delimiter, comma, width, spans)[2]
+            most and 0 < k - 1 == _find_names(above[: k - 1], delimiter, comma, width, spans)[2]
         ):
             units = units or tuple(c.strip("[]() ") for c in cells)
             end = end or k
         elif 2 * len(words) >= width:
-            return tuple(_distinct(cells)), units, end or k
+            return tuple(_make_distinct(cells)), units, end or k
     return (), (), 0
 
 
-def _distinct(names: list[str]) -> list[str]:
-    """Names as they are; one that is not there, or was there before, is called by its place."""
+def _make_distinct(names: list[str]) -> list[str]:
+    """Number the names that are empty or repeated by their place; keep the others."""
     seen: set[str] = set()
-    told = []
+    made = []
     for k, name in enumerate(names, start=1):
-        told.append(name if name and name not in seen else f"{name or 'column'}.{k}")
-        seen.add(told[-1])
-    return told
+        made.append(name if name and name not in seen else f"{name or 'column'}.{k}")
+        seen.add(made[-1])
+    return made

@@ -1,4 +1,4 @@
-"""Columns for a table, or for what a board printed, for a user to look at and change."""
+"""Proposals of columns for a table or a board's printed lines, which a user may correct."""
 
 import re
 from collections.abc import Sequence
@@ -25,25 +25,25 @@ _DELTA = re.compile(r"Delta_X\W+([\d.,]+(?:E[+-]\d+)?)")  # LabVIEW's step, s
 _CLOCK = re.compile(r"\d:\d")
 LEAST = 3  # rows
 DAY_S = 86_400
-DATED = 0.9  # of the cells of a column of dates
+DATED = 0.9  # share of dates among the cells of a column of dates
 ORDERS = {"": "year", "mdy": "month", "dmy": "day"}
 
 
 @dataclass(frozen=True)
 class ProposedColumns:
-    """What may be in the columns of a file."""
+    """Proposed columns of a file."""
 
-    columns: str  # columns in words; empty where none were found with which the file is read
+    columns: str  # columns in words; empty where the file cannot be read with any that were found
     table: bool  # whether the file is to be read as a table; else as what a board prints
     timed: bool
     said: str
     samples: int = 0
-    rate_hz: float = 0.0  # rate that the header tells, Hz; 0: it tells none
+    rate_hz: float = 0.0  # rate by the header, Hz; 0: the header contains none
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
-    """The columns of what a board printed; None where it printed no samples."""
-    data = b"\n" + data  # it begins with a line
+    """Propose the columns of a board's printed lines; None where they hold no samples."""
+    data = b"\n" + data  # the data begin with a whole line
     guess = guess_line_columns(data) or guess_line_columns(data[len(data) // 2 :])
     if guess is None:
         return None
@@ -61,26 +61,26 @@ def propose_line_columns(data: bytes) -> ProposedColumns | None:
 
 
 def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
-    """The columns of a file of text; None where it has none."""
+    """Propose the columns of a text file; None where it has none."""
     try:
         form = csv_form(path)
     except RecordingError:
         form = None
-    told = propose_line_columns(data)
-    labelled = told is not None and "=" in told.columns
+    printed = propose_line_columns(data)
+    labelled = printed is not None and "=" in printed.columns
     if form is None or (labelled and not form.names):
-        return told
+        return printed
     if form.names or form.delimiter != " ":
-        proposed = _of_table(path, form)
+        proposed = _propose_table_columns(path, form)
         if proposed is not None and proposed.columns:
             return proposed
-    if told is None or labelled:
-        return told or _of_table(path, form)
-    tried = _try_import(path, form, replace(told, table=True))
-    return tried if tried.columns else _of_table(path, form) or tried
+    if printed is None or labelled:
+        return printed or _propose_table_columns(path, form)
+    tried = _try_import(path, form, replace(printed, table=True))
+    return tried if tried.columns else _propose_table_columns(path, form) or tried
 
 
-def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
+def _propose_table_columns(path: Path, form: CsvForm) -> ProposedColumns | None:
     rows = [r for r in islice(read_table(path, form).rows, LOOKED_AT) if len(r) == form.width]
     clocks = {k: order for k in range(form.width) if (order := _find_order([r[k] for r in rows]))}
     cells = [
@@ -91,10 +91,10 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     if len(rows) < LEAST or 2 * numbers < len(rows) * form.width:
         return None
     names = form.names
-    if form.units:  # said as names say them
+    if form.units:  # written as units in names are
         names = tuple(f"{n} [{u}]" if u else n for n, u in zip(names, form.units, strict=True))
     words, timed = guess_columns(names, cells, clocks)
-    if clocks and max(row[min(clocks)] or 0 for row in cells) < DAY_S:  # its date is beside it
+    if clocks and max(row[min(clocks)] or 0 for row in cells) < DAY_S:  # another column has dates
         for k in sorted(set(range(form.width)) - clocks.keys()):
             if order := _find_order([f"{r[k].strip() or '-'} {r[min(clocks)]}" for r in rows]):
                 clocks[k], words[k] = order, "time:iso"
@@ -117,8 +117,8 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
             said += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
     if form.names:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    told = ProposedColumns(compress_columns(words), True, timed, said, rate_hz=_find_rate(form))
-    return _try_import(path, form, told)
+    found = ProposedColumns(compress_columns(words), True, timed, said, rate_hz=_find_rate(form))
+    return _try_import(path, form, found)
 
 
 def _find_rate(form: CsvForm) -> float:
@@ -140,7 +140,7 @@ def _find_order(cells: Sequence[str]) -> str:
 
 
 def _try_import(path: Path, form: CsvForm, proposed: ProposedColumns) -> ProposedColumns:
-    """Return what is proposed, without columns where the first rows are not read by them."""
+    """Return the proposal, without its columns if the first rows cannot be read with them."""
     table = read_table(path, form)
     table.rows = islice(table.rows, LOOKED_AT)
     try:

@@ -1,8 +1,8 @@
-"""A log of a line, decoded by a codec into a recording that holds the packets, too.
+"""Import of a log of a serial line or CAN bus: a codec decodes it; the packets are stored, too.
 
-Packets that carry the time at which they came are decoded as they were live. Where the log has no
-times, the device's own clock dates the samples; a device without one is taken to have sent at its
-nominal rate, and what its counter or its damaged frames tell of lost samples takes time, too.
+Packets with a time of arrival are decoded as in live use. If the log has no times, the device's own
+clock dates the samples. A device without a clock is assumed to have sent at its nominal rate;
+samples that were lost, by its counter or its damaged frames, take up their time, too.
 """
 
 from collections import deque
@@ -26,10 +26,10 @@ from tactile_rt.recording.importing.report import Import, clock_of, measure_samp
 from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
 from tactile_rt.recording.writer import McapFile
 
-PROBED, SHORTEST = 16_384, 8  # bytes
-FEW, UNUSUAL = 10, 1.2  # samples; how far their rate may be from the codec's
-LAST = 4  # packets that are fed byte by byte
-AHEAD = 4096  # packets in which a device may describe itself before samples must come
+PROBED, SHORTEST = 16_384, 8  # bytes: of a log to probe; of a piece, at least
+FEW, UNUSUAL = 10, 1.2  # samples for a rate; factor by which it may be off the codec's rate
+LAST = 4  # last packets, which are fed byte by byte
+AHEAD = 4096  # packets in which a device may describe itself
 
 
 def import_wire(
@@ -38,21 +38,21 @@ def import_wire(
     """Decode a log, and write samples and packets as a recording.
 
     Args:
-        output: the recording; it is there whole or not at all.
+        output: the recording to write, whole or not at all.
         fields: ``codec`` and its options, as in a URL, also ``array``.
-        rate_hz: rate of the samples, Hz; 0 for the codec's.
+        rate_hz: rate of the samples, Hz; 0: the codec's rate.
 
     Raises:
-        ConfigError: no such codec or option, or a device that describes itself did not.
+        ConfigError: no such codec or option, or the log lacks the device's description of itself.
     """
-    codec, about = _prepared(log, fields, rate_hz)
+    codec, about = _prepare(log, fields, rate_hz)
     log.names = getattr(codec, "names", {})
     if log.form == "raw":
-        log.piece = _bytes_of_a_sample(log, make_codec(log.wire, about.codec, _own(fields)))
+        log.piece = _sample_size(log, make_codec(log.wire, about.codec, _codec_options(fields)))
     account, stats = Import(), SourceStats()
 
     def fill(file: BinaryIO) -> None:
-        decoded = _Decoded(log, codec, about, stats)
+        decoded = _DecodedLog(log, codec, about, stats)
         made = McapFile(file, decoded.about)
         made.add(WIRE, encode_packet(None, about.wire), 0)
         packets = 0
@@ -65,14 +65,14 @@ def import_wire(
             made.add(SAMPLES, encode_samples(chunk), t_ns if own else int(chunk.t_ns[-1]))
             account.samples += len(chunk)
         if not account.samples:
-            raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
+            raise RecordingError(f"{log.path}: {_explain_empty(log, codec, str(fields['codec']))}")
         if log.wire == "serial" and decoded.unfinished:
             account.notes.append(f"it ends with {decoded.unfinished} bytes of no whole sample")
         if passed := getattr(codec, "passed", 0):
             account.notes.append(f"{passed} lines of words between samples are passed over")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
-        _count(log, decoded, account)
+        _fill_account(log, decoded, account)
 
     write_whole(output, fill)
     measure_samples(account, output)
@@ -103,7 +103,7 @@ def import_wire(
     return account
 
 
-def _count(log: LineLog, decoded: "_Decoded", account: Import) -> None:
+def _fill_account(log: LineLog, decoded: "_DecodedLog", account: Import) -> None:
     account.unit = {"raw": "bytes", "blf": "objects", "db": "frames"}.get(log.form, "lines")
     account.total, account.read = log.total, log.frames
     if log.form == "raw":
@@ -117,11 +117,11 @@ def _count(log: LineLog, decoded: "_Decoded", account: Import) -> None:
         account.notes.append(f"corrupt frames: {decoded.corrupt}")
 
 
-def _prepared(
+def _prepare(
     log: LineLog, fields: Mapping[str, str], rate_hz: float
 ) -> tuple[Codec[Any], Description]:
-    """The codec, and the description of the recording but for what the packets tell."""
-    own, name, array = _own(fields), fields.get("codec", ""), fields.get("array", "")
+    """Make the codec, and the recording's description as far as it is known without packets."""
+    own, name, array = _codec_options(fields), fields.get("codec", ""), fields.get("array", "")
     if not name:
         raise ConfigError("--as needs codec=NAME, see `tactile-rt codecs`")
     if log.form == "raw" and ("can", name) in CODECS and ("serial", name) not in CODECS:
@@ -141,20 +141,20 @@ def _prepared(
     if rate_hz and codec.spec is not None and codec.spec.rate_hz != rate_hz:
         codec.spec = replace(codec.spec, rate_hz=rate_hz)
     about = Description(
-        codec.spec,  # type: ignore[arg-type]  # until the packets tell
+        codec.spec,  # type: ignore[arg-type]  # None until the packets describe the array
         0, f"{log.path.name}", log.wire, name, written,
         session={"imported": log.path.name, "form": log.form},
     )  # fmt: skip
     return codec, about
 
 
-def _own(fields: Mapping[str, str]) -> dict[str, str]:
-    """The options of the codec alone."""
+def _codec_options(fields: Mapping[str, str]) -> dict[str, str]:
+    """Select the options of the codec."""
     return {k: v for k, v in fields.items() if k not in ("codec", "array")}
 
 
-def _bytes_of_a_sample(log: LineLog, codec: Codec[Any]) -> int:
-    """How many bytes one takes: of so many a packet is made, that each has a time of its own."""
+def _sample_size(log: LineLog, codec: Codec[Any]) -> int:
+    """Measure the bytes per sample: packets of this size give each sample its own time."""
     size = frames = 0
     for packet, _ in log.packets():
         codec.feed(packet, 0)
@@ -164,35 +164,35 @@ def _bytes_of_a_sample(log: LineLog, codec: Codec[Any]) -> int:
     return max(SHORTEST, size // max(1, frames))
 
 
-class _Decoded:
-    """(packet, when it came, the samples that it completes) of a log, one after the other."""
+class _DecodedLog:
+    """Iterable of (packet, time of arrival in ns, samples that it completes) of a log."""
 
     def __init__(
         self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
     ) -> None:
         self._codec, self._now, self._rest = codec, 0, 0
-        self.skipped = self._at = 0  # bytes: beside the frames up to the newest sample; of packets
+        self.skipped = self._at = 0  # bytes outside frames up to the newest sample; of packets
         self.corrupt = Occurrences(
             "frame" if log.wire == "can" else "byte" if log.form == "raw" else "packet"
         )
-        self._count: int | None = None  # of the newest sample
-        codec.commands(Command.START)  # some note what they have asked for
-        lines = log.form in ("raw", "terminal")  # which begin with their first line
+        self._count: int | None = None  # count of the newest sample
+        codec.commands(Command.START)  # some codecs remember what they asked for
+        lines = log.form in ("raw", "terminal")  # forms that begin with a whole line
         packets = _cut_last(log.packets(), getattr(codec, "line_end", b"") if lines else b"")
         waiting: list[tuple[Any, int | None, Samples | None]] = []
         for packet, t_ns in packets:
-            waiting.append((packet, t_ns, self._take(packet, t_ns)))
+            waiting.append((packet, t_ns, self._feed(packet, t_ns)))
             if codec.spec is not None or len(waiting) > AHEAD:
                 break
         if codec.spec is None:
-            why = _why_none(log, codec, about.codec)
+            why = _explain_empty(log, codec, about.codec)
             if codec.stats.intact:
                 why = (
                     f"{codec.stats.intact} whole {about.codec} frames, and none describes the "
                     "array: give array=FILE.json in --as, as `tactile-rt describe` writes it"
                 )
             raise ConfigError(f"{log.path}: {why}")
-        self._packets = chain(waiting, ((p, t_ns, self._take(p, t_ns)) for p, t_ns in packets))
+        self._packets = chain(waiting, ((p, t_ns, self._feed(p, t_ns)) for p, t_ns in packets))
         self.timed = self._stamped = bool(waiting) and waiting[0][1] is not None
         self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
         self._stamper = Stamper(codec, codec.spec, stats, steady=False)
@@ -201,7 +201,7 @@ class _Decoded:
             self.timed = own_clock = True
             self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         self._period_ns = NS_PER_S / codec.spec.rate_hz
-        self._passed = 0.0  # periods, where the log has no times
+        self._passed = 0.0  # periods since the beginning of a log without times
         self.about = replace(
             about, spec=codec.spec, utc_offset_ns=self._zero,
             clock="device" if own_clock else "log",
@@ -209,17 +209,17 @@ class _Decoded:
 
     @property
     def unfinished(self) -> int:
-        """Count the bytes after the last sample or line of text."""
+        """Number of bytes after the last sample or line of text."""
         return int(getattr(self._codec, "unfinished", self._rest))
 
     @property
     def clock_steps(self) -> int:
-        """Count how often the device's own clock went back or began anew."""
+        """Number of times that the device's own clock went back or began anew."""
         clock = self._stamper.clock
         return clock.steps if isinstance(clock, DeviceTime) else 0
 
-    def _take(self, packet: Any, t_ns: int | None) -> Samples | None:
-        """Feed a packet, and note what it damages."""
+    def _feed(self, packet: Any, t_ns: int | None) -> Samples | None:
+        """Feed a packet to the codec, and count corrupt frames and bytes."""
         stats = self._codec.stats
         before = stats.corrupt
         samples = self._codec.feed(packet, t_ns or 0)
@@ -240,13 +240,13 @@ class _Decoded:
                 yield packet, self._now, None
                 continue
             if not self._stamped:
-                self._passed += self._periods(samples)
+                self._passed += self._count_periods(samples)
                 self._now = max(self._now + 1, round(self._passed * self._period_ns))
             samples.arrived_ns[:] = self._now
             yield packet, self._now, self._stamper.chunk(samples)
 
-    def _periods(self, samples: Samples) -> int:
-        """How many periods these samples took, with those that were lost before them."""
+    def _count_periods(self, samples: Samples) -> int:
+        """Count the periods of these samples and of those lost before them."""
         n = len(samples)
         bits, before = self._codec.count_bits, self._count
         if samples.count is None or bits is None:
@@ -261,7 +261,7 @@ class _Decoded:
 def _cut_last(
     packets: Iterator[tuple[Any, int | None]], lead: bytes
 ) -> Iterator[tuple[Any, int | None]]:
-    """Put bytes before the packets, and cut the last ones into single bytes."""
+    """Put `lead` before the first packet, and cut the last packets into single bytes."""
     last: deque[tuple[Any, int | None]] = deque()
     for packet, t_ns in packets:
         last.append((lead + packet if lead else packet, t_ns))
@@ -272,10 +272,10 @@ def _cut_last(
         yield from ((packet[k : k + 1], t_ns) for k in range(len(packet)))
 
 
-def _why_none(log: LineLog, codec: Codec[Any], name: str) -> str:
+def _explain_empty(log: LineLog, codec: Codec[Any], name: str) -> str:
     stats = codec.stats
     if log.notes and not (stats.intact or stats.corrupt or stats.skipped):
-        return log.notes[-1]  # of another bus than asked for, say
+        return log.notes[-1]  # for example, that the log is of another bus
     guess = codec.complaint or (
         f"{stats.intact} intact and {stats.corrupt} damaged frames, {stats.skipped} "
         f"{'bytes' if codec.wire == 'serial' else 'frames'} beside them"

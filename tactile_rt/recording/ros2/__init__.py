@@ -1,9 +1,8 @@
-"""ROS 2 without ROS 2: its message definitions, CDR, and the names of topics and types.
+"""ROS 2 messages without a ROS 2 installation: definitions, CDR, names of topics and types.
 
-    definitions    the package ``tactile_rt_msgs``, and what it needs of others
-    cdr            a message as bytes, by its definition
-    messages       what we tell, as these messages
+    definitions    the package ``tactile_rt_msgs``, and the standard messages that it uses
+    cdr            encoding of a message as bytes, by its definition
+    messages       samples, decisions, events and arrays as these messages
 
-Recordings are made of such messages, and the publisher ``ros2`` sends them. Nothing of ROS need be
-installed.
+Recordings consist of such messages, and the publisher ``ros2`` sends them.
 """

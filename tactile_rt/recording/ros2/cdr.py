@@ -1,8 +1,8 @@
-"""A message as the bytes that ROS 2 sends and stores: CDR, little-endian, by its definition.
+"""Encoding of messages as the bytes that ROS 2 sends and stores: CDR, little-endian.
 
-A number stands at a multiple of its size, counted from after the four bytes that say which kind of
-CDR it is; a sequence and a string begin with their length, and a string ends with a zero, which
-counts. The definitions are those that a file or a topic carries with its messages.
+A number is aligned to a multiple of its size, counted from the end of the four bytes that name the
+kind of CDR. A sequence and a string begin with their length; a string ends with a zero byte, which
+is counted. The definitions are those that a file or a topic carries with its messages.
 """
 
 import re
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PACKAGE = Path(__file__).parents[2] / "assets" / "tactile_rt_msgs"
-# Of a definition's words, those that are no other message: how `struct` packs each; not a string.
+# Types of a definition that are no messages, with their `struct` codes; a string has none.
 SIMPLE = {
     "bool": "?", "uint8": "B", "int32": "i", "uint32": "I", "int64": "q", "float32": "f",
     "float64": "d", "string": "",
@@ -37,15 +37,15 @@ class Field(NamedTuple):
     """A field of a message."""
 
     name: str
-    kind: str  # kind of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``
+    kind: str  # type of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``
     many: bool
 
 
 @cache
 def fields_of(message: str) -> tuple[Field, ...]:
-    """The fields of a message, by its name such as ``tactile_rt_msgs/msg/Samples``."""
+    """Return the fields of a message, by its name such as ``tactile_rt_msgs/msg/Samples``."""
     found = []
-    for line in _text(message).splitlines():
+    for line in _read_definition(message).splitlines():
         words = line.partition("#")[0].split()
         if not words:
             continue
@@ -57,33 +57,33 @@ def fields_of(message: str) -> tuple[Field, ...]:
 
 @cache
 def schema_text(message: str) -> str:
-    """The definition with all that it needs, as MCAP's ``ros2msg`` has it."""
+    """Return a definition with all others that it uses, in MCAP's form ``ros2msg``."""
     needed: list[str] = []
 
-    def need(name: str) -> None:
+    def collect(name: str) -> None:
         for field in fields_of(name):
             if field.kind not in SIMPLE and field.kind not in needed:
                 needed.append(field.kind)
-                need(field.kind)
+                collect(field.kind)
 
-    need(message)
-    others = (f"{LINE}\nMSG: {n.replace('/msg/', '/')}\n{_text(n)}" for n in needed)
-    return "".join((_text(message), *others))
+    collect(message)
+    others = (f"{LINE}\nMSG: {n.replace('/msg/', '/')}\n{_read_definition(n)}" for n in needed)
+    return "".join((_read_definition(message), *others))
 
 
 def dds_type(message: str) -> str:
-    """What ROS 2 calls this message in DDS."""
+    """Return the name of a message's type in DDS."""
     package, _, name = message.partition("/msg/")
     return f"{package}::msg::dds_::{name}_"
 
 
 def token(text: str) -> str:
-    """The text as one word of a topic, of which ROS 2 allows letters, digits and ``_`` alone."""
+    """Turn a text into one word of a topic. ROS 2 allows only letters, digits and ``_``."""
     word = re.sub(r"[^A-Za-z0-9_]", "_", text) or "_"
     return f"_{word}" if word[0].isdigit() else word
 
 
-def _text(message: str) -> str:
+def _read_definition(message: str) -> str:
     if message in STANDARD:
         return STANDARD[message]
     return (PACKAGE / "msg" / f"{message.rpartition('/')[2]}.msg").read_text("utf-8")
@@ -95,23 +95,23 @@ NS = 10**9
 
 
 def encode(message: str, values: Mapping[str, Any]) -> bytes:
-    """The bytes of a message.
+    """Encode a message.
 
     Args:
         message: The name, such as ``tactile_rt_msgs/msg/Event``.
-        values: By name of field; a message within is a mapping itself.
+        values: By name of field; a nested message is a mapping itself.
     """
     out = bytearray(CDR)
-    _put(out, message, values)
+    _encode_fields(out, message, values)
     return bytes(out)
 
 
 def decode(message: str, data: bytes) -> dict[str, Any]:
-    """Return the values of a message; raise ValueError if it is not of this type."""
+    """Decode the values of a message by field. Raise ValueError if it is not of this type."""
     if data[:4] != CDR:
         raise ValueError(f"{data[:4]!r} begins no message in CDR")
     try:
-        values, at = _take(data, 4, message)
+        values, at = _decode_fields(data, 4, message)
     except (struct.error, UnicodeDecodeError) as error:
         raise ValueError(f"{len(data)} bytes are no {message}: {error}") from None
     if at != len(data):
@@ -120,21 +120,21 @@ def decode(message: str, data: bytes) -> dict[str, Any]:
 
 
 def header(utc_ns: int, frame: str) -> bytes:
-    """A ``std_msgs/msg/Header`` at the beginning of a message, with `CDR` before it."""
+    """Encode `CDR` and a ``std_msgs/msg/Header``, the beginning of a message."""
     seconds, ns = divmod(min(max(utc_ns, 0), MOST_S * NS), NS)
     name = frame.encode()
     return CDR + struct.pack("<iII", seconds, ns, len(name) + 1) + name + b"\0"
 
 
 def header_size(data: bytes) -> int:
-    """How many bytes of a message `header` are."""
+    """Return the number of bytes of a message that `header` wrote."""
     if len(data) < 16:
         raise ValueError(f"{len(data)} bytes have no header")
     (length,) = struct.unpack_from("<I", data, 12)
     return 16 + int(length)
 
 
-def _put(out: bytearray, message: str, values: Mapping[str, Any]) -> None:
+def _encode_fields(out: bytearray, message: str, values: Mapping[str, Any]) -> None:
     for name, kind, many in fields_of(message):
         ones, code = values[name] if many else (values[name],), SIMPLE.get(kind)
         if many:
@@ -147,7 +147,7 @@ def _put(out: bytearray, message: str, values: Mapping[str, Any]) -> None:
                 _pack(out, "I", len(text) + 1)
                 out += text + b"\0"
             else:
-                _put(out, kind, one)
+                _encode_fields(out, kind, one)
 
 
 def _pack(out: bytearray, code: str, *numbers: Any) -> None:
@@ -155,7 +155,7 @@ def _pack(out: bytearray, code: str, *numbers: Any) -> None:
     out += struct.pack(f"<{len(numbers)}{code}", *numbers)
 
 
-def _take(data: bytes, at: int, message: str) -> tuple[dict[str, Any], int]:
+def _decode_fields(data: bytes, at: int, message: str) -> tuple[dict[str, Any], int]:
     found: dict[str, Any] = {}
     for name, kind, many in fields_of(message):
         n, code, ones = 1, SIMPLE.get(kind), list[Any]()
@@ -173,7 +173,7 @@ def _take(data: bytes, at: int, message: str) -> tuple[dict[str, Any], int]:
                 ones.append(data[at : at + length - 1].decode())
                 at += length
             else:
-                one, at = _take(data, at, kind)
+                one, at = _decode_fields(data, at, kind)
                 ones.append(one)
         found[name] = ones if many else ones[0]
     return found, at

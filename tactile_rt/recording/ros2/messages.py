@@ -1,4 +1,4 @@
-"""What we tell, as ROS 2 messages."""
+"""Samples, decisions, events, arrays and wrenches as ROS 2 messages."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,15 +14,15 @@ from tactile_rt.recording.ros2 import cdr
 OURS = "tactile_rt_msgs/msg"
 ARRAY, DECISION, EVENT, SAMPLES = (f"{OURS}/{n}" for n in ("Array", "Decision", "Event", "Samples"))
 WRENCH = "geometry_msgs/msg/WrenchStamped"
-BODY = 12  # where the first sample's number is in a message of samples without header
+BODY = 12  # offset of the first sequence number in a message of samples without header
 FORCE, TORQUE = ("fx", "fy", "fz"), ("mx", "my", "mz")
 
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 UInt32 = Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
 
 
-class _Told(msgspec.Struct):
-    """What is looked for in JSON; of what is not there, or is of another type, nothing is told."""
+class _Message(msgspec.Struct):
+    """Fields that are read from a JSON message; missing ones have these defaults."""
 
     type: str = "device"
     t_ns: Int64 = 0
@@ -35,7 +35,7 @@ class _Told(msgspec.Struct):
         return _header(self.utc_ns or self.t_ns + self.utc_offset_ns, self.frame)
 
 
-class _Decision(_Told):
+class _Decision(_Message):
     model: str = ""
     onset_ns: Int64 = 0
     step: UInt32 = 0
@@ -55,7 +55,7 @@ class _Decision(_Told):
     late: bool = False
 
 
-class _Event(_Told):
+class _Event(_Message):
     model: str = ""
     part: str = ""
     state: str = ""
@@ -65,55 +65,55 @@ class _Event(_Told):
 
 
 def decision_message(text: bytes) -> bytes:
-    """A decision, which is a line of JSON, as a message."""
+    """Encode a decision, a line of JSON. One that cannot be parsed gets default fields."""
     try:
-        said = msgspec.json.decode(text, type=_Decision)
+        parsed = msgspec.json.decode(text, type=_Decision)
     except msgspec.MsgspecError:
-        said = _Decision()
+        parsed = _Decision()
     return cdr.encode(
         DECISION,
         {
-            "header": said.header(), "source": said.source, "model": said.model,
-            "t_ns": said.t_ns, "onset_ns": said.onset_ns, "step": said.step,
-            "is_final": said.final, "label": said.label, "labels": list(said.probabilities),
-            "probabilities": list(said.probabilities.values()),
-            "prediction_set": said.prediction_set,
-            "coverage": math.nan if said.coverage is None else said.coverage,
-            "names": said.names,
-            "names_coverage": math.nan if said.names_coverage is None else said.names_coverage,
-            "object": said.object,
-            "object_margin": math.nan if said.object_margin is None else said.object_margin,
-            "object_touches": said.object_touches,
-            "model_ms": said.model_ms, "latency_ms": said.latency_ms, "age_ms": said.age_ms,
-            "late": said.late, "json": text.decode(),
+            "header": parsed.header(), "source": parsed.source, "model": parsed.model,
+            "t_ns": parsed.t_ns, "onset_ns": parsed.onset_ns, "step": parsed.step,
+            "is_final": parsed.final, "label": parsed.label, "labels": list(parsed.probabilities),
+            "probabilities": list(parsed.probabilities.values()),
+            "prediction_set": parsed.prediction_set,
+            "coverage": math.nan if parsed.coverage is None else parsed.coverage,
+            "names": parsed.names,
+            "names_coverage": math.nan if parsed.names_coverage is None else parsed.names_coverage,
+            "object": parsed.object,
+            "object_margin": math.nan if parsed.object_margin is None else parsed.object_margin,
+            "object_touches": parsed.object_touches,
+            "model_ms": parsed.model_ms, "latency_ms": parsed.latency_ms, "age_ms": parsed.age_ms,
+            "late": parsed.late, "json": text.decode(),
         },
     )  # fmt: skip
 
 
 def event_message(text: bytes) -> bytes:
-    """Whatever else is told, a line of JSON, as a message."""
+    """Encode an event or health, a line of JSON. One that cannot be parsed gets default fields."""
     try:
-        said = msgspec.json.decode(text, type=_Event)
+        parsed = msgspec.json.decode(text, type=_Event)
     except msgspec.MsgspecError:
-        said = _Event()
+        parsed = _Event()
     return cdr.encode(
         EVENT,
         {
-            "header": said.header(), "type": said.type, "source": said.source,
-            "part": said.part or said.model, "state": said.state, "reason": said.reason,
-            "level": said.level, "touching": said.touching, "json": text.decode(),
+            "header": parsed.header(), "type": parsed.type, "source": parsed.source,
+            "part": parsed.part or parsed.model, "state": parsed.state, "reason": parsed.reason,
+            "level": parsed.level, "touching": parsed.touching, "json": text.decode(),
         },
     )  # fmt: skip
 
 
 def json_of(message: str, data: bytes) -> bytes:
-    """Return the JSON of a decision or an event, or raise ValueError."""
+    """Return the JSON text of a decision or an event. Raise ValueError if it is neither."""
     text: str = cdr.decode(message, data)["json"]
     return text.encode()
 
 
 def array_message(spec: ArraySpec, source: str, utc_ns: int) -> bytes:
-    """What an array is."""
+    """Encode the description of an array."""
     rows, columns = zip(*spec.grid, strict=True)
     poses = [
         {"position": _vector(position), "orientation": {"w": w, "x": x, "y": y, "z": z}}
@@ -130,16 +130,16 @@ def array_message(spec: ArraySpec, source: str, utc_ns: int) -> bytes:
 
 
 def stamped(samples: bytes, utc_ns: int, frame: str) -> bytes:
-    """Samples as `recording.layout.encode_samples` writes them, with a header before."""
+    """Insert a header into samples that `recording.layout.encode_samples` wrote."""
     begin = bytearray(cdr.header(utc_ns, frame))
     begin += bytes(-len(begin) % 4)
-    begin += samples[4:8]  # how many there are
+    begin += samples[4:8]  # number of samples
     begin += bytes(-(len(begin) - 4) % 8)
     return bytes(begin) + samples[BODY:]
 
 
 def unstamped(data: bytes) -> bytes:
-    """Return the samples that `stamped` took; raise ValueError if there is no header."""
+    """Remove the header that `stamped` inserted; raise ValueError if none is there."""
     at = cdr.header_size(data)
     at += -at % 4
     many = data[at : at + 4]
@@ -149,10 +149,10 @@ def unstamped(data: bytes) -> bytes:
 
 
 def wrenches_of(spec: ArraySpec, values: NDArray[np.float32]) -> NDArray[np.float64] | None:
-    """Force and torque at the origin of the mount frame, in its axes, as ROS 2 has a wrench.
+    """Return ROS 2 wrenches: force and torque at the mount frame's origin, in its axes.
 
     Args:
-        spec: The array; only one of a single element that measures a whole force in N has a wrench.
+        spec: The array; only an array of one element that measures fx, fy and fz in N has a wrench.
         values: (n, 1, channel) of such an array.
 
     Returns:
@@ -173,7 +173,7 @@ def wrenches_of(spec: ArraySpec, values: NDArray[np.float32]) -> NDArray[np.floa
 
 
 def wrench_message(wrench: Sequence[float], utc_ns: int, frame: str) -> bytes:
-    """A row of `wrenches_of`, taken at this time, in the mount frame."""
+    """Encode a row of `wrenches_of`, of this time, in the mount frame."""
     parts = {"force": _vector(wrench[:3]), "torque": _vector(wrench[3:])}
     return cdr.encode(WRENCH, {"header": _header(utc_ns, frame), "wrench": parts})
 
@@ -183,21 +183,21 @@ def _vector(numbers: Any) -> Mapping[str, float]:
 
 
 def array_of(data: bytes) -> ArraySpec:
-    """Return the array of a message of `array_message`, or raise ValueError."""
-    told = cdr.decode(ARRAY, data)
-    poses = told["poses"]
+    """Decode a message of `array_message`; raise ValueError if it is none."""
+    fields = cdr.decode(ARRAY, data)
+    poses = fields["poses"]
     return ArraySpec(
-        name=told["name"],
-        elements=tuple(told["elements"]),
-        grid=tuple(zip(map(int, told["rows"]), map(int, told["columns"]), strict=True)),
+        name=fields["name"],
+        elements=tuple(fields["elements"]),
+        grid=tuple(zip(map(int, fields["rows"]), map(int, fields["columns"]), strict=True)),
         positions=tuple((p["x"], p["y"], p["z"]) for p in (pose["position"] for pose in poses)),
         orientations=tuple(
             (q["w"], q["x"], q["y"], q["z"]) for q in (pose["orientation"] for pose in poses)
         ),
-        channels=tuple(told["channels"]),
-        units=tuple(told["units"]),
-        rate_hz=float(told["rate_hz"]),
-        frame=told["header"]["frame_id"],
+        channels=tuple(fields["channels"]),
+        units=tuple(fields["units"]),
+        rate_hz=float(fields["rate_hz"]),
+        frame=fields["header"]["frame_id"],
     )
 
 
