@@ -55,7 +55,7 @@ class Sequencer:
         period_ticks: float | None = None,
         tick_bits: int = 32,
     ) -> None:
-        self.resets = self._standing = 0  # samples in a row with an unchanged counter
+        self.resets = self._standing = 0  # the latter: successive samples of an unchanged count
         self._wrap = None if bits is None else 1 << bits
         self._stats = stats
         self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
@@ -75,7 +75,7 @@ class Sequencer:
         return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return ((n,) sequence numbers, (n,) whether to keep each sample); duplicates are not.
+        """Return (n,) sequence numbers, and (n,) whether to keep each sample (no duplicate).
 
         Sequence numbers count from 0 and go on over a reset; a gap in them is a gap in the stream.
         """
@@ -126,7 +126,7 @@ class Sequencer:
         return number
 
     def _find_gap(self, count: int, tick: int) -> int:
-        """Return how many samples are missing before this one; negative: the counter was reset."""
+        """Return the number of samples missing before this one; negative if it is not newer."""
         assert self._wrap is not None
         if self._count is None:
             return 0

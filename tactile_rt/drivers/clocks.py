@@ -43,7 +43,7 @@ COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the de
 FIRST_BUCKET_NS: Final = NS_PER_S // 4  # only the promptest arrival of a bucket is kept
 BUCKETS: Final = 240
 LONGEST_BUCKET_NS: Final = 5 * NS_PER_S // 2  # so that the fit spans ten minutes
-DRIFT_SEEN_AFTER: Final = 1e-3  # s of jitter; over the allowed drift: time until a fit
+DRIFT_SEEN_AFTER: Final = 1e-3  # s of jitter; over the largest drift: s until a slope is fitted
 EARLY_NS: Final = 20_000_000  # a sample this early shows that the device's clock stepped
 # ... and so does one that is only this early, if the promptest arrivals of the last buckets lie
 # within half of that.
@@ -187,7 +187,7 @@ class DeviceClock:
         return np.array(stamps + [self._date_sample(*sample) for sample in waiting], np.int64)
 
     def resume(self) -> None:
-        """Expect any time after a reconnection: the device may have restarted."""
+        """Accept any device time next: it may have restarted before a reconnection."""
         self._tick = None
 
     def _date_sample(self, x: float, step: float, arrived: int) -> int:

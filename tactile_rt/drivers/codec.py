@@ -135,7 +135,7 @@ class Codec(abc.ABC, Generic[Packet]):
         spec: The array that the samples are of; None until the device has described itself. If
             it is set beforehand, the device is not asked.
         measures: Device's side: whether it measures although no host has asked for samples.
-        describes: Whether the device describes itself when started; `spec` is then replaced.
+        describes: Whether the device describes itself when started; `spec` is then a new object.
         serial_number: Serial number that the device has reported; empty for none.
         newest: Device's side: newest sample of a device that measures and does not send, or None.
         commanded_hz: Device's side: rate that hosts have commanded, Hz; None for none.
@@ -176,7 +176,7 @@ class Codec(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def encode(self, chunk: Chunk) -> list[Packet]:
-        """Return the packet that the device sends for each of these samples.
+        """Return the packets that the device sends, one for each sample.
 
         Args:
             chunk: Samples of `spec`; `seq` is the device's counter and `t_ns` its clock, neither

@@ -99,7 +99,7 @@ class DeviceSource(Source):
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
         self._found_empty_ns = 0  # time of the last read that found nothing
-        self._noise_ns = 0  # since when no input is a sample; 0: the last one is
+        self._noise_ns = 0  # since when no input was a sample; 0: the last one was
         self._asked_ns, self._resets = 0, 0  # last request for a description; counter resets then
         self.describes = codec.describes and codec.spec is None
         self._early: list[Samples] = []  # received while the device was being started
@@ -207,7 +207,7 @@ class DeviceSource(Source):
         return stamper.sequencer.numbered + damaged, stamper.elapsed_ns
 
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
-        """Command the whiskers' protraction as offset + amplitude sin(2 pi f t), rad.
+        """Command an active array's protraction: offset + amplitude sin(2 pi f t), rad.
 
         Raises:
             SourceError: this device takes no such command, or is away.

@@ -50,7 +50,7 @@ class Health:
         counter_resets: Number of times that the device's sample counter restarted.
         status: Meanings of the status bits that are set in the newest sample.
         identity: Serial number of the device, or of its USB port; ``unknown`` for none.
-        faults: Meanings of the status bits that are faults and were set within the last second.
+        faults: Meanings of the fault bits set within the second before the newest sample.
     """
 
     state: State

@@ -98,7 +98,7 @@ class SerialLink(Link[bytes]):
                     return None
             data = self._read(self._fd, stalled)
             if not data and timeout_s <= 0 and self._terminal and not self._has_hung_up():
-                return None  # an empty read of a terminal: it only had no input yet
+                return None  # an empty read of a terminal that has not hung up: no input
         except BlockingIOError:
             return None
         except (OSError, ValueError, TypeError) as error:  # closed by now, or unplugged

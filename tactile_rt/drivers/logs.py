@@ -98,10 +98,7 @@ class LineLog:
         self.back = Occurrences("packet")  # whose time is before the previous one
 
     def packets(self) -> Iterator[tuple[Any, int | None]]:
-        """Yield packets, bytes or a CAN frame each, with their times in ns.
-
-        A time is None where the log has none; times never decrease.
-        """
+        """Yield (packet, time in ns or None), in order of time. Packets are bytes or CAN frames."""
         self.notes.clear()
         self.buses.clear()
         self.total = self.frames = 0

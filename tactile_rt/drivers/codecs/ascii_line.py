@@ -282,10 +282,8 @@ class AsciiLine(SerialCodec):
         return row if 2 * missing <= measured else None
 
     def _collect_named(self, text: str, t_ns: int) -> None:
-        """Collect named numbers; a sample ends when it is complete or a name repeats.
-
-        It also ends at a number of the first column, with which each sample begins.
-        """
+        """Collect named numbers. A sample ends when all have come, when a name repeats, or at the
+        name of the first column, with which each sample begins."""
         assert self._names is not None
         while rest := self._names.cut_glued(text):
             self.complaint = f"line {quoted(text)} breaks off in a number, and another begins"

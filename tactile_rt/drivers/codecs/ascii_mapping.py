@@ -146,9 +146,10 @@ class Column:
 
     @classmethod
     def measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
-        """Return a column of measurements of `scale` units each.
+        """Return a column of measurements, whose numbers count `scale` units.
 
-        The unit is one of `UNITS`; empty for the SI unit of a channel with a usual name."""
+        The unit is one of `UNITS`; empty for the SI unit of a channel with a usual name.
+        """
         si, factor, offset = UNITS[unit or _KNOWN.get(channel, "1")]
         return cls("value", scale * factor, offset, 0, element, channel, si)
 

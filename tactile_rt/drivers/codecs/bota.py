@@ -36,8 +36,8 @@ class BotaOptions:
         chop: Whether the device chops its inputs, against offset drift.
         fast: Whether the device's filters settle fast.
         skip_fir: Whether to skip the FIR filter, which is faster and noisier.
-        temperature_compensation: Whether the device's own temperature compensation is on; it is off
-            by default.
+        temperature_compensation: Whether the device's own temperature compensation is on; the
+            maker's default is off.
         temperature: Whether to add the device's temperature (K) as a seventh channel.
         baud: Speed of the line, bit/s: 9600, 57600, 115200, 230400 or 460800.
     """
@@ -92,9 +92,9 @@ class Bota(DescribedFrame):
 
     def encode(self, chunk: Chunk) -> list[bytes]:
         packets = super().encode(chunk)
-        return packets if self._measures_temperature else [self._set_room(p) for p in packets]
+        return packets if self._measures_temperature else [self._set_ambient(p) for p in packets]
 
-    def _set_room(self, packet: bytes) -> bytes:
+    def _set_ambient(self, packet: bytes) -> bytes:
         frame = bytearray(packet)
         struct.pack_into("<f", frame, TEMPERATURE, ROOM)
         return self.frame.seal(frame)

@@ -307,7 +307,7 @@ def _place_count(
 
 
 def _name_words(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
-    """Return words by names, for the elements that have all channels."""
+    """Return words ELEMENT.CHANNEL:UNIT from names, for the elements with all channels."""
     parsed = {k: _parse_name(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())

@@ -106,7 +106,7 @@ class Block:
     ) -> None:  # fmt: skip
         self.numbers, self.gain, self.bias = numbers, gain, bias
         self.cells = np.array(cells, np.intp)  # places in a sample; empty if not delivered
-        self._values, self._name_elements = values, elements
+        self._values, self._elements = values, elements
         self._limited = bool(values.possible or values.valid or values.smallest)
 
     def possible(self, raw: Row) -> NDArray[np.bool_]:
@@ -120,7 +120,7 @@ class Block:
         if not self._limited:
             return
         good = self.possible(raw) & _is_within(raw, self._values.valid)
-        for k, element in enumerate(self._name_elements):
+        for k, element in enumerate(self._elements):
             valid[:, element] &= good[:, k]
 
     def write(self, frame: bytearray, sample: Row) -> None:

@@ -93,10 +93,7 @@ class NativeSerial(SerialCodec):
         return self._decode_any(packet, t_ns)
 
     def _decode_usual(self, packet: bytes, t_ns: int) -> Samples | None:
-        """Return the sample of a packet that is one usual intact frame, or None.
-
-        It is a faster path to the result of `_decode_any`.
-        """
+        """Return the sample of one intact usual frame, else None: faster than `_decode_any`."""
         head = HEADER.unpack_from(packet)
         sync, kind, form, length, status, count, ticks, elements, channels, check = head
         if (

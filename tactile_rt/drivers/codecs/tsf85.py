@@ -2,9 +2,9 @@
 
 A packet is 9A, a CRC that neither side computes, a command, the length of the rest (one byte), and
 signals in sequence: a byte with the type in its high half, the finger in bits 2-3 and an index in
-bits 0-1, then big-endian values. The length byte is too small for a whole set of signals, so a set
-comes in several packets, in no guaranteed order. The host's command 58 sets the period in ms at
-which the device sends sets; 0 stops it.
+bits 0-1, then big-endian values. A packet is too short for a whole set of signals, so a set comes
+in several packets, in no guaranteed order. The host's command 58 sets the period in ms at which the
+device sends sets; 0 stops it.
 
 Sources: facts of the public drivers that go back to Robotiq's tactile sensor interface
 (UsbCommands, UsbSensorType and the scales of the motion sensor, +-2 g and +-250 deg/s).

@@ -83,8 +83,8 @@ class Emulator:
         self._rate = RateConverter(source.spec.rate_hz, codec) if pace == "realtime" else None
         self._seconds = seconds
         self._ahead_ns = QUIET_S * NS_PER_S if faults and not source.live else 0.0
-        self._host_paces = pace == "fast" and not source.live  # the host sets the pace
-        self._streams_at_power_on = codec.streaming  # whether it streams from power-on
+        self._host_paces = pace == "fast" and not source.live
+        self._streams_at_power_on = codec.streaming
         tick_ns = codec.tick_ns or 1.0
         wrap_ns = round(2**codec.tick_bits * tick_ns)
         clock = EmulatedClock(round(start_tick * tick_ns), drift_ppm, wrap_ns)

@@ -57,7 +57,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Send a packet, or queue it; return False without a host or room.
 
         Args:
-            answer: Whether it answers a command: there is always room for that.
+            answer: Whether it answers a command: an answer always has room.
         """
 
     @abc.abstractmethod

@@ -198,7 +198,7 @@ class Pty:
             self._waking = (-1, -1)
 
     def write(self, data: bytes, answer: bool = False, takes_s: float = 0.0) -> bool:
-        """Queue all bytes; return False without a host or room (more for an answer).
+        """Queue all bytes; without a host or room, queue none and return False.
 
         Args:
             takes_s: The time that they take on the wire, s.

@@ -22,7 +22,7 @@ SAME = 1e-3  # relative difference below which rates count as equal
 
 
 class Transmitter:
-    """Encodes and sends samples to an endpoint, with faults; for one thread.
+    """Encodes and sends samples to an endpoint, with faults; one thread at a time.
 
     Attributes:
         end_ns: Time at which the stream ends, on the source's clock, ns; no fault happens just
@@ -201,7 +201,7 @@ class EmulatedClock:
             self._ppm, self._drift_ends = self._base_ppm, np.inf
 
     def drift(self, t_ns: int, ppm: float, duration_s: float) -> None:
-        """Set the drift from now on, for this duration; 0: until the end."""
+        """Set the drift, ppm, from now on for this duration, s; 0: until the end."""
         self._anchor(t_ns)
         self._ppm = ppm
         self._drift_ends = t_ns + duration_s * NS_PER_S if duration_s else np.inf
