@@ -17,7 +17,7 @@ its steps count, modulo its width:
   Several samples may share one reading of the clock, as those of one packet do: a clock that
   stands still between two samples is no sign of a restart;
 - if the clock shows how many samples passed, it also reveals gaps beyond the counter's width, and
-  distinguishes a gap of more than half of it from a step back.
+  distinguishes a gap of more than half that width from a step back.
 
 For a device without a counter, only damage can be counted.
 """

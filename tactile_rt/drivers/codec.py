@@ -203,7 +203,7 @@ class Codec(abc.ABC, Generic[Packet]):
         return packet[:0]
 
     streaming = True  # the device's side: whether it sends without being asked, now
-    status = 0  # the device's side: status bits of what it sends, where the codec sends them
+    status = 0  # the device's side: status bits to send, where the codec has them
     polled = 0  # the device's side: samples asked for and not yet sent
     polls = False  # the host's side: whether each sample must be asked for (`Command.POLL`)
 

@@ -27,7 +27,7 @@ from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
 
 @dataclass(frozen=True)
 class Prepared:
-    """A source that can be opened, with what is known before.
+    """A source that can be opened, with its array if known in advance.
 
     Attributes:
         spec: The array that the samples will be of; None if the device must describe it.
@@ -222,12 +222,12 @@ def _prepare(
 ) -> Prepared:
     """Prepare a source, and read its calibration file; opening the result opens the line."""
     written = {k: v for k, v in fields.items() if k in codec.Options.__dataclass_fields__}
-    told = array if codec.spec is None else None
-    if told is not None:
-        codec.spec = told
-        written["array"] = told.to_json()  # without it a recording's packets say nothing
+    declared_array = array if codec.spec is None else None
+    if declared_array is not None:
+        codec.spec = declared_array
+        written["array"] = declared_array.to_json()  # needed to decode a recording's packets
     opened = partial(DeviceSource, connect, codec, options, name, written)
-    prepared = Prepared(codec.spec, opened, told is not None)
+    prepared = Prepared(codec.spec, opened, declared_array is not None)
     if not options.calibration:
         return prepared
     return prepared.calibrated(load_calibration(options.calibration))
