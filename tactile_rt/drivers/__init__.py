@@ -1,8 +1,8 @@
-"""Drivers for real arrays, and devices that only pretend.
+"""Drivers for real arrays, and emulated devices.
 
 links  --bytes, frames-->  codecs/  --samples-->  accounting, clocks  --chunks-->  device_source
-emulation/: any source's samples spoken by any codec over a real line, faults included
+emulation/: the samples of any source, encoded by any codec, sent over a real line, with faults
 
-codec: what a codec is, and which there are; opening: from a URL to a source; discovery: what is
-plugged in, and what may be in the way; health: how a device is doing; slcan: CAN over serial lines.
+codec: the interface of all codecs; opening: from a URL to a source; discovery: connected ports and
+buses, and their problems; health: the state of a device; slcan: CAN over serial lines.
 """

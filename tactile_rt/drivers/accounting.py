@@ -1,25 +1,25 @@
-"""Which samples came, came twice or never, by the device's own counter.
+"""Accounting of lost and duplicate samples by the device's own counter.
 
-What is needed is one sum that adds up, whatever happens on the wire:
+Requirement: this sum adds up, whatever happens on the wire:
 
     sent + duplicated = delivered + corrupt + missing + dropped + duplicates
 
 The left side is the device's, the right side `SourceStats`. A sample number counts from 0, goes on
 over restarts of the device, and has a gap exactly where the stream has one.
 
-The plan. A device's counter is narrow, may begin anywhere and begins anew with the device. So only
+Method. A device's counter is narrow, may begin anywhere and starts again with the device. So only
 its steps count, modulo its width:
-- a sample with the counter and the very content of one that came lately is a copy of it;
+- a sample with the counter and the exact content of a recent one is a copy of it;
 - a step of one is the next sample; a step of g + 1 is a gap of g. If d damaged frames came within
   the gap, min(d, g) of it count as corrupt and the rest as missing: noise looks like damage, too;
-- a step back means that the counter has begun anew, and so does one far ahead while the device's
-  clock hardly moved or went back. What was lost around a restart nobody knows, so nothing is
-  counted. Several samples may share one reading of the clock, as those of one packet do: a clock
-  that stands still between two samples is no sign of a restart;
-- where the clock tells how many samples passed, it tells gaps beyond the counter's width, too, and
-  a gap of more than half of it from a step back.
+- a step back means that the counter was reset, and so does a step far ahead while the device's
+  clock hardly moved or went back. The losses around a restart are unknown, so none are counted.
+  Several samples may share one reading of the clock, as those of one packet do: a clock that
+  stands still between two samples is no sign of a restart;
+- if the clock shows how many samples passed, it also reveals gaps beyond the counter's width, and
+  distinguishes a gap of more than half that width from a step back.
 
-A device without a counter can show damage only.
+For a device without a counter, only damage can be counted.
 """
 
 import numpy as np
@@ -28,15 +28,15 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codec import Samples
 
-REMEMBERED = 1024  # samples back that a repeated one is looked for
+REMEMBERED = 1024  # last samples among which a duplicate is searched
 HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
-RATE_TOLERANCE = 0.02  # of the nominal rate, when the clock is to tell how many samples passed
-STANDING = 5  # samples in a row that have the count of the one before: it counts nothing
+RATE_TOLERANCE = 0.02  # of the nominal rate, where the clock shows how many samples passed
+STANDING = 5  # samples in a row with an unchanged count: the counter is useless
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
 class Sequencer:
-    """Numbers samples and counts what is lost, as the head of this module says.
+    """Numbers samples and counts losses, by the method described in this module's docstring.
 
     Args:
         bits: Width of the device's counter, which wraps at 2^bits; None for a device without one.
@@ -45,7 +45,7 @@ class Sequencer:
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
 
     Attributes:
-        numbered: How many numbers have been given, those of gaps too.
+        numbered: Number of samples numbered so far, including those lost in gaps.
     """
 
     def __init__(
@@ -55,27 +55,27 @@ class Sequencer:
         period_ticks: float | None = None,
         tick_bits: int = 32,
     ) -> None:
-        self.resets = self._standing = 0  # samples in a row whose counter has not gone on
+        self.resets = self._standing = 0  # the latter: successive samples of an unchanged count
         self._wrap = None if bits is None else 1 << bits
         self._stats = stats
         self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
         self._count: int | None = None  # of the newest sample
         self._tick = 0
-        self._run = self._longest_run = 0  # steps of the counter within one reading of the clock
+        self._steps_in_tick = self._most_steps_in_tick = 0  # of the counter, per clock reading
         self._damaged = 0  # frames since the newest sample
         self.numbered = 0
-        self._seen: dict[int, None] = {}  # of the last samples, oldest first: what was in it
-        # Without a clock, a sample of an earlier turn can look like this one.
+        self._seen: dict[int, None] = {}  # hashes of the last samples, oldest first
+        # Without a clock, a sample of an earlier turn of the counter can look like this one.
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
 
     @property
     def useless(self) -> bool:
-        """Whether the counter stands, and shows no loss."""
+        """Whether the counter stands still, so that it shows no loss."""
         return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """((n,) sequence numbers, (n,) which samples to keep); the others came before.
+        """Return (n,) sequence numbers, and (n,) whether to keep each sample (no duplicate).
 
         Sequence numbers count from 0 and go on over a reset; a gap in them is a gap in the stream.
         """
@@ -88,7 +88,7 @@ class Sequencer:
         ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
         counts = samples.count.tolist()
         seq = [
-            self._number(counts[i], ticks[i], damaged[i], samples.values[i].tobytes())
+            self._number_sample(counts[i], ticks[i], damaged[i], samples.values[i].tobytes())
             for i in range(n)
         ]
         if None not in seq:
@@ -96,11 +96,11 @@ class Sequencer:
         keep = np.array([number is not None for number in seq], np.bool_)
         return np.array([number or 0 for number in seq], np.int64), keep
 
-    def _number(self, count: int, tick: int, damaged: int, values: bytes) -> int | None:
-        """The number of one sample; None: it came before."""
+    def _number_sample(self, count: int, tick: int, damaged: int, values: bytes) -> int | None:
+        """Return the number of one sample; None if it is a duplicate."""
         content = hash((count, tick, values))
         self._damaged += damaged
-        gap = self._gap(count, tick)
+        gap = self._find_gap(count, tick)
         # While the clock stands still, the same content may be a sample of a later turn.
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
@@ -109,10 +109,10 @@ class Sequencer:
         if gap < 0:
             self.resets += not self.useless
             self._seen.clear()
-            self._run = gap = 0
+            self._steps_in_tick = gap = 0
         elif self._count is not None:
-            self._run = self._run + gap + 1 if tick == self._tick else 0
-            self._longest_run = max(self._longest_run, self._run)
+            self._steps_in_tick = self._steps_in_tick + gap + 1 if tick == self._tick else 0
+            self._most_steps_in_tick = max(self._most_steps_in_tick, self._steps_in_tick)
         if gap:
             corrupt = min(self._damaged, gap)
             self._stats.corrupt += corrupt
@@ -125,8 +125,8 @@ class Sequencer:
             del self._seen[next(iter(self._seen))]
         return number
 
-    def _gap(self, count: int, tick: int) -> int:
-        """Samples between the newest one and this; negative: none, it is not after it."""
+    def _find_gap(self, count: int, tick: int) -> int:
+        """Return the number of samples missing before this one; negative if it is not newer."""
         assert self._wrap is not None
         if self._count is None:
             return 0
@@ -135,7 +135,7 @@ class Sequencer:
             return 0
         forward = 0 < ahead <= self._wrap // 2
         period = self._period_ticks
-        if period is None or ahead * period >= self._tick_wrap / 2:  # the clock tells nothing
+        if period is None or ahead * period >= self._tick_wrap / 2:  # the clock is ambiguous
             return ahead - 1 if forward else -1
         passed = (tick - self._tick) % self._tick_wrap
         if passed > self._tick_wrap // 2 and self._tick_wrap >= LEAST_TURN * period:
@@ -143,7 +143,7 @@ class Sequencer:
         steps = ahead or self._wrap
         expected = passed / period
         steps += self._wrap * max(0, round((expected - steps) / self._wrap))
-        margin = 1 + self._longest_run + RATE_TOLERANCE * expected
+        margin = 1 + self._most_steps_in_tick + RATE_TOLERANCE * expected
         if margin < self._wrap / 2 and abs(steps - expected) <= margin:
             return steps - 1
         hardly = 0 < passed < HARDLY * ahead * period

@@ -1,6 +1,6 @@
-"""Which codecs there are, by wire and name: where each is, and the devices that speak it.
+"""Catalogue of the codecs by wire and name: the place of each, and its devices.
 
-Nothing of a codec is imported here, so that `tactile-rt codecs` answers at once.
+No codec is imported here, so that `tactile-rt codecs` answers at once.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ class Entry(NamedTuple):
     """A codec of the catalogue.
 
     Attributes:
-        attribute: The name of its class there; of a described frame, its file in `FRAMES`.
+        attribute: Name of its class in the module; for a described frame, its file in `FRAMES`.
     """
 
     module: str
@@ -52,7 +52,7 @@ CODECS = {
     ("can", "icub_skin"): _entry("icub_skin:IcubSkin", "iCub skin: boards of 16 triangles"),
 }
 FRAMES = Path(__file__).with_name("codecs") / "frames"
-# A device whose frame is described, and which needs no more: its first comment says what it is.
+# Devices that need only a description of their frame; its first comment names the device.
 for _file in sorted(FRAMES.glob("*.toml")):
     if ("serial", _file.stem) not in CODECS:
         with _file.open(encoding="utf-8") as _text:

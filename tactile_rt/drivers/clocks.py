@@ -1,32 +1,32 @@
-"""When each sample was taken: from a device's clock or counter to times in ns.
+"""Time stamps of samples in ns, from a device's clock, its counter or the arrivals.
 
-What is needed
+Requirements
 - A sample gets the time at which it was measured, not that at which it arrived: a USB adapter
   hands over 16 ms of samples at once, and a busy host reads them later still.
-- It gets it at once, without waiting for what comes later; times increase strictly, and none is
-  after its arrival where that can be.
+- It gets it at once, without waiting for later input; times increase strictly, and none is after
+  its arrival if possible.
 - Quartzes differ by up to 200 ppm, counters wrap, devices restart and clocks jump: all of this is
-  followed, and none of it costs a sample.
-- Live and replayed packets take one way, so that a recording decodes as the stream did.
+  followed without losing a sample.
+- Live and replayed packets take one path, so that a recording decodes as the stream did.
 
-The plan. `Stamper` makes chunks of what a codec found: `Sequencer` numbers the samples, then the
-best clock that there is dates them:
-- the device's own time, on the host's clock (`DeviceClock`);
-- if it sends a counter only, that, as a clock whose tick is the nominal period;
-- if it sends neither, its steady rate: samples are counted as they come, and that is its clock
-  (`SteadyClock`); where the rate is not steady, the arrivals, those of one packet spread over the
+Method. `Stamper` makes chunks of a codec's samples: `Sequencer` numbers the samples, then the best
+available clock dates them:
+- the device's own time, mapped to the host's clock (`DeviceClock`);
+- if it sends a counter only, the counter, as a clock whose tick is the nominal period;
+- if it sends neither, its steady rate: the number of samples received is the clock
+  (`SteadyClock`); if the rate is not steady, the arrivals, those of one packet spread over the
   time before (`host_stamps`);
-- on demand (``clock=device``), the device's own time as it is (`DeviceTime`).
+- on demand (``clock=device``), the device's own time, unmapped (`DeviceTime`).
 
-How `DeviceClock` finds offset and drift. A sample cannot arrive before it was taken, so of all
-arrivals the promptest bound the offset from one side: the line that lies under all points (device
+Estimation of offset and drift in `DeviceClock`. A sample cannot arrive before it was taken, so the
+promptest arrivals bound the offset from one side: the line that lies under all points (device
 time, arrival - device time) and nearest to them on average is an edge of their lower convex hull
 (Moon, Skelly and Towsley 1999, INFOCOM). Bursts and a busy host only add delay above that line, and
-so do not matter. What cannot be known is the delay that the promptest sample has, too. Only the
-promptest point of each bucket of time is kept, and buckets double in length until ten minutes fit
-into 240, so that memory and work stay small. Between two fits an arrival below the line pushes it
-down at once. Far below it means that the device's clock stepped; far above it for seconds, that it
-stepped back: then the fit begins anew.
+so do not matter. The delay that even the promptest sample has cannot be known. Only the promptest
+point of each bucket of time is kept, and buckets double in length until ten minutes fit into 240,
+so that memory and work stay small. Between two fits an arrival below the line moves the line down
+at once. An arrival far below it means that the device's clock stepped forward, arrivals far above
+it for seconds that it stepped back: then the fit starts again.
 """
 
 from collections.abc import Sequence
@@ -40,41 +40,41 @@ from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Codec, Samples
 
 COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the device's only clock
-FIRST_BUCKET_NS: Final = NS_PER_S // 4  # of each only the promptest arrival is kept
+FIRST_BUCKET_NS: Final = NS_PER_S // 4  # only the promptest arrival of a bucket is kept
 BUCKETS: Final = 240
-LONGEST_BUCKET_NS: Final = 5 * NS_PER_S // 2  # so ten minutes are looked back on
-DRIFT_SEEN_AFTER: Final = 1e-3  # s of uncertainty over the allowed drift: when a slope means much
-EARLY_NS: Final = 20_000_000  # a sample this early is no prompt one: the device's clock stepped
-# ... and one that is only this early, where the promptest of each of the last buckets were within
-# half of that.
+LONGEST_BUCKET_NS: Final = 5 * NS_PER_S // 2  # so that the fit spans ten minutes
+DRIFT_SEEN_AFTER: Final = 1e-3  # s of jitter; over the largest drift: s until a slope is fitted
+EARLY_NS: Final = 20_000_000  # a sample this early shows that the device's clock stepped
+# ... and so does one that is only this early, if the promptest arrivals of the last buckets lie
+# within half of that.
 PROMPT_EARLY_NS: Final = 4_000_000
 PROMPT_BUCKETS: Final = 8
-LATE_NS: Final = 30_000_000  # so late for ...
-LATE_FOR_NS: Final = 2 * NS_PER_S  # ... so long: it stepped back
+LATE_NS: Final = 30_000_000  # samples this late ...
+LATE_FOR_NS: Final = 2 * NS_PER_S  # ... for this long show that it stepped back
 LEAST_STEP: Final = 0.5  # of the device's, between two samples when the estimate moves back
 LONG_NS: Final = 60_000_000_000  # a clock that wraps sooner cannot show that it went back
-STEADY_TOLERANCE, STRAYED = 1.5, 0.5  # drift that is tried, and that of a rate that is another
-SETTLED_NS: Final = 2 * NS_PER_S  # when the rate is known well enough
+STEADY_TOLERANCE, STRAYED = 1.5, 0.5  # largest drift fitted; above the latter, use arrivals
+SETTLED_NS: Final = 2 * NS_PER_S  # after which the rate is known well enough
 LOST, LOST_NS, LOST_PACKETS = 0.7, NS_PER_S // 4, 8  # periods late, for so long, in so many packets
-SILENCE_NS, SILENT_PERIODS = NS_PER_S // 10, 5  # after which the count begins anew
-OFTEN, OFTEN_NS = 5, 10 * NS_PER_S  # samples lost within this: the count says little of the time
+SILENCE_NS, SILENT_PERIODS = NS_PER_S // 10, 5  # after which the count starts again
+OFTEN, OFTEN_NS = 5, 10 * NS_PER_S  # losses within this time, beyond which arrivals date samples
 
 
 class Stamper:
-    """Numbers and times a device's samples.
+    """Numbers and dates a device's samples.
 
     Args:
-        codec: The codec of the device, which says what counter and clock there are.
-        steady: False for a log, whose own times date what has neither time nor count.
+        codec: The codec of the device, which specifies its counter and clock.
+        steady: False for a log: its own times date samples that have neither time nor count.
 
     Attributes:
         clock: The clock that dates the samples; None for a device that sends neither time nor
             count.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
-        elapsed_ns: Time that the device's clock told until the newest sample, ns; of a device that
-            sends no time, host time of its arrival.
+        elapsed_ns: Time elapsed on the device's clock until the newest sample, ns; for a device
+            that sends no time, host time of its arrival.
         status: Status bits of the newest sample.
-        told_ns: When the newest sample arrived that had a bit of the status set, ns, by bit.
+        told_ns: Host time at which the last sample with a status bit set arrived, ns, by bit.
     """
 
     def __init__(
@@ -95,15 +95,15 @@ class Stamper:
             self.clock = DeviceClock(NS_PER_S / spec.rate_hz, codec.count_bits, COUNTED_TOLERANCE)
 
     def resume(self) -> None:
-        """The device was away."""
+        """Prepare for samples after a reconnection."""
         self._steady.resume()
         if self.clock is not None:
             self.clock.resume()
 
     def chunk(self, samples: Samples) -> Chunk | None:
-        """The samples that have not come before, or None."""
+        """Return the samples that are no duplicates, numbered and dated; None if none."""
         if samples.values.shape[1:] != self._shape:
-            return None  # the codec has counted it
+            return None  # the codec has counted them
         seq, keep = self.sequencer.number(samples)
         arrived, ticks, count = samples.arrived_ns, samples.ticks, samples.count
         values, valid = samples.values, samples.valid
@@ -126,9 +126,9 @@ class Stamper:
             self.elapsed_ns += round(passed * self._tick_ns)
         if samples.status is not None:
             self.status = int(samples.status[-1])
-            if said := int(np.bitwise_or.reduce(samples.status)):
-                told = {bit: self.newest_ns for bit in range(said.bit_length()) if said >> bit & 1}
-                self.told_ns = {**self.told_ns, **told}
+            if bits := int(np.bitwise_or.reduce(samples.status)):
+                now = {bit: self.newest_ns for bit in range(bits.bit_length()) if bits >> bit & 1}
+                self.told_ns = {**self.told_ns, **now}
         if valid.shape != values.shape[:2]:
             valid = np.broadcast_to(valid, values.shape[:2])
         return Chunk(seq, t_ns, values, valid)
@@ -140,11 +140,11 @@ class DeviceClock:
     Args:
         tick_ns: Nominal length of a tick, ns.
         bits: Width of the device's clock, which wraps at 2^bits.
-        tolerance: Largest drift that is believed, as a fraction (a quartz is within 2e-4).
+        tolerance: Largest drift that is fitted, as a fraction (a quartz is within 2e-4).
 
     Attributes:
         drift: Excess speed of the host's clock over the device's, as a fraction.
-        steps: Number of times that the device's clock jumped or began anew while it was connected.
+        steps: Number of times that the device's clock jumped or restarted while it was connected.
     """
 
     def __init__(self, tick_ns: float, bits: int, tolerance: float = 5e-4) -> None:
@@ -153,9 +153,9 @@ class DeviceClock:
         self._tick_ns, self._wrap, self._tolerance = tick_ns, 1 << bits, tolerance
         self._drift_after_ns = min(5 * NS_PER_S, round(NS_PER_S * DRIFT_SEEN_AFTER / tolerance))
         self._tick: int | None = None  # of the last sample
-        self._arrived = self._told = 0
+        self._arrived = self._stamp_ns = 0  # host times of the last sample: arrival and stamp
         self._x = 0.0  # device time of the last sample since the base
-        self._begin(0)
+        self._restart_fit(0)
 
     @property
     def drift_ppm(self) -> float:
@@ -163,67 +163,67 @@ class DeviceClock:
         return 1e6 * self.drift
 
     def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n,) host times of samples, ns: strictly increasing, none after its arrival if possible.
+        """Return (n,) host times of samples, ns: increasing, not after arrival if possible.
 
         Args:
             arrived_ns: Host times of arrival, (n,), ns, never decreasing.
         """
-        told: list[int] = []
-        waiting: list[tuple[float, float, int]] = []  # device time, since the last, arrival
+        stamps: list[int] = []
+        waiting: list[tuple[float, float, int]] = []  # device time, its step, arrival
         for tick, arrived in zip(ticks.tolist(), arrived_ns.tolist(), strict=True):
-            step = self._step(tick, arrived)
+            step = self._measure_step(tick, arrived)
             x = self._x + step
-            early = arrived - self._base - x - self._a - self.drift * x < -self._early_ns
+            early = arrived - self._base - x - self._offset - self.drift * x < -self._early_ns
             if self._tick is None or early:
-                # In a backlog, samples are early only against a first one that came late.
+                # In a backlog, samples are early only relative to a first one that came late.
                 self.steps += step - (arrived - self._arrived) > self._early_ns
-                told += [self._tell(*sample) for sample in waiting]
+                stamps += [self._date_sample(*sample) for sample in waiting]
                 waiting, x, step = [], 0.0, 0.0
-                self._begin(arrived)
+                self._restart_fit(arrived)
             self._x, self._tick, self._arrived = x, tick, arrived
-            self._observe(x, arrived)
+            self._add_arrival(x, arrived)
             waiting.append((x, step, arrived))
-        # told only now: the last sample of a packet is the promptest, and dates the others
-        return np.array(told + [self._tell(*sample) for sample in waiting], np.int64)
+        # dated only now: the last sample of a packet is the promptest, and dates the others
+        return np.array(stamps + [self._date_sample(*sample) for sample in waiting], np.int64)
 
     def resume(self) -> None:
-        """The device was away: its clock may have begun anew."""
+        """Accept any device time next: it may have restarted before a reconnection."""
         self._tick = None
 
-    def _tell(self, x: float, step: float, arrived: int) -> int:
-        """Host time of a sample, by what is known of the clock now."""
-        t = min(self._base + round(x + self._a + self.drift * x), arrived)
-        room = min(LEAST_STEP * step, arrived - self._told)
-        self._told = max(t, self._told + max(1, round(room)))
-        return self._told
+    def _date_sample(self, x: float, step: float, arrived: int) -> int:
+        """Return the host time of a sample by the current fit of the clock."""
+        t = min(self._base + round(x + self._offset + self.drift * x), arrived)
+        room = min(LEAST_STEP * step, arrived - self._stamp_ns)
+        self._stamp_ns = max(t, self._stamp_ns + max(1, round(room)))
+        return self._stamp_ns
 
-    def _step(self, tick: int, arrived: int) -> float:
-        """Device time since the last sample, ns."""
+    def _measure_step(self, tick: int, arrived: int) -> float:
+        """Return the device time since the last sample, ns."""
         if self._tick is None:
             return 0.0
         ticks = (tick - self._tick) % self._wrap
-        # a short counter may have wrapped more than once meanwhile
+        # a short counter may have wrapped more than once since then
         missed = (arrived - self._arrived) / self._tick_ns - ticks
         if missed > self._wrap / 2:
             ticks += self._wrap * round(missed / self._wrap)
         return ticks * self._tick_ns
 
-    def _begin(self, arrived: int) -> None:
+    def _restart_fit(self, arrived: int) -> None:
         self._base, self._x = arrived, 0.0
         self._points: list[tuple[float, float]] = []  # promptest of each bucket
         self._bucket_ns = FIRST_BUCKET_NS
-        self._opened, self._best = 0.0, (0.0, 0.0)
-        self._a = 0.0
+        self._bucket_start, self._bucket_best = 0.0, (0.0, 0.0)
+        self._offset = 0.0
         self._late_since: int | None = None  # host time
         self._late_best = (0.0, 0.0)
         self._early_ns = EARLY_NS
 
-    def _observe(self, x: float, arrived: int) -> None:
+    def _add_arrival(self, x: float, arrived: int) -> None:
         d = float(arrived - self._base - x)
         below = d - self.drift * x
-        late = below - self._a
+        late = below - self._offset
         if late < 0:
-            self._a += late  # the line is under all points, now
+            self._offset += late  # the line is under all points again
         if late < LATE_NS:
             self._late_since = None
         elif self._late_since is None:
@@ -235,18 +235,18 @@ class DeviceClock:
                 best_x, best_d = self._late_best
                 self.steps += 1
                 self._points, self._bucket_ns = [], FIRST_BUCKET_NS
-                self._opened, self._best, self._late_since = x, (x, d), None
-                self._a = best_d - self.drift * best_x
+                self._bucket_start, self._bucket_best, self._late_since = x, (x, d), None
+                self._offset = best_d - self.drift * best_x
                 return
-        if x - self._opened > self._bucket_ns:
-            self._points.append(self._best)
-            self._opened, self._best = x, (x, d)
-            self._forget_old()
+        if x - self._bucket_start > self._bucket_ns:
+            self._points.append(self._bucket_best)
+            self._bucket_start, self._bucket_best = x, (x, d)
+            self._thin_points()
             self._fit()
-        elif below < self._best[1] - self.drift * self._best[0]:
-            self._best = (x, d)
+        elif below < self._bucket_best[1] - self.drift * self._bucket_best[0]:
+            self._bucket_best = (x, d)
 
-    def _forget_old(self) -> None:
+    def _thin_points(self) -> None:
         if len(self._points) < BUCKETS:
             return
         if self._bucket_ns >= LONGEST_BUCKET_NS:
@@ -257,19 +257,19 @@ class DeviceClock:
         self._points = [min(pair, key=lambda p: p[1] - self.drift * p[0]) for pair in pairs]
 
     def _fit(self) -> None:
-        points = [*self._points, self._best]
+        points = [*self._points, self._bucket_best]
         if points[-1][0] - points[0][0] >= self._drift_after_ns:
             slope = _slope_below(points)
             self.drift = min(max(slope, -self._tolerance), self._tolerance)
         above = [d - self.drift * x for x, d in points]
-        self._a = min(above)
+        self._offset = min(above)
         last = above[-PROMPT_BUCKETS:]
-        prompt = len(last) == PROMPT_BUCKETS and max(last) - self._a < PROMPT_EARLY_NS / 2
+        prompt = len(last) == PROMPT_BUCKETS and max(last) - self._offset < PROMPT_EARLY_NS / 2
         self._early_ns = PROMPT_EARLY_NS if prompt else EARLY_NS
 
 
 def _slope_below(points: Sequence[tuple[float, float]]) -> float:
-    """Slope of the line under all points that is nearest to them on average."""
+    """Return the slope of the line under all points and nearest to them on average."""
     hull: list[tuple[float, float]] = []
     for x, d in points:
         while len(hull) > 1:
@@ -288,32 +288,32 @@ def _slope_below(points: Sequence[tuple[float, float]]) -> float:
 class SteadyClock:
     """Dates samples of a device without clock or counter by its steady rate.
 
-    That a sample is lost without a trace shows in all later ones, which come a period late. In the
-    first two seconds, also after a silence, and where the rate is far from the nominal, samples are
-    dated by their arrival.
+    A lost sample shows in all later ones, which come a period late. In the first two seconds, also
+    after a silence, and if the rate is far from nominal or losses are frequent, samples are dated
+    by their arrival.
 
     Args:
         period_ns: Nominal time between samples, ns.
         steady: False dates all samples by their arrival.
 
     Attributes:
-        lost: Number of samples that are missing, by the time at which others came.
+        lost: Number of missing samples, estimated from the arrivals of later ones.
     """
 
     def __init__(self, period_ns: int, steady: bool = True) -> None:
         self.lost = 0
-        self._period_ns, self._told, self._strayed = period_ns, 0, not steady
+        self._period_ns, self._stamp_ns, self._unsteady = period_ns, 0, not steady
         self.resume()
 
     def resume(self) -> None:
-        """The device was away."""
+        """Start counting again after a reconnection or a silence."""
         self._clock = DeviceClock(self._period_ns, 62, STEADY_TOLERANCE)
         self._count, self._began = 0, -1
-        self._late: list[tuple[int, int]] = []  # arrival of the newest packets, and how late
-        self._losses: list[int] = []  # when samples were lost
+        self._late: list[tuple[int, int]] = []  # arrivals of the newest packets, and delays, ns
+        self._losses: list[int] = []  # times of lost samples
 
     def to_host(self, arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n,) host times of the samples of one packet, ns: strictly increasing."""
+        """Return (n,) host times of the samples of one packet, ns, strictly increasing."""
         n, last = len(arrived_ns), int(arrived_ns[-1])
         silent_ns = last - self._late[-1][0] if self._late else 0
         if silent_ns > max(SILENCE_NS, SILENT_PERIODS * self._period_ns, 4 * n * self._period_ns):
@@ -326,12 +326,12 @@ class SteadyClock:
         late_ns = last - int(t_ns[-1])
         settled = last - self._began > SETTLED_NS
         self._losses = [at for at in self._losses if last - at < OFTEN_NS]
-        self._strayed = self._strayed or (settled and abs(self._clock.drift) > STRAYED)
-        if self._strayed or not settled or len(self._losses) >= OFTEN:
-            t_ns = host_stamps(arrived_ns, self._told, self._period_ns)
-        elif t_ns[0] <= self._told:
-            t_ns = np.maximum(t_ns, self._told + 1 + np.arange(n))
-        self._told = int(t_ns[-1])
+        self._unsteady = self._unsteady or (settled and abs(self._clock.drift) > STRAYED)
+        if self._unsteady or not settled or len(self._losses) >= OFTEN:
+            t_ns = host_stamps(arrived_ns, self._stamp_ns, self._period_ns)
+        elif t_ns[0] <= self._stamp_ns:
+            t_ns = np.maximum(t_ns, self._stamp_ns + 1 + np.arange(n))
+        self._stamp_ns = int(t_ns[-1])
         self._count_lost(last, late_ns, settled)
         return t_ns
 
@@ -351,15 +351,15 @@ class SteadyClock:
 
 
 class DeviceTime:
-    """Stands in for `DeviceClock`: gives the device's time instead of the host's.
+    """Substitute for `DeviceClock` that gives the device's time instead of the host's.
 
-    The first sample has the time that its clock shows. A clock that leaps forward makes a silence;
-    one that goes back or begins anew goes on from the last sample's time after the time that passed
-    on the host's clock.
+    The first sample has the time of the device's clock. If the clock leaps forward, the stream has
+    a silence. If it goes back or restarts, time goes on from the last sample by the time that
+    passed on the host's clock.
 
     Attributes:
         drift_ppm: Always 0, since no other clock is compared with this one.
-        steps: Number of times that the clock went back or began anew.
+        steps: Number of times that the clock went back or restarted.
     """
 
     drift_ppm = 0.0
@@ -369,12 +369,12 @@ class DeviceTime:
         self._tick_ns, self._wrap = tick_ns, 1 << bits
         self._can_go_back = self._wrap * tick_ns >= LONG_NS
         self._tick: int | None = None  # of the last sample
-        self._arrived = self._told = 0
-        self._ticks, self._origin = 0, 0  # since the clock began, and its time then, ns
+        self._arrived = self._stamp_ns = 0  # of the last sample: arrival and stamp, ns
+        self._ticks, self._origin = 0, 0  # ticks since the clock started, and its time then, ns
 
     def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n,) device times of samples, ns: strictly increasing."""
-        told = np.empty(len(ticks), np.int64)
+        """Return (n,) device times of samples, ns, strictly increasing."""
+        stamps = np.empty(len(ticks), np.int64)
         for i, (tick, arrived) in enumerate(zip(ticks.tolist(), arrived_ns.tolist(), strict=True)):
             if self._tick is None:
                 self._ticks = tick
@@ -382,30 +382,30 @@ class DeviceTime:
                 ahead = (tick - self._tick) % self._wrap
                 if self._can_go_back and ahead > self._wrap // 2:
                     self.steps += 1
-                    self._origin = self._told + max(1, arrived - self._arrived)
+                    self._origin = self._stamp_ns + max(1, arrived - self._arrived)
                     self._ticks = 0
                 else:
                     self._ticks += ahead
             t = self._origin + round(self._ticks * self._tick_ns)
-            self._told = t if self._tick is None else max(t, self._told + 1)
+            self._stamp_ns = t if self._tick is None else max(t, self._stamp_ns + 1)
             self._tick, self._arrived = tick, arrived
-            told[i] = self._told
-        return told
+            stamps[i] = self._stamp_ns
+        return stamps
 
     def resume(self) -> None:
-        """The device was away; its clock tells whether it began anew."""
+        """Do nothing after a reconnection: the ticks themselves show a restart."""
 
 
 def host_stamps(arrived_ns: NDArray[np.int64], before_ns: int, period_ns: int) -> NDArray[np.int64]:
-    """(n,) times for samples of a device that tells neither time nor count.
+    """Return (n,) times for samples of a device that sends neither time nor count.
 
     Samples that arrive together were not taken together: they are spread over the time before
-    their arrival, a nominal period apart or as much as fits after the sample before.
+    their arrival, a nominal period apart, or less if the previous sample leaves less room.
 
     Args:
         arrived_ns: Host times at which the samples of one packet arrived, (n,), ns, never
             decreasing.
-        before_ns: Time given to the sample before these, ns.
+        before_ns: Time given to the previous sample, ns.
         period_ns: Nominal time between samples, ns.
     """
     n = len(arrived_ns)

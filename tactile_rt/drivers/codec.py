@@ -1,10 +1,10 @@
-"""What a device speaks: bytes or CAN frames to samples, and back.
+"""Interface of the codecs, which convert bytes or CAN frames to samples, and back.
 
     wire --> Codec.feed --> Samples --> source (sequence, clock) --> Chunk
     Chunk --> Codec.encode --> wire          (an emulated device, answering by Codec.respond)
 
-A codec is pure: no I/O, no clock, no thread. What comes over a wire is never trusted and never
-raises: what fails a check is counted in `stats`.
+A codec is pure: no I/O, no clock, no thread. It trusts no input from the wire and never raises
+because of it: input that fails a check is counted in `stats`.
 """
 
 import abc
@@ -27,7 +27,7 @@ SIX_AXES = {**dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my
 
 
 class Command(StrEnum):
-    """What a host tells a device; see `Codec.commands`."""
+    """A command from a host to a device; see `Codec.commands`."""
 
     START = "start"  # after connecting: configure it and let it stream
     STOP = "stop"  # before closing
@@ -56,15 +56,15 @@ Packet = TypeVar("Packet", bytes, Sequence[CanFrame])
 
 @dataclass(frozen=True)
 class Step(Generic[Packet]):
-    """One thing to send to a device, and what to wait for.
+    """A packet to send to a device, and the answer to wait for.
 
     Attributes:
-        send: The packet to send; an empty one means that the host only waits.
-        expect: What the answer contains, bytes or the identifier of a CAN frame; None when no
-            answer is awaited.
+        send: The packet to send; if empty, the host only waits.
+        expect: Bytes in the answer, or the identifier of its CAN frame; None to wait for no
+            answer.
         timeout_s: Longest time that the answer may take, s; a device that does not answer in time
-            counts as not there.
-        pause_s: Time to wait before the next step, answer or not, s.
+            counts as absent.
+        pause_s: Time to wait before the next step, answered or not, s.
     """
 
     send: Packet
@@ -76,18 +76,18 @@ class Step(Generic[Packet]):
 
 @dataclass(eq=False, slots=True)
 class Samples:
-    """n >= 1 samples as the device numbers and times them.
+    """n >= 1 samples with the device's own numbers and times.
 
     Attributes:
         values: Measured values, (n, element, channel) float32, SI units.
-        valid: Validity of each value, (n, element) bool; False where the device or the wire says
-            that there is no value.
+        valid: Validity of each element, (n, element) bool; False where the device or the wire
+            marks the values as missing.
         arrived_ns: Host time at which the last part of each sample arrived, (n,) int64, ns.
-        damaged: Number of frames that failed a check since the sample before, (n,) int64.
-        count: The device's sample counter as it came, (n,) int64, modulo 2^count_bits; None for a
-            device without one.
-        ticks: The device's clock as it came, (n,) int64, modulo 2^tick_bits; None for a device
-            without one.
+        damaged: Number of frames that failed a check since the previous sample, (n,) int64.
+        count: The device's raw sample counter, (n,) int64, modulo 2^count_bits; None for a
+            device without a counter.
+        ticks: The device's raw clock, (n,) int64, modulo 2^tick_bits; None for a device
+            without a clock.
         status: The device's status bits, (n,) int64; None for a device without them.
     """
 
@@ -105,11 +105,10 @@ class Samples:
 
 @dataclass
 class WireStats:
-    """What came over the wire since the codec was made.
+    """Counts of what a codec has received since it was made.
 
     Attributes:
-        skipped: Bytes that lay between frames; on CAN, frames with identifiers that are not this
-            device's.
+        skipped: Bytes between frames; on CAN, frames with the identifiers of other devices.
         incomplete: Samples of which a part never came, from devices that send samples in parts.
     """
 
@@ -120,7 +119,7 @@ class WireStats:
 
 
 class Codec(abc.ABC, Generic[Packet]):
-    """One device's protocol. Implementations are of `SerialCodec` or `CanCodec`.
+    """One device's protocol; base class of `SerialCodec` and `CanCodec`.
 
     Args (of every implementation):
         options: The codec's options, an instance of its class `Options`.
@@ -130,23 +129,19 @@ class Codec(abc.ABC, Generic[Packet]):
         count_bits: Width of the device's sample counter; None for a device without one.
         tick_ns: Length of a tick of the device's clock, ns; None for a device that sends no time.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
-        status_bits: What each bit of the status means when set, by the number of the bit.
-        harmless_bits: The bits of the status that are no fault of the device: an overload, a state.
+        status_bits: Meaning of each status bit when set, by the number of the bit.
+        harmless_bits: Status bits that are no fault of the device: an overload, a state.
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
-        spec: What the samples are; None until the device has described itself. Whoever knows it
-            beforehand sets it, and the device is then not asked.
-        measures: Whether the device measures although no host has asked for samples. The device's
-            side.
-        describes: Whether a device that is started says what it is: `spec` is another object then.
-        serial_number: Serial number that the device has told of itself; empty for none.
-        newest: The newest sample of a device that measures and does not send, None if there is
-            none. The device's side.
-        commanded_hz: Rate at which hosts have told the device to send, Hz; None for none. The
-            device's side.
-        complaint: Why what came last is no sample, for the user, where the codec can tell; else
-            empty.
-        full_scale: The largest load that a sample can tell, (channel,), SI; None where a frame
-            proves by itself whose it is. `sniffing` takes samples near it for those of another
+        spec: The array that the samples are of; None until the device has described itself. If
+            it is set beforehand, the device is not asked.
+        measures: Device's side: whether it measures although no host has asked for samples.
+        describes: Whether the device describes itself when started; `spec` is then a new object.
+        serial_number: Serial number that the device has reported; empty for none.
+        newest: Device's side: newest sample of a device that measures and does not send, or None.
+        commanded_hz: Device's side: rate that hosts have commanded, Hz; None for none.
+        complaint: Reason, for the user, why the last input is no sample; empty if unknown.
+        full_scale: Largest load that a sample can hold, (channel,), SI; None if a frame itself
+            proves which device it is from. `sniffing` attributes samples near it to another
             device.
     """
 
@@ -173,15 +168,15 @@ class Codec(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def feed(self, packet: Packet, t_ns: int) -> Samples | None:
-        """Take what has arrived, cut anywhere; return the samples that it completes, or None.
+        """Decode received data, cut anywhere; return the samples that it completes, or None.
 
-        Never raises, whatever comes. The result does not depend on how the input was cut, arrival
-        times apart.
+        Never raises, whatever comes. Except for arrival times, the result does not depend on how
+        the input was cut.
         """
 
     @abc.abstractmethod
     def encode(self, chunk: Chunk) -> list[Packet]:
-        """What the device sends for each of these samples.
+        """Return the packets that the device sends, one for each sample.
 
         Args:
             chunk: Samples of `spec`; `seq` is the device's counter and `t_ns` its clock, neither
@@ -190,40 +185,40 @@ class Codec(abc.ABC, Generic[Packet]):
 
     @classmethod
     def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
-        """Options that a device may have besides the defaults, of those that change its frames.
+        """Return sets of options, other than the defaults, that change the device's frames.
 
-        For whoever must find out what a device is.
+        `sniffing` tries each of them to identify an unknown device.
         """
         return []
 
     def commands(self, command: Command) -> tuple[Step[Packet], ...]:
-        """What to send to the device when this happens."""
+        """Return the steps by which a host gives the device this command."""
         return ()
 
     def respond(self, packet: Packet) -> Packet:
-        """What the device answers; the device's side, for an emulator.
+        """Return the device's answer to a packet from the host; used by an emulator.
 
         It also updates `streaming` and `polled`.
         """
         return packet[:0]
 
     streaming = True  # the device's side: whether it sends without being asked, now
-    status = 0  # the device's side: status bits of what it sends, where the codec sends them
+    status = 0  # the device's side: status bits to send, where the codec has them
     polled = 0  # the device's side: samples asked for and not yet sent
     polls = False  # the host's side: whether each sample must be asked for (`Command.POLL`)
 
     @abc.abstractmethod
     def forget(self) -> None:
-        """Drop what has come of a frame not yet complete (after a reconnection)."""
+        """Discard the beginning of an incomplete frame (after a reconnection)."""
 
 
 class SerialCodec(Codec[bytes]):
     """A protocol over a serial line.
 
     Attributes:
-        baud: Speed of the line that the device has by default, bit/s.
-        parity: Parity that the device has by default: ``N``, ``E`` or ``O``.
-        usb: Whether the device is attached by USB itself, so that its speed means nothing.
+        baud: Default speed of the device's line, bit/s.
+        parity: Default parity of the device's line: ``N``, ``E`` or ``O``.
+        usb: Whether the device itself is on USB, so that its baud rate has no effect.
     """
 
     wire = "serial"
@@ -236,8 +231,8 @@ class CanCodec(Codec[Sequence[CanFrame]]):
     """A protocol over a CAN bus.
 
     Attributes:
-        bitrate: Speed of the bus that the device has by default, bit/s.
-        data_bitrate: Speed of the data phase, bit/s, for a device that speaks CAN FD; else None.
+        bitrate: Default speed of the device's bus, bit/s.
+        data_bitrate: Default speed of the data phase, bit/s, of a CAN FD device; else None.
     """
 
     wire = "can"
@@ -247,7 +242,7 @@ class CanCodec(Codec[Sequence[CanFrame]]):
 
 @dataclass
 class SampleBatch:
-    """Samples collected while a packet is decoded; `take` makes one `Samples` of them."""
+    """Samples collected while a packet is decoded; `take` returns them as one `Samples`."""
 
     values: list[Any] = field(default_factory=list)  # each (element, channel), or flat
     valid: list[Any] = field(default_factory=list)
@@ -257,7 +252,7 @@ class SampleBatch:
     status: list[int] = field(default_factory=list)
 
     def take(self, shape: tuple[int, int], t_ns: int) -> Samples | None:
-        """All samples so far, or None; each list is empty or of one entry per sample.
+        """Return the collected samples, or None. Each list is empty or has one entry per sample.
 
         Args:
             t_ns: Host time at which the samples arrived, ns.
@@ -267,7 +262,7 @@ class SampleBatch:
             return None
         values = np.asarray(self.values, dtype=np.float32).reshape(n, *shape)
         valid = np.asarray(self.valid, dtype=np.bool_) if self.valid else np.ones((n, 1), np.bool_)
-        # what is not finite is no measurement, whatever the device says
+        # a value that is not finite is no measurement, whatever the device's flags claim
         valid = valid & np.isfinite(values).all(axis=2)
         whole = [
             np.array(x, np.int64) if x else None for x in (self.count, self.ticks, self.status)
@@ -277,12 +272,15 @@ class SampleBatch:
 
 
 def six_axis(name: str, rate_hz: float) -> ArraySpec:
-    """One element at the origin of the frame ``sensor``: fx, fy, fz in N, mx, my, mz in N m."""
+    """Return a spec of one element at the origin of the frame ``sensor``.
+
+    Its channels are fx, fy, fz in N and mx, my, mz in N m.
+    """
     return ArraySpec.at_origin(name, rate_hz, SIX_AXES)
 
 
 def codec_class(wire: str, name: str) -> type[Codec[Any]]:
-    """The codec of this name for ``serial`` or ``can``."""
+    """Return the class of the codec with this name for ``serial`` or ``can``."""
     if (wire, name) in CODECS:
         module, attribute, _ = CODECS[wire, name]
         there = import_module(module)

@@ -1,9 +1,9 @@
-"""A device as a source: a line, a codec, the device's counter and clock, and its ups and downs.
+"""A device as a source: its line, codec, sample counter, clock and reconnection.
 
     link --> codec --> sequence --> clock --> Chunk
 
-There is no thread here: `read` does it all, so that nothing is buffered out of sight. A device that
-goes away is tried again inside `read`; the stream goes on with the next sample it sends.
+No thread is used: `read` does everything, so there is no hidden buffer. If the line is lost, `read`
+opens it again; the stream goes on with the next sample that the device sends.
 """
 
 import time
@@ -19,19 +19,19 @@ from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.health import Health, Identity, State
 from tactile_rt.drivers.links import Link
 
-# Called with each packet as it came and its arrival (host time, ns), and with None whenever the
-# line has been opened. It must be quick: the device is not read meanwhile.
+# Called with each raw packet and its arrival (host time, ns), and with None whenever the line has
+# been opened. It must be quick: the device is not read while it runs.
 Tap = Callable[[Any, int], None]
 
-SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
-FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # a path is looked for cheaply and often
+SLICE_S = 0.1  # longest time until a waiting read notices that the source was closed
+FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # short, since checking for a path is cheap
 ATTEMPTS = 3  # at a step of the start that gets no answer
 ASK_NS = NS_PER_S  # without a sample, after which a device that describes itself is asked again
-DESCRIBED_S = 0.5  # for a description of which the beginning has come
+DESCRIBED_S = 0.5  # longest wait for a description after a reconnection
 
 
 class ArrayChanged(SourceError):
-    """Another array is at the port than the one that the stream is of."""
+    """The array at the port is no longer the one that the stream began with."""
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,15 @@ class DeviceOptions:
     """Options of every device.
 
     Attributes:
-        codec: Name of the codec that the device speaks, one of those that `tactile-rt codecs`
-            lists.
-        start_s: Longest time that the first sample may take, s; with 0 nobody waits for it.
+        codec: Name of the codec that the device speaks, from the list of `tactile-rt codecs`.
+        start_s: Longest time that the first sample may take, s; 0 does not wait for it.
         stale_s: Time without a sample after which the stream counts as stale, s; 0 stands for ten
-            periods, at least 0.1 s.
-        reconnect: Whether a lost line is opened again and again; without, reading breaks with a
+            sample periods, at least 0.1 s.
+        reconnect: Whether to reopen a lost line until it works; if not, reading raises a
             `SourceError`.
         calibration: A calibration file, or the id of a device calibrated before; empty for none.
-        clock: ``host`` gives samples the host's time; ``device`` that of the device's own clock,
-            which depends on the device alone, and agrees with nothing else's.
+        clock: ``host`` stamps samples with the host's time, ``device`` with the time of the
+            device's own clock, which is synchronised with no other clock.
     """
 
     codec: str
@@ -71,10 +70,10 @@ class DeviceSource(Source):
 
     Args:
         connect: Opens the line; called again after the line was lost.
-        codec_options: Options of the codec as the user wrote them, for a recording to tell.
+        codec_options: Options of the codec as the user wrote them, to store with a recording.
 
     Raises:
-        SourceError: it cannot be opened, does not answer, or nothing that comes is of its codec.
+        SourceError: it cannot be opened, does not answer, or sends nothing that the codec decodes.
     """
 
     def __init__(
@@ -99,11 +98,11 @@ class DeviceSource(Source):
         self._tap: Tap | None = None
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
-        self._looked_ns = 0  # when nothing had come
-        self._noise_ns = 0  # since when what comes is no sample; 0: it is
-        self._asked_ns, self._resets = 0, 0  # when it was last asked again; its counter's then
+        self._found_empty_ns = 0  # time of the last read that found nothing
+        self._noise_ns = 0  # since when no input was a sample; 0: the last one was
+        self._asked_ns, self._resets = 0, 0  # last request for a description; counter resets then
         self.describes = codec.describes and codec.spec is None
-        self._early: list[Samples] = []  # that came while the device was being started
+        self._early: list[Samples] = []  # received while the device was being started
         try:
             self._open()
             self._await_first()
@@ -112,8 +111,8 @@ class DeviceSource(Source):
             raise
         assert codec.spec is not None
         super().__init__(codec.spec)
-        self._described: ArraySpec | None = codec.spec  # another object with every description
-        self._identity = self._known = self.identity  # now, and the last one that was known
+        self._last_spec: ArraySpec | None = codec.spec  # each description gives a new object
+        self._identity = self._known_identity = self.identity  # now, and last with a serial number
         self._stamper = Stamper(codec, self.spec, self.stats)
         if options.clock == "device" and codec.tick_ns is not None:
             self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
@@ -126,7 +125,7 @@ class DeviceSource(Source):
         end = None if timeout is None else time.monotonic() + timeout
         self._first = None
         while not self._closed:
-            chunk = self._chunk(self._early.pop(0)) if self._early else self._receive(end)
+            chunk = self._make_chunk(self._early.pop(0)) if self._early else self._receive(end)
             if chunk is not None:
                 return chunk
             if not self._early and end is not None and time.monotonic() >= end:
@@ -141,19 +140,19 @@ class DeviceSource(Source):
                 for step in self.codec.commands(Command.STOP):
                     self._link.send(step.send)
             except SourceError:
-                pass  # it is gone, which is what we want
+                pass  # the line is gone, as intended
         self._drop()
 
     def fileno(self) -> int:
         link = self._link
-        # One that is asked for each sample must be read to be asked.
+        # A polled device must be read without waiting: `read` requests its samples.
         return -1 if link is None or self._early or self.codec.polls else link.fileno()
 
     def tap(self, on_packet: Tap | None) -> None:
-        """Pass every packet on as it came, before it is decoded; None: no longer.
+        """Pass every raw packet to this function before it is decoded; None: stop.
 
-        Those that came while the device was started are passed on at once, if nothing has been
-        read yet: without them a device that describes itself cannot be decoded again.
+        Packets received while the device was started are passed at once, if nothing has been
+        read yet: without them, a replay could not decode a device that describes itself.
         """
         first, self._first = self._first, None
         if on_packet is not None:
@@ -163,18 +162,18 @@ class DeviceSource(Source):
 
     @property
     def health(self) -> Health:
-        """How the device is doing, by what was found when it was last read; from any thread."""
+        """State of the device as of the last read; available from any thread."""
         stamper, link = self._stamper, self._link
         assert stamper is not None
         clock, newest, status = stamper.clock, stamper.newest_ns, stamper.status
         state, since, reason = self._state, self._since, self._reason
-        # Since then nobody may have looked: what waits in the line is no silence of the device.
-        silent = self._looked_ns - newest
+        # Up to the last look at an empty line: unread data in the line is no silence.
+        silent = self._found_empty_ns - newest
         if state == State.STREAMING and silent > self._stale_ns:
             state, since = State.STALE, newest + self._stale_ns
             reason = f"no sample for {silent / 1e9:.1f} s"
-        bits, told = self.codec.status_bits.items(), stamper.told_ns
-        recent = {bit for bit, at in told.items() if newest - at < NS_PER_S}
+        bits, set_ns = self.codec.status_bits.items(), stamper.told_ns
+        recent = {bit for bit, at in set_ns.items() if newest - at < NS_PER_S}
         faults = recent - self.codec.harmless_bits
         return Health(
             state, since, reason, self._connections, newest,
@@ -191,16 +190,16 @@ class DeviceSource(Source):
 
     @property
     def identity(self) -> Identity:
-        """Which array it is, by what it last told."""
+        """Identity of the array, as last reported by the device."""
         assert self.codec.spec is not None
         usb_number = self._link.usb_number if self._link else ""
         return Identity(self.codec.spec, self.codec.serial_number, usb_number)
 
     @property
     def measured(self) -> tuple[int, int]:
-        """How many samples the device has measured, and by when, ns.
+        """Number of samples that the device has measured, and the time of the newest, ns.
 
-        By its own counter and clock if it has them, so that neither a loss nor the host matters.
+        Both are by its own counter and clock if it has them, so independent of losses and the host.
         """
         stamper = self._stamper
         assert stamper is not None
@@ -208,7 +207,7 @@ class DeviceSource(Source):
         return stamper.sequencer.numbered + damaged, stamper.elapsed_ns
 
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
-        """Move the whiskers of an active array: protraction = offset + amplitude sin(2 pi f t).
+        """Command an active array's protraction: offset + amplitude sin(2 pi f t), rad.
 
         Raises:
             SourceError: this device takes no such command, or is away.
@@ -241,29 +240,29 @@ class DeviceSource(Source):
         try:
             found = link.receive(left)
         except SourceError as error:
-            if not self._closed:  # else closing it is what ended the wait
+            if not self._closed:  # otherwise `close` ended the wait
                 self._lose(str(error))
             return None
         if found is None:
-            now_ns = self._looked_ns = time.monotonic_ns()
+            now_ns = self._found_empty_ns = time.monotonic_ns()
             if self.describes and self._stamper is not None:
                 self._ask_again(now_ns, now_ns - self._stamper.newest_ns)
             return None
         packet, t_ns = found
         samples = self._feed(packet, t_ns)
         if self.describes:
-            # What waited while nobody read is old, but no silence: its end may be half a frame.
+            # A backlog is old, but no silence of the device: it may end in half a frame.
             self._noise_ns = 0 if samples is not None else self._noise_ns or t_ns
             self._ask_again(t_ns, t_ns - self._noise_ns if self._noise_ns else 0)
-            if self.codec.spec is not self._described:
-                self._compare()
-        return None if samples is None else self._chunk(samples)
+            if self.codec.spec is not self._last_spec:
+                self._check_identity()
+        return None if samples is None else self._make_chunk(samples)
 
     def _feed(self, packet: Any, t_ns: int) -> Samples | None:
-        self._note(packet, t_ns)
+        self._record_packet(packet, t_ns)
         return self.codec.feed(packet, t_ns)
 
-    def _note(self, packet: Any, t_ns: int) -> None:
+    def _record_packet(self, packet: Any, t_ns: int) -> None:
         if self._tap is not None:
             self._tap(packet, t_ns)
         elif self._first is not None:
@@ -280,30 +279,30 @@ class DeviceSource(Source):
             self._poll_at = max(self._poll_at + period, now)
         return min(left, max(0.0, self._poll_at - now))
 
-    def _chunk(self, samples: Samples) -> Chunk | None:
+    def _make_chunk(self, samples: Samples) -> Chunk | None:
         assert self._stamper is not None
         chunk = self._stamper.chunk(samples)
         if chunk is not None:
             if self._state != State.STREAMING:
-                self._turn(State.STREAMING, "")
+                self._set_state(State.STREAMING, "")
             self.stats.delivered += len(chunk)
         return chunk
 
     # identity
 
-    def _compare(self) -> None:
-        """Go on if this can be the same array; else raise an `ArrayChanged`."""
-        self._described, found = self.codec.spec, self.identity
-        if why := found.difference(self._known):
+    def _check_identity(self) -> None:
+        """Raise an `ArrayChanged` if the device cannot be the same array."""
+        self._last_spec, found = self.codec.spec, self.identity
+        if why := found.difference(self._known_identity):
             self._closed = True
             self._drop()
             raise ArrayChanged(f"{self.name}: another array is at the port: {why}")
         self._identity = found
         if found.serial_number:
-            self._known = found
+            self._known_identity = found
 
     def _ask_again(self, now_ns: int, silent_ns: int) -> None:
-        """Ask a device that is silent, or counts anew, what it is."""
+        """Request a description again if the device is silent or its counter was reset."""
         assert self._stamper is not None
         resets = self._stamper.sequencer.resets
         well = silent_ns < max(ASK_NS, self._stale_ns) and resets == self._resets
@@ -311,7 +310,7 @@ class DeviceSource(Source):
             return
         self._asked_ns, self._resets = now_ns, resets
         if silent_ns > ASK_NS:
-            self.codec.forget()  # among samples no other array is believed
+            self.codec.forget()  # within a stream, a codec rejects another array's description
         try:
             for step in self.codec.commands(Command.START):
                 self._link.send(step.send)
@@ -323,20 +322,20 @@ class DeviceSource(Source):
     def _open(self) -> None:
         self._link = self._connect()
         self._connections += 1
-        self._note(None, time.monotonic_ns())
+        self._record_packet(None, time.monotonic_ns())
         self.codec.forget()
         if self._stamper is not None:
             self._stamper.resume()
-        self._turn(State.CONNECTING, "")
+        self._set_state(State.CONNECTING, "")
         for step in self.codec.commands(Command.START):
-            self._do(step)
-        if self._stamper is not None:  # it was there before
+            self._run_step(step)
+        if self._stamper is not None:  # this is a reconnection
             end = time.monotonic() + DESCRIBED_S
-            while self.describes and self.codec.spec is self._described and time.monotonic() < end:
+            while self.describes and self.codec.spec is self._last_spec and time.monotonic() < end:
                 self._listen(0.01, None)
-            self._compare()
+            self._check_identity()
 
-    def _do(self, step: Step[Any]) -> None:
+    def _run_step(self, step: Step[Any]) -> None:
         link = self._link
         assert link is not None
         for _ in range(ATTEMPTS):
@@ -353,7 +352,7 @@ class DeviceSource(Source):
         )
 
     def _listen(self, seconds: float, expect: bytes | int | None) -> bool:
-        """Take what comes for so long, or until this answer has; whether it has."""
+        """Feed input to the codec; return whether the expected answer came in time."""
         assert self._link is not None
         end = time.monotonic() + seconds
         tail: Any = None
@@ -375,7 +374,7 @@ class DeviceSource(Source):
         return False
 
     def _await_first(self) -> None:
-        """Wait for the device to describe itself and to send."""
+        """Wait until the device has described itself and sent a sample."""
         assert self._link is not None
         before = time.monotonic()
         end = before + self.options.start_s
@@ -392,9 +391,9 @@ class DeviceSource(Source):
             if samples is not None:
                 self._early.append(samples)
         if self.codec.spec is None or (self.options.start_s and not self._early):
-            raise SourceError(f"{self.name}: {self._silence(came)}")
+            raise SourceError(f"{self.name}: {self._explain_silence(came)}")
 
-    def _silence(self, came: int) -> str:
+    def _explain_silence(self, came: int) -> str:
         stats = self.codec.stats
         seconds = f"{self.options.start_s:g} s"
         things = "bytes" if self.codec.wire == "serial" else "frames"
@@ -422,7 +421,7 @@ class DeviceSource(Source):
             raise SourceError(why)
         if self._state != State.LOST:
             self._retry_s = FIRST_RETRY_S
-        self._turn(State.LOST, why)
+        self._set_state(State.LOST, why)
         self._retry_at = time.monotonic() + self._retry_s
         self._retry_s = min(LAST_RETRY_S, 2 * self._retry_s)
 
@@ -432,19 +431,19 @@ class DeviceSource(Source):
             self._can_errors += link.can_errors
             link.close()
 
-    def _turn(self, state: State, reason: str) -> None:
+    def _set_state(self, state: State, reason: str) -> None:
         if state != self._state:
             self._since = time.monotonic_ns()
         self._state, self._reason = state, reason
 
 
 def device_of(source: Source) -> DeviceSource | None:
-    """The device behind a source, if there is one."""
+    """Return the device that a source reads, through any calibration; None if none."""
     while isinstance(source, CalibratedSource):
         source = source.source
     return source if isinstance(source, DeviceSource) else None
 
 
 def share_of_changes(source: Source) -> float:
-    """Return the share of readings that changed while its tare was taken; 0: unknown."""
+    """Return the share of readings that changed during the source's tare; 0: unknown."""
     return source.calibration.changes if isinstance(source, CalibratedSource) else 0.0

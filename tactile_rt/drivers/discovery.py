@@ -1,8 +1,8 @@
-"""Which serial ports and CAN buses there are, what is likely there, and what may be in the way.
+"""Discovery of serial ports and CAN buses, the devices likely on them, and their problems.
 
-`serial_ports` and `can_buses` list them, each with the URL to begin with; `diagnose` looks at
-permissions, latency timers and the state of buses, and says what to do; `udev_rules` does part of
-it for good.
+`serial_ports` and `can_buses` list them, each with a URL to begin with; `diagnose` checks
+permissions, latency timers and the state of buses, and suggests remedies; `udev_rules` makes part
+of these permanent.
 """
 
 import getpass
@@ -17,7 +17,7 @@ from typing import Any
 
 ARPHRD_CAN = 280  # type of a CAN network interface, linux/if_arp.h
 
-# USB (vendor, product; None: any) -> what it is likely to be, and the URL's codec or scheme.
+# USB (vendor, product; None: any) -> the likely device, and the URL's codec or scheme.
 # Numbers from the vendors' own udev rules and the Linux USB ID repository.
 KNOWN = {
     (0x0403, 0x6001): ("FTDI adapter: Bota or Robotiq RS-485, ATI", "serial"),
@@ -44,8 +44,7 @@ class Port:
 
     Attributes:
         path: Path by which the port is opened, such as ``/dev/ttyUSB0``.
-        stable: Name in /dev/serial/by-id, the same after every reboot; empty for a port without
-            one.
+        stable: Path in /dev/serial/by-id, the same after every reboot; empty if it has none.
         usb: Vendor and product numbers on USB; None for a port that is not on USB.
         serial_number: Serial number that the USB device reports; empty if none.
         url: The URL to begin with; the codec in it is a guess.
@@ -64,8 +63,8 @@ class CanBus:
     """A CAN network interface.
 
     Attributes:
-        bitrate: Speed of the bus, bit/s; 0 where the kernel does not know it.
-        url: The URL to begin with; its codec is left to the user.
+        bitrate: Speed of the bus, bit/s; 0 if the kernel does not know it.
+        url: The URL to begin with; the user fills in the codec.
     """
 
     name: str
@@ -76,7 +75,7 @@ class CanBus:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at."""
+    """Result of one check."""
 
     what: str
     good: bool
@@ -85,14 +84,14 @@ class Finding:
 
 
 def serial_ports(by_id: Path = Path("/dev/serial/by-id")) -> list[Port]:
-    """The serial ports of this machine; those that nothing is plugged into are left out."""
+    """Return the serial ports of this machine that have a device."""
     from serial.tools import list_ports
 
     stable = {str(p.resolve()): str(p) for p in by_id.iterdir()} if by_id.is_dir() else {}
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: p.device):
         if port.vid is None and port.hwid in ("n/a", "", None):
-            continue  # ttyS0..31 that the kernel keeps ready
+            continue  # one of ttyS0..31, which the kernel lists without a device
         usb = None if port.vid is None else (port.vid, port.pid)
         likely, guess = "", "serial"
         if usb is not None:
@@ -112,13 +111,13 @@ def serial_ports(by_id: Path = Path("/dev/serial/by-id")) -> list[Port]:
 
 
 def can_buses(net: Path = Path("/sys/class/net")) -> list[CanBus]:
-    """The CAN network interfaces of this machine (Linux)."""
+    """Return the CAN network interfaces of this machine (Linux)."""
     found = []
     for link in sorted(net.iterdir()) if net.is_dir() else ():
-        if _number(link / "type") != ARPHRD_CAN:
+        if _read_number(link / "type") != ARPHRD_CAN:
             continue
-        up = bool((_number(link / "flags") or 0) & 1)
-        bitrate = _number(link / "can_bittiming" / "bitrate") or 0
+        up = bool((_read_number(link / "flags") or 0) & 1)
+        bitrate = _read_number(link / "can_bittiming" / "bitrate") or 0
         found.append(CanBus(link.name, up, bitrate, f"can:socketcan:{link.name}?codec="))
     return found
 
@@ -129,15 +128,15 @@ def diagnose(
     sys: Path = Path("/sys"),
     run: Callable[[list[str]], str] | None = None,
 ) -> list[Finding]:
-    """Look at permissions, latency timers, CAN states and what else gets in the way.
+    """Check permissions, latency timers, the states of CAN buses and ModemManager.
 
     Args:
         sys: Where sysfs is mounted.
         run: Runs a command and returns its output ("" if it fails).
     """
-    ask = run or _run
-    found = [f for port in ports for f in _port(port, sys)]
-    found += [_bus(bus, ask) for bus in buses]
+    ask = run or _run_command
+    found = [f for port in ports for f in _check_port(port, sys)]
+    found += [_check_bus(bus, ask) for bus in buses]
     if not ports and not buses:
         found.append(
             Finding(
@@ -156,7 +155,7 @@ def diagnose(
 
 
 def udev_rules(ports: list[Port]) -> str:
-    """Rules by which group dialout may use these devices, quickly and under fixed names."""
+    """Return udev rules for these ports: access for group dialout, low latency, fixed names."""
     lines = [
         "# tactile_rt: access, low latency and stable names for tactile sensors.",
         "# Install: sudo cp THIS /etc/udev/rules.d/99-tactile.rules",
@@ -178,7 +177,7 @@ def udev_rules(ports: list[Port]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _port(port: Port, sys: Path) -> Iterator[Finding]:
+def _check_port(port: Port, sys: Path) -> Iterator[Finding]:
     if os.access(port.path, os.R_OK | os.W_OK):
         yield Finding(port.path, True, "may be read and written")
     else:
@@ -205,7 +204,7 @@ def _port(port: Port, sys: Path) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _bus(bus: CanBus, ask: Callable[[list[str]], str]) -> Finding:
+def _check_bus(bus: CanBus, ask: Callable[[list[str]], str]) -> Finding:
     up = f"sudo ip link set {bus.name} up type can bitrate {bus.bitrate or 1_000_000}"
     if not bus.up:
         return Finding(bus.name, False, "down", up)
@@ -236,14 +235,14 @@ def _bus(bus: CanBus, ask: Callable[[list[str]], str]) -> Finding:
     return Finding(bus.name, True, says)
 
 
-def _run(command: list[str]) -> str:
+def _run_command(command: list[str]) -> str:
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=5).stdout
     except (OSError, subprocess.TimeoutExpired):
         return ""
 
 
-def _number(path: Path) -> int | None:
+def _read_number(path: Path) -> int | None:
     try:
         return int(path.read_text().strip(), 0)
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""How a device is doing: one snapshot, true at the moment it is taken."""
+"""Snapshot of a device's state at one moment."""
 
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -9,19 +9,19 @@ from tactile_rt.drivers.codec import WireStats
 
 @dataclass(frozen=True)
 class Identity:
-    """Which array a device is, as far as it can be known; see `difference`."""
+    """Identity of an array, as far as its device and port reveal it; see `difference`."""
 
     spec: ArraySpec
     serial_number: str = ""
-    usb_number: str = ""  # of its port
+    usb_number: str = ""  # serial number of its USB port
 
     def difference(self, other: "Identity") -> str:
-        """Why this cannot be the same array as another; empty: it can, or nobody knows."""
+        """Explain why this cannot be the same array as another; empty if it can be."""
         if found := other.spec.differences(self.spec):
             return f"it describes itself otherwise: {found[0]}"
         for what in ("serial_number", "usb_number"):
             mine, theirs = getattr(self, what), getattr(other, what)
-            if mine and theirs:  # the device's own counts for more than that of its port
+            if mine and theirs:  # the device's own number overrides that of its port
                 name = what.replace("_", " ")
                 return "" if mine == theirs else f"its {name} is {mine}, not {theirs}"
         return ""
@@ -33,24 +33,24 @@ class State(StrEnum):
     CONNECTING = "connecting"  # opened, no sample yet
     STREAMING = "streaming"  # samples come
     STALE = "stale"  # the line is open, but no sample has come for too long
-    LOST = "lost"  # the line is gone; it is tried again and again
+    LOST = "lost"  # the line is gone; the source keeps trying to reopen it
 
 
 @dataclass(frozen=True)
 class Health:
-    """What is known of a device at one moment.
+    """State of a device at one moment.
 
     Attributes:
         since_ns: Host time (CLOCK_MONOTONIC) since which the stream is in this state, ns.
         reason: Why the device is not streaming, in words; empty when it is.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
         drift_ppm: Excess speed of the host's clock over the device's, parts per million; 0 for a
-            device that tells no time.
-        clock_steps: Number of times that the device's clock jumped or began anew.
-        counter_resets: Number of times that the device's sample counter began anew.
-        status: What the device says of itself in its newest sample.
+            device that sends no time.
+        clock_steps: Number of times that the device's clock jumped or restarted.
+        counter_resets: Number of times that the device's sample counter restarted.
+        status: Meanings of the status bits that are set in the newest sample.
         identity: Serial number of the device, or of its USB port; ``unknown`` for none.
-        faults: What it said within the second before that, and is a fault.
+        faults: Meanings of the fault bits set within the second before the newest sample.
     """
 
     state: State
@@ -66,4 +66,4 @@ class Health:
     wire: WireStats = field(default_factory=WireStats)
     faults: tuple[str, ...] = ()
     identity: str = "unknown"
-    counts: bool = True  # whether its counter goes on, if it should have one
+    counts: bool = True  # False if the device's counter stands still

@@ -1,4 +1,4 @@
-"""Lines to devices: a serial port, a CAN bus. Bytes or frames out and in, nothing else."""
+"""Links to devices over serial ports and CAN buses, which only move bytes or frames."""
 
 import abc
 import errno
@@ -14,22 +14,22 @@ from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 
 READ_BYTES = 65_536
-TERMINAL_BYTES = 4095  # that Linux's terminals give at most at a time
-STALLED_S = 0.15  # for so long nobody looked: what has come meanwhile is one packet
+TERMINAL_BYTES = 4095  # most that a Linux terminal returns in one read
+STALLED_S = 0.15  # since the last read, after which all waiting bytes are read as one packet
 MOST_FRAMES = 512  # taken from a bus at a time
-WAIT_S = 0.05  # how soon a line without a descriptor looks for the end of the wait
+WAIT_S = 0.05  # longest read of a line without a descriptor, before it checks the time
 
 
 class Link(abc.ABC, Generic[Packet]):
-    """A line to a device; opened when made."""
+    """A line to a device, which the constructor opens."""
 
     name: str
     can_errors = 0
-    usb_number = ""  # serial number of the USB device that the line ends in; empty: unknown
+    usb_number = ""  # serial number of the USB device of the line; empty: unknown
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> tuple[Packet, int] | None:
-        """What has arrived and when (host time, ns), or None when nothing came in time.
+        """Return (packet, host time of arrival in ns), or None if nothing came in time.
 
         Raises:
             SourceError: the line is gone.
@@ -37,7 +37,7 @@ class Link(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def send(self, packet: Packet) -> None:
-        """Send; waits a moment where the line is full.
+        """Send a packet; wait a moment if the line is full.
 
         Raises:
             SourceError: the line is gone, or full for too long.
@@ -45,10 +45,10 @@ class Link(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Release the line; safe to call twice."""
+        """Release the line; it may be called twice."""
 
     def fileno(self) -> int:
-        """The descriptor that is readable when something has arrived; -1: there is none."""
+        """Return the descriptor that is readable when input has arrived; -1 for none."""
         return -1
 
 
@@ -64,7 +64,7 @@ class SerialLink(Link[bytes]):
         import serial
 
         self.name = port
-        # a pty forgets parity and then refuses to be opened with it again
+        # a pty does not keep a parity and then refuses to be opened with it again
         self._pty = os.path.realpath(port).startswith("/dev/pts/")
         if self._pty:
             parity = "N"
@@ -77,19 +77,19 @@ class SerialLink(Link[bytes]):
                 self._port.dtr = False
             self._port.open()
         except (OSError, ValueError, AttributeError) as error:
-            raise SourceError(f"{port}: {_why(port, error)}") from None
-        self.usb_number = _usb_number(os.path.realpath(port))
-        self._looked_s = math.inf
+            raise SourceError(f"{port}: {_explain_port_error(port, error)}") from None
+        self.usb_number = _find_usb_number(os.path.realpath(port))
+        self._last_read_s = math.inf
         try:
             self._fd: int | None = self._port.fileno()
             self._terminal, self._blocks = os.isatty(self._fd), os.get_blocking(self._fd)
             self._poll = select.poll()
             self._poll.register(self._fd, select.POLLIN)
-        except Exception:  # each pyserial handler without one says so in its own way
+        except Exception:  # pyserial's handlers without a descriptor raise different errors
             self._fd = None
 
     def receive(self, timeout_s: float) -> tuple[bytes, int] | None:
-        stalled = time.monotonic() - self._looked_s > STALLED_S
+        stalled = time.monotonic() - self._last_read_s > STALLED_S
         try:
             if self._fd is None:
                 return self._receive_slowly(timeout_s)
@@ -97,22 +97,22 @@ class SerialLink(Link[bytes]):
                 if not self._poll.poll(1e3 * max(timeout_s, 0.0)):
                     return None
             data = self._read(self._fd, stalled)
-            if not data and timeout_s <= 0 and self._terminal and not self._hung_up():
-                return None  # a terminal that has nothing gives nothing; it may have by now
+            if not data and timeout_s <= 0 and self._terminal and not self._has_hung_up():
+                return None  # an empty read of a terminal that has not hung up: no input
         except BlockingIOError:
             return None
-        except (OSError, ValueError, TypeError) as error:  # closed meanwhile, or unplugged
+        except (OSError, ValueError, TypeError) as error:  # closed by now, or unplugged
             raise SourceError(f"{self.name}: the line is gone ({_reason(error)})") from None
         finally:
-            self._looked_s = time.monotonic()
+            self._last_read_s = time.monotonic()
         if not data:
             raise SourceError(f"{self.name}: the line is gone (unplugged, or hung up)")
         return data, time.monotonic_ns()
 
     def _read(self, fd: int, whole: bool) -> bytes:
-        """Read what has come, or a part of it.
+        """Read the waiting bytes; all of them, however many, if `whole`.
 
-        The parts of a backlog, after nobody looked, would be dated as if they came one by one.
+        A backlog that is read in parts would be dated as if its parts had arrived one by one.
         """
         data = newest = os.read(fd, READ_BYTES)
         while whole and len(newest) >= TERMINAL_BYTES and len(data) < READ_BYTES:
@@ -121,11 +121,11 @@ class SerialLink(Link[bytes]):
                     break
                 newest = os.read(fd, READ_BYTES)
             except OSError:
-                break  # the next call meets it, too
+                break  # the next call raises it, too
             data += newest
         return data
 
-    def _hung_up(self) -> bool:
+    def _has_hung_up(self) -> bool:
         return any(events & ~select.POLLIN for _, events in self._poll.poll(0))
 
     def _receive_slowly(self, timeout_s: float) -> tuple[bytes, int] | None:
@@ -138,10 +138,10 @@ class SerialLink(Link[bytes]):
                 return None
 
     def retune(self, baud: int, parity: str = "N") -> None:
-        """Go on at another speed, with what had come at the last one thrown away.
+        """Change the speed and parity; discard input received before.
 
         Raises:
-            SourceError: the port cannot have it, or is gone.
+            SourceError: the port does not support the speed, or is gone.
         """
         try:
             self._port.baudrate = baud
@@ -162,7 +162,7 @@ class SerialLink(Link[bytes]):
         try:
             self._port.close()
         except (OSError, TypeError):
-            pass  # it is gone, which is what we want
+            pass  # the port is gone already
 
     def fileno(self) -> int:
         return -1 if self._fd is None else self._fd
@@ -180,11 +180,11 @@ class CanLink(Link[Sequence[CanFrame]]):
     """Any interface of python-can: socketcan, pcan, kvaser, virtual, ...
 
     Args:
-        interface: Name that python-can has for the interface, such as ``socketcan``.
-        channel: Which bus of that interface, such as ``can0``.
+        interface: Name of the interface in python-can, such as ``socketcan``.
+        channel: Bus of that interface, such as ``can0``.
         bitrate: Speed of the bus, bit/s.
         data_bitrate: Speed of the data phase of CAN FD, bit/s.
-        patience_s: Longest time that the bus may take to take a frame, s.
+        patience_s: Longest time that the bus may take to accept a frame, s.
     """
 
     def __init__(
@@ -194,18 +194,18 @@ class CanLink(Link[Sequence[CanFrame]]):
         import can
 
         self.name, self._patience_s = f"{interface}:{channel}", patience_s
-        wanted: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if fd else {}
+        options: dict[str, Any] = {"fd": True, "data_bitrate": data_bitrate} if fd else {}
         if interface == "virtual":
-            wanted = {"protocol": can.CanProtocol.CAN_FD} if fd else {}
+            options = {"protocol": can.CanProtocol.CAN_FD} if fd else {}
         try:
-            self.bus: Any = can.Bus(channel, interface, bitrate=bitrate, **wanted)
+            self.bus: Any = can.Bus(channel, interface, bitrate=bitrate, **options)
         except can.CanInterfaceNotImplementedError as error:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             raise ConfigError(
                 f"can:{self.name}: {_reason(error)}; python-can knows {known}"
             ) from None
         except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
-            raise SourceError(f"can:{self.name}: {_why_bus(channel, error)}") from None
+            raise SourceError(f"can:{self.name}: {_explain_bus_error(channel, error)}") from None
 
     def receive(self, timeout_s: float) -> tuple[Sequence[CanFrame], int] | None:
         import can
@@ -220,7 +220,7 @@ class CanLink(Link[Sequence[CanFrame]]):
                     frames.append(convert_message(message))
                 message = self.bus.recv(0) if len(frames) < MOST_FRAMES else None
         except (can.CanError, OSError, ValueError) as error:
-            if self._off():
+            if self._is_bus_off():
                 raise SourceError(
                     f"can:{self.name}: the controller is bus-off after too many errors: check "
                     "bit rate, termination and wiring"
@@ -249,9 +249,9 @@ class CanLink(Link[Sequence[CanFrame]]):
         try:
             self.bus.shutdown()
         except (can.CanError, OSError):
-            pass  # it is gone, which is what we want
+            pass  # the bus is gone already
 
-    def _off(self) -> bool:
+    def _is_bus_off(self) -> bool:
         import can
 
         try:
@@ -263,7 +263,7 @@ class CanLink(Link[Sequence[CanFrame]]):
 class SlcanLink(Link[Sequence[CanFrame]]):
     """A CAN adapter that speaks slcan (LAWICEL) over a serial port.
 
-    python-can speaks it too, byte by byte: 5,500 frames/s where a saturated bus carries 9,000.
+    python-can reads it, too, but byte by byte: 5,500 frames/s, while a full bus carries 9,000.
     """
 
     def __init__(self, port: str, bitrate: int) -> None:
@@ -290,14 +290,14 @@ class SlcanLink(Link[Sequence[CanFrame]]):
         try:
             self._serial.send(closing())
         except SourceError:
-            pass  # it is gone, which is what we want
+            pass  # the port is gone already
         self._serial.close()
 
     def fileno(self) -> int:
         return self._serial.fileno()
 
 
-def _usb_number(path: str) -> str:
+def _find_usb_number(path: str) -> str:
     if not path.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
         return ""
     from serial.tools import list_ports
@@ -311,8 +311,8 @@ def _reason(error: BaseException) -> str:
     return describe_error(error)
 
 
-def _why(port: str, error: Exception) -> str:
-    """Why a serial port cannot be opened, and what to do."""
+def _explain_port_error(port: str, error: Exception) -> str:
+    """Explain why a serial port cannot be opened, and what to do."""
     number = getattr(error, "errno", None)
     text = _reason(error)
     if number == errno.ENOENT or "No such file" in text:
@@ -326,7 +326,7 @@ def _why(port: str, error: Exception) -> str:
     return f"cannot be opened ({text})"
 
 
-def _why_bus(channel: str, error: Exception) -> str:
+def _explain_bus_error(channel: str, error: Exception) -> str:
     text = _reason(error)
     if getattr(error, "errno", None) == errno.ENODEV or "No such device" in text:
         return (

@@ -1,7 +1,7 @@
-"""One line of a log of text: what candump, SavvyCAN, slcan adapters, tools of Vector and PEAK,
-python-can, terminals and dumps in hexadecimal write.
+"""Parsers of the lines of text logs.
 
-What is no such line is None; a ValueError says why one is none that nearly is.
+The logs are of candump, SavvyCAN, slcan adapters, tools of Vector and PEAK, python-can, terminals
+and hexadecimal dumps. A line of another form gives None, a damaged one a ValueError with the cause.
 """
 
 import base64
@@ -23,16 +23,16 @@ _CANDUMP: Final = re.compile(
     r"|\s+\[(?P<n>\d+)\](?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)(?:\s+'.*')?)"
     r"|(?P<error>[0-9A-Fa-f]{8}\s+\[\d+\].*ERRORFRAME.*))\s*"
 )
-_GVRET: Final = re.compile(  # what SavvyCAN saves
+_GVRET: Final = re.compile(  # as saved by SavvyCAN
     r"(?P<us>\d+),(?P<id>[0-9A-Fa-f]{3,8}),(?P<extended>true|false),(?:[RT]x,)?(?P<bus>\d+),"
     r"(?P<n>\d+)(?P<hex>(?:,[0-9A-Fa-f]{2})*),*\s*"
 )
 _SLCAN: Final = re.compile(r"(?:[tr][0-7][0-9A-Fa-f]{2}|[TR][01][0-9A-Fa-f]{7}|[dDbB])[0-9A-Fa-f]+")
-_HEARD: Final = re.compile(  # the Arduino IDE; CoolTerm, Tera Term and the like
+_TERMINAL: Final = re.compile(  # the Arduino IDE; CoolTerm, Tera Term and the like
     r"(?P<arduino>\d\d?:\d\d?:\d\d?\.\d+(?: ?[AaPp][Mm])?) -> (?P<a>.*)"
     r"|\[(?P<t>(?:\d{4}-\d\d-\d\d[ T])?\d\d?:\d\d?:\d\d?[.,]\d+)\]:? ?(?P<b>.*)"
 )
-# xxd, hexdump -C, and bytes in hex with or without a time before them
+# xxd, hexdump -C, and hexadecimal bytes, optionally after a time
 _XXD: Final = re.compile(
     r"[0-9a-fA-F]{7,16}:? +(?P<hex>(?:[0-9a-fA-F]{2,8} {1,2})*[0-9a-fA-F]{2,8})(?:  .*| \|.*)?"
 )
@@ -41,28 +41,28 @@ _HEX: Final = re.compile(
     r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
 )
 _ERROR, _STANDARD, _EXTENDED = 1 << 29, 0x7FF, 0x1FFFFFFF
-_FD_BYTES: Final = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by the code of the length
-# Columns of each version of .trc: the letters of its line ;$COLUMNS.
+_FD_BYTES: Final = (*range(9), 12, 16, 20, 24, 32, 48, 64)  # by data length code
+# Columns of each version of .trc, by the letters of its line ;$COLUMNS.
 TRC_COLUMNS: Final = {
     "1.0": "NOILD", "1.1": "NOdILD", "1.2": "NOBdILD", "1.3": "NOBdIRLD", "2.0": "NOTIdlD",
     "2.1": "NOTBIdRLD",
 }  # fmt: skip
-_TRC_STATUS: Final = {"Warng", "Error", "ST", "EC", "ER", "EV"}  # of the bus: no frame
+_TRC_STATUS: Final = {"Warng", "Error", "ST", "EC", "ER", "EV"}  # bus status, not frames
 _TRC_FD: Final = {"FD", "FB", "FE", "BI"}
 
-# Bus, packet, when in ns. The packet is empty for an error frame, None for a line beside frames.
+# Bus, packet, time in ns. The packet is empty for an error frame, None for a line without a frame.
 Found = tuple[str, Any, int | None] | None
 BESIDE: Final = ("", None, None)
 
 
 def of_candump(line: str) -> Found:
-    """A line of candump, as it prints or logs."""
+    """Read a line that candump printed or logged."""
     found = _CANDUMP.fullmatch(line)
     if found is None:
         return None
     if found["error"]:
         return found["bus"], [], None
-    t_ns = _time(found["t"]) if found["t"] else None
+    t_ns = _parse_time(found["t"]) if found["t"] else None
     number = int(found["id"], 16)
     extended = len(found["id"]) == 8
     if extended and number & _ERROR:
@@ -71,11 +71,11 @@ def of_candump(line: str) -> Found:
     text = "" if remote else found["hex"] or found["spaced"] or ""
     data = bytes.fromhex(text.replace(".", ""))
     n, fd = int(found["n"] or len(data)), found["fd"] is not None
-    return _frame(found["bus"], t_ns, number & _EXTENDED, extended, data, n, fd, remote)
+    return _to_frame(found["bus"], t_ns, number & _EXTENDED, extended, data, n, fd, remote)
 
 
 def of_gvret(line: str) -> Found:
-    """A line of what SavvyCAN saves (GVRET)."""
+    """Read a line of a GVRET file, as saved by SavvyCAN."""
     if line.lower().startswith("time stamp,"):
         return BESIDE
     found = _GVRET.fullmatch(line)
@@ -83,36 +83,36 @@ def of_gvret(line: str) -> Found:
         return None
     data, t_ns = bytes.fromhex(found["hex"].replace(",", "")), 1000 * int(found["us"])
     extended = found["extended"] == "true"
-    return _frame(found["bus"], t_ns, int(found["id"], 16), extended, data, int(found["n"]))
+    return _to_frame(found["bus"], t_ns, int(found["id"], 16), extended, data, int(found["n"]))
 
 
 def read_csv_line(line: str) -> Found:
-    """Read a line of a table that python-can writes as text."""
+    """Read a line of a CSV table written by python-can."""
     if line.startswith("timestamp,"):
         return BESIDE
     t, number, extended, remote, error, n, text = line.split(",")
     if error == "1":
         return "", [], None
     t_ns, data = round(float(t) * NS_PER_S), base64.b64decode(text)
-    return _frame("", t_ns, int(number, 16), extended == "1", data, int(n), remote=remote == "1")
+    return _to_frame("", t_ns, int(number, 16), extended == "1", data, int(n), remote=remote == "1")
 
 
 class AscLines:
-    """Lines of an .asc log, whose times may be differences, and whose identifiers names.
+    """Reader of the lines of an .asc log; its identifiers may be names.
 
     Args:
-        names: Identifiers, and whether they have 29 bits, of the messages whose names are known.
+        names: Identifier, and whether it has 29 bits, of each known message name.
 
     Attributes:
-        unknown: The number of frames of each name that is not known.
-        begun: Whether a trigger block has begun that has not ended.
-        odd_date: A date that is not read.
+        unknown: Number of frames of each unknown message name.
+        begun: Whether a trigger block is open.
+        odd_date: First date that could not be parsed; empty if none.
     """
 
     def __init__(self, names: Mapping[str, tuple[int, bool]]) -> None:
         self.unknown: Counter[str] = Counter()
         self.begun, self.odd_date = False, ""
-        self._names, self._base, self._differ = names, 16, False
+        self._names, self._base, self._relative = names, 16, False
         self._began_ns = self._now_ns = 0
 
     def read(self, line: str) -> Found:
@@ -121,22 +121,22 @@ class AscLines:
         first = words[0].lower()
         if re.fullmatch(r"\d+[.,]\d+", first):
             since = round(float(first.replace(",", ".")) * NS_PER_S)
-            self._now_ns = since + self._now_ns * self._differ
-            return self._event(words[1:])
+            self._now_ns = since + self._now_ns * self._relative
+            return self._read_event(words[1:])
         if first in ("date", "begin"):
             if first == "begin":
                 self.begun, self._now_ns = True, 0
-            self._date(words[2 if first == "begin" else 1 :])
+            self._read_date(words[2 if first == "begin" else 1 :])
         elif first == "base":
             self._base = 10 if words[1:2] == ["dec"] else 16
-            self._differ = "relative" in line.lower()
+            self._relative = "relative" in line.lower()
         elif first == "end":
             self.begun = False
         elif first not in ("internal", "no", "previous", "next") and not first.startswith("//"):
             return None
         return BESIDE
 
-    def _date(self, words: list[str]) -> None:
+    def _read_date(self, words: list[str]) -> None:
         from can.io import ASCReader
 
         try:
@@ -145,7 +145,7 @@ class AscLines:
         except ValueError:
             self.odd_date = self.odd_date or " ".join(words)
 
-    def _event(self, words: list[str]) -> Found:
+    def _read_event(self, words: list[str]) -> Found:
         """Read what follows the time of a line."""
         fd = words[:1] == ["CANFD"]
         bus, text, way, *rest = [*words[fd:], "", "", ""]
@@ -155,25 +155,25 @@ class AscLines:
             return BESIDE if bus else None
         if text.lower() == "errorframe":
             return f"{int(bus) - 1}", [], None
-        if way == "TxRq" or ":" in (text[-1:], way[-1:]):  # statistics and the like
+        if way == "TxRq" or ":" in (text[-1:], way[-1:]):  # e.g. statistics
             return BESIDE
         if way not in ("Rx", "Tx"):
             return None
-        if fd:  # a name may come first, then two flags and the code of the length
+        if fd:  # an optional name, then two flags and the data length code
             rest = ["d", *rest[3 + (not rest[0].isdigit()) :], "", ""]
-        identifier = self._identifier(text)
+        identifier = self._find_identifier(text)
         if identifier is None:
             return BESIDE
         remote, n = rest[0].lower() == "r", 0
         if not remote:
             n = int(rest[1]) if fd else min(8, int(rest[1], self._base))
-        told = rest[2 : 2 + n]
-        data = _unpack(" ".join(told)) if self._base == 16 else bytes(map(int, told))
+        digits = rest[2 : 2 + n]
+        data = _read_hex_bytes(" ".join(digits)) if self._base == 16 else bytes(map(int, digits))
         t_ns = self._began_ns + self._now_ns
-        return _frame(f"{int(bus) - 1}", t_ns, *identifier, data, n, fd, remote)
+        return _to_frame(f"{int(bus) - 1}", t_ns, *identifier, data, n, fd, remote)
 
-    def _identifier(self, text: str) -> tuple[int, bool] | None:
-        """Find an identifier, and whether it has 29 bits, by its number or name."""
+    def _find_identifier(self, text: str) -> tuple[int, bool] | None:
+        """Return (identifier, whether it has 29 bits) of a number or name; None if unknown."""
         digits = text.rstrip("xX")
         extended = digits != text
         try:
@@ -189,7 +189,7 @@ class AscLines:
 
 
 class TrcLines:
-    """Lines of a .trc log, whose header says its version and columns.
+    """Reader of the lines of a .trc log, whose header names its version and columns.
 
     Attributes:
         version: Version of the format.
@@ -200,7 +200,7 @@ class TrcLines:
         self._columns, self._began_ns = TRC_COLUMNS["1.0"], 0
 
     def read(self, line: str) -> Found:
-        """Read a line; all of a version that is not known are beside frames."""
+        """Read a line; in an unknown version, no line is taken for a frame."""
         if line.startswith(";"):
             key, _, value = line.strip().partition("=")
             if key == ";$FILEVERSION":
@@ -225,15 +225,15 @@ class TrcLines:
         n = int(cells["l"]) if "l" in cells else int(cells["L"])
         if "L" in cells:
             n = _FD_BYTES[n] if fd else min(8, n)
-        return _frame(
+        return _to_frame(
             cells.get("B", "1"), self._began_ns + round(1e6 * float(cells["O"])),
-            int(cells["I"], 16), len(cells["I"]) > 4, _unpack("" if remote else text), n,
+            int(cells["I"], 16), len(cells["I"]) > 4, _read_hex_bytes("" if remote else text), n,
             fd, remote,
         )  # fmt: skip
 
 
 def of_slcan(line: str) -> Found:
-    """A line of what an slcan adapter sends."""
+    """Read a line that an slcan adapter sent."""
     if _SLCAN.fullmatch(line) is None:
         return None
     frames = SlcanDecoder().feed(line.encode("ascii") + b"\r")
@@ -241,32 +241,32 @@ def of_slcan(line: str) -> Found:
 
 
 def of_heard(line: str) -> Found:
-    """A line of text with the time at which a terminal got it."""
-    found = _HEARD.fullmatch(line)
+    """Read a line that a terminal received and logged with its time."""
+    found = _TERMINAL.fullmatch(line)
     if found is None:
         return None
-    t_ns = _time((found["arduino"] or found["t"]).replace(",", "."))
+    t_ns = _parse_time((found["arduino"] or found["t"]).replace(",", "."))
     text = found["a"] if found["b"] is None else found["b"]
     return None if t_ns is None else ("", f"{text}\n".encode(), t_ns)
 
 
 def of_hex(line: str) -> Found:
-    """A line of bytes in hexadecimal."""
+    """Read a line of hexadecimal bytes, such as of xxd or hexdump."""
     found = _HEX.fullmatch(line) or _XXD.fullmatch(line)
     if found is None:
         return None
-    t_ns = _time(found["t"]) if "t" in found.re.groupindex and found["t"] else None
+    t_ns = _parse_time(found["t"]) if "t" in found.re.groupindex and found["t"] else None
     return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
 
 
-def _unpack(text: str) -> bytes:
-    """Read bytes of two hexadecimal digits each."""
+def _read_hex_bytes(text: str) -> bytes:
+    """Read bytes of two hexadecimal digits each; raise a ValueError at anything else."""
     if not re.fullmatch(r"(?:\s*[0-9A-Fa-f]{2})*\s*", text):
         raise ValueError("its bytes are damaged")
     return bytes.fromhex(text)
 
 
-def _frame(
+def _to_frame(
     bus: str,
     t_ns: int | None,
     number: int,
@@ -276,7 +276,7 @@ def _frame(
     fd: bool = False,
     remote: bool = False,
 ) -> Found:
-    """Make a frame, which has n bytes if it is right."""
+    """Make a frame; raise a ValueError unless it has n bytes and a valid identifier."""
     if number > (_EXTENDED if extended else _STANDARD):
         raise ValueError("no such identifier")
     if n > _FD_BYTES[-1] or (len(data) != n and not remote):
@@ -284,8 +284,8 @@ def _frame(
     return bus, [CanFrame(number, data, extended, fd or n > 8, remote)], t_ns
 
 
-def _time(text: str) -> int | None:
-    """Read a time in seconds, or a date, as ns; None if it is neither."""
+def _parse_time(text: str) -> int | None:
+    """Convert a time in seconds, or a date, to ns; None if it is neither."""
     plain = text.strip()
     if "-" in plain or ":" in plain:
         plain = in_seconds(plain)

@@ -1,10 +1,10 @@
-"""What somebody kept of a line: bytes, hexadecimal text, or a log of a CAN bus, as packets again.
+"""Logs of a serial line or CAN bus, read as packets of bytes or frames.
 
     log = read_log(Path("can.log"))       # candump, asc, blf, ...; bytes, hex
     for packet, t_ns in log.packets(): ...  # t_ns is None where the log has no times
 
-Which form a file has is told by how it begins, whatever its name; gzip is unpacked. Logs end
-anywhere and hold lines that are none: what can be read is, and `notes` say what could not.
+The first bytes of a file determine its form, whatever its name; gzip is unpacked. Logs may be cut
+and hold foreign lines: whatever is readable is read, and `notes` list what is not.
 """
 
 import gzip
@@ -27,12 +27,12 @@ from tactile_rt.drivers.links import convert_message
 CAN_FORMS: Final = ("candump", "slcan", "gvret", "asc", "blf", "trc", "csv", "db")
 BINARY: Final = ("blf", "db")
 FORMS: Final = ("raw", "hex", "terminal", *CAN_FORMS)
-HEAD: Final = 16_384  # bytes that tell the form
+HEAD: Final = 16_384  # bytes by which the form is recognised
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
 BLF: Final = b"LOGG"
 SQLITE: Final = b"SQLite format 3\0"  # of python-can's logger, .db; bags of ROS 2 are .db3
 GZIP: Final = b"\x1f\x8b"
-# What is neither a log nor a text, by its first bytes, and how it becomes one.
+# Files that are neither a log nor text, by their first bytes, and how to convert them.
 OTHERS: Final = {
     b"\x93NUMPY": "an array of NumPy: write it as a table, as numpy.savetxt does",
     b"PK\x03\x04": "a zip archive, as .npz and .xlsx are: write a table of it as text",
@@ -47,23 +47,23 @@ OTHERS: Final = {
 CSV_HEADER: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
 SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
 DAY_NS: Final = 86_400 * NS_PER_S
-FALLING: Final = 0.2  # of the times of candump -td are less than the one before
+FALLING: Final = 0.2  # of the times of candump -td are less than the previous one
 
 LINES: Final[dict[str, Callable[[str], log_lines.Found]]] = {
     "candump": log_lines.of_candump, "slcan": log_lines.of_slcan, "terminal": log_lines.of_heard,
     "hex": log_lines.of_hex, "gvret": log_lines.of_gvret, "csv": log_lines.read_csv_line,
 }  # fmt: skip
-Read = tuple[str, Any, int | None]  # bus, packet, empty for an error frame, and time, ns
+Read = tuple[str, Any, int | None]  # bus, packet (empty for an error frame), time in ns
 
 
 class Occurrences:
-    """How many there are of something, and which is the first."""
+    """Count of occurrences, with the number of the first one and its cause."""
 
     def __init__(self, what: str) -> None:
         self.what, self.n, self.first, self.why = what, 0, 0, ""
 
     def add(self, number: int, why: str = "") -> None:
-        """Count the one of this number."""
+        """Count an occurrence, at the line, frame or packet of this number."""
         if not self.n:
             self.first, self.why = number, why
         self.n += 1
@@ -76,15 +76,15 @@ class LineLog:
     """A log of a serial line or a CAN bus.
 
     Args:
-        bus: Name of the bus whose frames to take, of a log of several; empty for all.
+        bus: Name of the bus whose frames to read from a log of several; empty for all.
 
     Attributes:
-        piece: Bytes of a packet where the log says nothing of packets.
-        notes: What could not be read, a sentence each; complete once all packets were read.
-        buses: Number of packets of each bus, by its name; complete once all packets were read.
-        names: Identifiers, and whether they have 29 bits, of the messages whose names are known.
-        total: The number of bytes, lines or frames that the file holds; complete as the notes.
-        frames: How many of them were read as frames, or as lines that a device sent.
+        piece: Size of a packet in bytes, where the log does not delimit packets.
+        notes: Sentences on what could not be read; complete once all packets are read.
+        buses: Number of packets of each bus, by its name; complete once all packets are read.
+        names: Identifier, and whether it has 29 bits, of each known message name.
+        total: Number of bytes, lines or frames in the file; complete once all packets are read.
+        frames: Number of those that were read as frames, or as lines from a device.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:
@@ -95,20 +95,18 @@ class LineLog:
         self.buses: Counter[str] = Counter()
         self.names: Mapping[str, tuple[int, bool]] = {}
         self.total = self.frames = 0
-        self.back = Occurrences("packet")  # times that go back
+        self.back = Occurrences("packet")  # whose time is before the previous one
 
     def packets(self) -> Iterator[tuple[Any, int | None]]:
-        """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
-        not say. Times never go back.
-        """
+        """Yield (packet, time in ns or None), in order of time. Packets are bytes or CAN frames."""
         self.notes.clear()
         self.buses.clear()
         self.total = self.frames = 0
         latest, self.back = -(1 << 62), Occurrences("frame" if self.wire == "can" else "packet")
         number = errors = 0
-        read = self._raw if self.form == "raw" else self._text
+        read = self._read_raw if self.form == "raw" else self._read_text
         with open_log_file(self.path) as file:
-            reads = (self._binary if self.form in BINARY else read)(file)
+            reads = (self._read_binary if self.form in BINARY else read)(file)
             for bus, packet, t_ns in _count_days(reads) if self.form == "terminal" else reads:
                 self.frames += 1
                 if not packet:
@@ -139,35 +137,35 @@ class LineLog:
                 "these packets have the time before"
             )
 
-    def _raw(self, file: BufferedReader) -> Iterator[Read]:
-        """Read bytes; those of text in UTF-16, of which most is ASCII, as UTF-8."""
-        head, decode = _head(self.path), getincrementaldecoder("utf-16")("replace").decode
-        text = head.decode("utf-16", "replace") if _encoding(head) == "utf-16" else ""
+    def _read_raw(self, file: BufferedReader) -> Iterator[Read]:
+        """Read bytes; convert UTF-16 text, if it is mostly ASCII, to UTF-8."""
+        head, decode = _read_head(self.path), getincrementaldecoder("utf-16")("replace").decode
+        text = head.decode("utf-16", "replace") if _guess_encoding(head) == "utf-16" else ""
         plain = sum(c.isascii() and (c.isprintable() or c.isspace()) for c in text)
         while piece := file.read(self.piece):
             if data := decode(piece).encode() if plain > MOSTLY * len(text) else piece:
                 self.total += len(data)
                 yield "", data, None
 
-    def _text(self, file: BufferedReader) -> Iterator[Read]:
-        """Read lines of text, and note those that are none of its form."""
+    def _read_text(self, file: BufferedReader) -> Iterator[Read]:
+        """Read lines of text, and note those of another form."""
         asc, trc = log_lines.AscLines(self.names), log_lines.TrcLines()
         parse = {"asc": asc.read, "trc": trc.read, **LINES}[self.form]
         odd, number, now = Occurrences("line"), 0, 0
-        apart = self.form == "candump" and _times_are_apart(self.path)
-        with TextIOWrapper(file, _encoding(_head(self.path)), "replace") as lines:
+        differences = self.form == "candump" and _has_time_differences(self.path)
+        with TextIOWrapper(file, _guess_encoding(_read_head(self.path)), "replace") as lines:
             for number, line in enumerate(lines, 1):
                 if not line.strip():
                     continue
                 self.total += 1
-                found, why = _parse(parse, line.rstrip("\r\n"))
+                found, why = _try_parse(parse, line.rstrip("\r\n"))
                 if found is None:
                     odd.add(number, why)
                     continue
                 bus, packet, t_ns = found
                 if packet is None:
                     continue
-                if apart:
+                if differences:
                     t_ns = now = now + (t_ns or 0)
                 yield bus, packet, t_ns
         if asc.odd_date:
@@ -185,14 +183,14 @@ class LineLog:
                 f"version {trc.version[:20]!r} of a .trc is not read: there are "
                 f"{', '.join(log_lines.TRC_COLUMNS)}"
             )
-        if asc.begun:  # in its last line, most often
+        if asc.begun:  # it was most often cut within its last line
             self.notes.append(f"it ends before its end: {self.frames} frames were read")
         if odd.n and not (asc.begun and odd.n == 1 and odd.first == number):
             a = "an" if self.form == "asc" else "a"
             what = "frame" if self.form in ("asc", "csv", "trc") else "line"
             self.notes.append(f"passed over, no {what} of {a} {self.form} log: {odd}")
 
-    def _binary(self, file: BufferedReader) -> Iterator[Read]:
+    def _read_binary(self, file: BufferedReader) -> Iterator[Read]:
         """Read messages by python-can, up to where the file is damaged."""
         from can.io import BLFReader, SqliteReader
 
@@ -200,7 +198,7 @@ class LineLog:
         warned.addFilter(self._note_warning)
         try:
             made: Any = SqliteReader(self.path) if self.form == "db" else BLFReader(file)
-            made.stop = lambda: None  # `file` is looked at once more
+            made.stop = lambda: None  # keep `file` open: its position is needed below
             for message in made:
                 bus = "" if message.channel is None else str(message.channel)
                 packet = [] if message.is_error_frame else [convert_message(message)]
@@ -213,7 +211,7 @@ class LineLog:
                     self.notes.append(f"it ends before its end: {n} frames{of} were read")
         except OSError:
             raise
-        except Exception as error:  # python-can raises anything on what is cut or damaged
+        except Exception as error:  # python-can raises any exception at a cut or damaged file
             why = describe_error(error)
             self.notes.append(f"it is cut short or damaged after {self.frames} frames ({why:.80})")
         finally:
@@ -221,30 +219,30 @@ class LineLog:
             self.total = max(self.total, self.frames)
 
     def _note_warning(self, record: logging.LogRecord) -> bool:
-        """Note what python-can passes over with a warning, and not on the terminal."""
+        """Note a warning of python-can; return False, so that the terminal does not show it."""
         note = " ".join(record.getMessage().split())
         self.notes += [note] if note not in self.notes else []
         return False
 
 
 def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
-    """A log of a line; raw bytes where it is no other.
+    """Return the log in a file, as raw bytes if its form is unknown.
 
     Args:
-        form: one of `FORMS`; empty: as it begins.
+        form: one of `FORMS`; empty to recognise it by the first bytes.
     """
     if form and form not in FORMS:
         raise ConfigError(f"no form {form!r} of a log: there are {', '.join(FORMS)}")
     if not path.exists():
         raise ConfigError(f"no file {path}")
-    return LineLog(path, form or _form(path), bus)
+    return LineLog(path, form or _guess_form(path), bus)
 
 
 def open_log_file(path: Path) -> BufferedReader:
-    """A file to read, unpacked if it is of gzip; what is cut short or damaged ends where it does.
+    """Open a file for reading, unpacking gzip; a damaged one ends at the damage.
 
     Raises:
-        ConfigError: it is known to be no log and no table.
+        ConfigError: it is of a known type that is neither a log nor a table.
         OSError: it cannot be read, or is a pipe or device.
     """
     file = open_regular(path)
@@ -255,11 +253,11 @@ def open_log_file(path: Path) -> BufferedReader:
             raise ConfigError(f"{path} is {what}")
     packed = begins.startswith(GZIP)
     file.seek(0)
-    return BufferedReader(_Unpacked(file)) if packed else cast(BufferedReader, file)
+    return BufferedReader(_GzipReader(file)) if packed else cast(BufferedReader, file)
 
 
-class _Unpacked(RawIOBase):
-    """A gzip file, which ends where it is damaged: `broken` says that it does."""
+class _GzipReader(RawIOBase):
+    """A gzip file that ends where it is damaged; `broken` is then True."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file, self._unpacked, self.broken = file, gzip.GzipFile(fileobj=file), False
@@ -281,25 +279,25 @@ class _Unpacked(RawIOBase):
         super().close()
 
 
-def _head(path: Path) -> bytes:
+def _read_head(path: Path) -> bytes:
     with open_log_file(path) as file:
         return file.read(HEAD)
 
 
-def _encoding(head: bytes) -> str:
+def _guess_encoding(head: bytes) -> str:
     return "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
 
 
-def _lines(head: bytes) -> list[str]:
-    lines = [x for x in head.decode(_encoding(head), "replace").splitlines() if x.strip()]
-    return lines[:-1] if len(head) == HEAD else lines  # the last one was cut
+def _split_lines(head: bytes) -> list[str]:
+    lines = [x for x in head.decode(_guess_encoding(head), "replace").splitlines() if x.strip()]
+    return lines[:-1] if len(head) == HEAD else lines  # the last line is cut
 
 
 def _count_days(reads: Iterator[Read]) -> Iterator[Read]:
-    """Count times of day on after midnight; a lone one that is wrong goes back."""
+    """Continue times of day past midnight. A single wrong time becomes 1 ns before the last."""
     now, (reads, ahead) = 0, tee(reads)
     for read, after in zip_longest(reads, islice(ahead, 1, None)):
-        t_ns, then = (  # a day later where it is more than half a day before
+        t_ns, then = (  # add days to a time that is more than half a day earlier
             t + DAY_NS * max(0, -((t - now + DAY_NS // 2) // DAY_NS))
             for t in (read[2] or 0, (after or read)[2] or 0)
         )
@@ -308,8 +306,8 @@ def _count_days(reads: Iterator[Read]) -> Iterator[Read]:
         yield *read[:2], now - wrong
 
 
-def _parse(parse: Callable[[str], log_lines.Found], line: str) -> tuple[log_lines.Found, str]:
-    """Read a line, or say why it is none."""
+def _try_parse(parse: Callable[[str], log_lines.Found], line: str) -> tuple[log_lines.Found, str]:
+    """Parse a line; return (result, reason for a failure)."""
     try:
         return parse(line), ""
     except (ValueError, LookupError) as error:
@@ -317,12 +315,12 @@ def _parse(parse: Callable[[str], log_lines.Found], line: str) -> tuple[log_line
 
 
 def _count_frames(parse: Callable[[str], log_lines.Found], lines: list[str]) -> int:
-    return sum(x is not None and x[1] is not None for x in (_parse(parse, y)[0] for y in lines))
+    return sum(x is not None and x[1] is not None for x in (_try_parse(parse, y)[0] for y in lines))
 
 
-def _times_are_apart(path: Path) -> bool:
-    """Whether the times of candump are differences (-td): from 0 on, up and down."""
-    found = [_parse(log_lines.of_candump, line)[0] for line in _lines(_head(path))]
+def _has_time_differences(path: Path) -> bool:
+    """Return whether candump's times are differences (-td): they start at 0 and vary."""
+    found = [_try_parse(log_lines.of_candump, line)[0] for line in _split_lines(_read_head(path))]
     times = [one[2] for one in found if one is not None and one[2] is not None]
     if len(times) < 3 or times[0]:
         return False
@@ -330,13 +328,13 @@ def _times_are_apart(path: Path) -> bool:
     return falling > FALLING * len(times) or (times[1] > 0 and len(set(times[1:])) == 1)
 
 
-def _form(path: Path) -> str:
-    head = _head(path)
+def _guess_form(path: Path) -> str:
+    head = _read_head(path)
     if head.startswith(BLF):
         return "blf"
     if head.startswith(SQLITE):
         return "db"
-    lines = _lines(head)
+    lines = _split_lines(head)
     if not lines:
         return "raw"
     most = max(1, MOSTLY * len(lines))
@@ -357,8 +355,8 @@ def _form(path: Path) -> str:
     for form in ("candump", "slcan", "terminal"):
         if _count_frames(LINES[form], lines) >= most:
             return form
-    # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
-    hexes = [x for x in (_parse(log_lines.of_hex, line)[0] for line in lines) if x is not None]
+    # A table of two-digit numbers looks hexadecimal, too: only letters prove that it is bytes.
+    hexes = [x for x in (_try_parse(log_lines.of_hex, line)[0] for line in lines) if x is not None]
     data = b"".join(x[1] for x in hexes)
     letters = sum(b & 15 > 9 or b > 0x9F for b in data)
     right = len(hexes) >= most and len(data) >= 16 and letters > len(data) / 16

@@ -1,4 +1,4 @@
-"""`serial:` and `can:` URLs.
+"""Opening of devices from `serial:` and `can:` URLs.
 
 serial:///dev/ttyUSB0?codec=bota            can:socketcan:can0?codec=xela
 serial:socket://10.0.0.7:4000?codec=native  can:slcan:/dev/ttyACM0?codec=native&bitrate=1000000
@@ -27,12 +27,12 @@ from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
 
 @dataclass(frozen=True)
 class Prepared:
-    """A source that can be opened, and what is known of it before it is.
+    """A source that can be opened, with its array if known in advance.
 
     Attributes:
-        spec: The array that the samples will be of; None if only the device can tell.
-        told: Whether a device that would have been asked what array it is has been told instead;
-            the samples are of that array before any calibration.
+        spec: The array that the samples will be of; None if the device must describe it.
+        told: Whether the user declared the array of a device that would otherwise describe it;
+            the samples are then of that array before any calibration.
     """
 
     spec: ArraySpec | None
@@ -40,25 +40,25 @@ class Prepared:
     told: bool = False
 
     def calibrated(self, calibration: Calibration) -> "Prepared":
-        """The same, its samples corrected.
+        """Return a copy whose samples are corrected by a calibration.
 
         Raises:
-            SpecMismatch: they are of another device.
+            SpecMismatch: the calibration is of another device.
         """
         spec = self.spec and calibration.output_spec(self.spec)
-        opened = self._then(lambda source: CalibratedSource(source, calibration))
+        opened = self._open_then(lambda source: CalibratedSource(source, calibration))
         return Prepared(spec, opened, self.told)
 
     def declared(self, array: ArraySpec) -> "Prepared":
-        """The same as a source of this array, see `calibration.declare`."""
+        """Return a copy that is a source of this array, see `calibration.declare`."""
         if self.told:
             return self
         known = self.spec
         spec = declared(known, array).output_spec(known) if known else array
-        return Prepared(spec, self._then(lambda source: declare(source, array)))
+        return Prepared(spec, self._open_then(lambda source: declare(source, array)))
 
-    def _then(self, change: Callable[[Source], Source]) -> Callable[[], Source]:
-        def opened() -> Source:
+    def _open_then(self, change: Callable[[Source], Source]) -> Callable[[], Source]:
+        def open_changed() -> Source:
             source = self.open()
             try:
                 return change(source)
@@ -66,16 +66,16 @@ class Prepared:
                 source.close()
                 raise
 
-        return opened
+        return open_changed
 
 
 @dataclass(frozen=True)
 class SerialOptions(DeviceOptions):
-    """Options of ``serial:``, besides those of its codec.
+    """Options of ``serial:`` in addition to those of the codec.
 
     Attributes:
-        baud: Speed of the line, bit/s; 0 for the default of the codec.
-        parity: Parity of the line, ``N``, ``E`` or ``O``; empty for the default of the codec.
+        baud: Speed of the line, bit/s; 0 for the codec's default.
+        parity: Parity of the line, ``N``, ``E`` or ``O``; empty for the codec's default.
         dtr: Whether to assert DTR; many boards reset when it rises.
     """
 
@@ -93,12 +93,12 @@ class SerialOptions(DeviceOptions):
 
 @dataclass(frozen=True)
 class CanOptions(DeviceOptions):
-    """Options of ``can:``, besides those of its codec.
+    """Options of ``can:`` in addition to those of the codec.
 
     Attributes:
-        bitrate: Speed of the bus, bit/s; 0 for the default of the codec.
+        bitrate: Speed of the bus, bit/s; 0 for the codec's default.
         fd: Whether to open the bus for CAN FD.
-        data_bitrate: Speed of the data phase of CAN FD, bit/s; 0 for the default of the codec.
+        data_bitrate: Speed of the data phase of CAN FD, bit/s; 0 for the codec's default.
     """
 
     bitrate: int = 0
@@ -113,7 +113,7 @@ class CanOptions(DeviceOptions):
 
 
 def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
-    """A codec from its options as written."""
+    """Return a codec with options as written in a URL."""
     kind = codec_class(wire, name)
     (options,) = take_options(f"codec {name}", fields, kind.Options)
     made: Codec[Any] = kind(options)
@@ -121,33 +121,36 @@ def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
 
 
 def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:
-    """What opens the device on a serial port.
+    """Prepare the device on a serial port for opening.
+
+    Args:
+        array: The array, if a device that would describe itself is not to be asked.
 
     Raises:
-        ConfigError: wrong options. To open what is returned raises `SourceError` if the port
-            cannot be opened, or the device does not send.
+        ConfigError: wrong options. Opening the result raises `SourceError` if the port cannot be
+            opened or the device does not send.
         SpecMismatch: the calibration is of another device.
     """
     if not target:
         raise ConfigError("serial: needs a port, e.g. serial:///dev/ttyUSB0?codec=bota")
-    kind = _kind("serial", target, fields)
+    kind = _find_codec_class("serial", target, fields)
     assert issubclass(kind, SerialCodec)
     options, own = take_options(f"serial:{target}", fields, SerialOptions, kind.Options)
     codec = kind(own)
     baud, parity = options.baud or codec.baud, options.parity or codec.parity
     connect = partial(SerialLink, target, baud, parity, options.dtr)
-    return _prepared(connect, codec, options, target, fields, array)
+    return _prepare(connect, codec, options, target, fields, array)
 
 
 def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:
-    """What opens the device on a CAN bus.
+    """Prepare the device on a CAN bus for opening.
 
     Args:
-        target: interface and channel, ``socketcan:can0``.
+        target: interface and channel, such as ``socketcan:can0``.
 
     Raises:
-        ConfigError: wrong options. To open what is returned raises `SourceError` if the bus cannot
-            be opened, or the device does not send.
+        ConfigError: wrong options. Opening the result raises `SourceError` if the bus cannot be
+            opened or the device does not send.
     """
     from can import VALID_INTERFACES
 
@@ -156,18 +159,18 @@ def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = N
         raise ConfigError(
             f"can:{target} needs an interface and a channel, e.g. can:socketcan:can0?codec=xela"
         )
-    kind = _kind("can", target, fields)
+    kind = _find_codec_class("can", target, fields)
     assert issubclass(kind, CanCodec)
     if interface not in VALID_INTERFACES:
         raise ConfigError(
             f"can:{target}: {no_such('interface', interface, sorted(VALID_INTERFACES))}"
         )
-    # `fd` is the bus's affair and the codec's
+    # `fd` may be set by an option of the bus or of the codec
     options, own = take_options(f"can:{target}", fields, CanOptions, kind.Options)
     fd = options.fd or bool(getattr(own, "fd", False))
     speeds = kind.bitrate, kind.data_bitrate
     connect = partial(_open_bus, interface, channel, options, fd, speeds)
-    return _prepared(connect, kind(own), options, target, fields, array)
+    return _prepare(connect, kind(own), options, target, fields, array)
 
 
 def _open_bus(
@@ -180,10 +183,10 @@ def _open_bus(
 
 
 def open_line(url: str) -> Link[Any]:
-    """The bare line of a ``serial:`` or ``can:`` URL, for looking at what comes.
+    """Open the line of a ``serial:`` or ``can:`` URL, to receive raw packets.
 
     Args:
-        url: as of a source; of its options only those of the line matter.
+        url: URL of a source; only the options of the line have an effect.
 
     Raises:
         ConfigError: another scheme, or a wrong option.
@@ -201,7 +204,7 @@ def open_line(url: str) -> Link[Any]:
     return _open_bus(interface, channel, can, can.fd, speeds)
 
 
-def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
+def _find_codec_class(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
     if "codec" not in fields:
         raise ConfigError(
             f"{wire}:{target} needs codec=...: what the device speaks, see `tactile-rt codecs`"
@@ -209,7 +212,7 @@ def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
     return codec_class(wire, fields["codec"])
 
 
-def _prepared(
+def _prepare(
     connect: Callable[[], Link[Any]],
     codec: Codec[Any],
     options: DeviceOptions,
@@ -217,18 +220,14 @@ def _prepared(
     fields: dict[str, str],
     array: ArraySpec | None,
 ) -> Prepared:
-    """Reads the file that the calibration is described in; what it returns opens the line.
-
-    Args:
-        array: of a device that would be asked what it is; None: it is asked.
-    """
+    """Prepare a source, and read its calibration file; opening the result opens the line."""
     written = {k: v for k, v in fields.items() if k in codec.Options.__dataclass_fields__}
-    told = array if codec.spec is None else None
-    if told is not None:
-        codec.spec = told
-        written["array"] = told.to_json()  # without it a recording's packets say nothing
+    declared_array = array if codec.spec is None else None
+    if declared_array is not None:
+        codec.spec = declared_array
+        written["array"] = declared_array.to_json()  # needed to decode a recording's packets
     opened = partial(DeviceSource, connect, codec, options, name, written)
-    prepared = Prepared(codec.spec, opened, told is not None)
+    prepared = Prepared(codec.spec, opened, declared_array is not None)
     if not options.calibration:
         return prepared
     return prepared.calibrated(load_calibration(options.calibration))

@@ -1,11 +1,10 @@
-"""Many sources, one thread: whoever has something is read, in the order in which it came.
+"""Reader of many sources in one thread, each as soon as it has samples.
 
     reader = Reader([left, right])
     for source, chunk in reader:
         ...
 
-A thread for each device costs more: they take the interpreter's lock from each other at every
-sample.
+A thread for each device costs more: they contend for the interpreter's lock at every sample.
 """
 
 import os
@@ -15,22 +14,22 @@ from collections.abc import Iterable, Iterator
 
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-BLIND_S = 0.005  # how often sources are looked at that have no descriptor to wait for
-LOOK_S = 0.1  # how often each source is: a device is silent only when somebody has looked
+BLIND_S = 0.005  # interval at which sources without a descriptor are read
+LOOK_S = 0.1  # interval at which every source is read: only a read shows that a device is silent
 
 
 class Reader:
-    """Reads sources as their samples come. One thread at a time may use it, but for `wake`.
+    """Reads sources as their samples come. Only `wake` may be called from another thread.
 
-    It waits for the descriptors of all sources at once (`Source.fileno`), and looks at those that
-    have none every 5 ms: simulations, devices that are asked for each sample, and lines that are
-    lost. While a lost one is opened again, which may take as long as its device takes to answer,
-    the others wait in their lines. Nothing is buffered here.
+    It waits for the descriptors of all sources at once (`Source.fileno`), and reads those without
+    a descriptor every 5 ms: simulations, polled devices and lost lines. While a lost line is
+    opened again, which takes until its device answers, the samples of the others wait in their
+    lines. Nothing is buffered here.
 
     Args:
-        sources: what to read; they stay the caller's to close.
-        gather_s: how long what has come waits for more, s: to be woken for each sample costs as
-            much as to decode it.
+        sources: Sources to read; the caller closes them.
+        gather_s: Time to wait for further input once some has come, s: waking up for each sample
+            costs as much as decoding it.
 
     Attributes:
         sources: The sources that have not ended, in the order in which they were added.
@@ -41,40 +40,41 @@ class Reader:
         self.sources: list[Source] = []
         self._poll = select.poll()
         self._lines: dict[int, Source] = {}  # by descriptor
-        self._blind: list[Source] = []  # without one, now
+        self._blind: list[Source] = []  # those without a descriptor now
         self._look_at = 0.0
-        self._woken, self._wake = os.pipe()
-        os.set_blocking(self._woken, False)
-        self._poll.register(self._woken, select.POLLIN)
+        self._wake_reader, self._wake_writer = os.pipe()
+        os.set_blocking(self._wake_reader, False)
+        self._poll.register(self._wake_reader, select.POLLIN)
         for source in sources:
             self.add(source)
 
     def __del__(self) -> None:
-        os.close(self._woken)
-        os.close(self._wake)
+        os.close(self._wake_reader)
+        os.close(self._wake_writer)
 
     def add(self, source: Source) -> None:
-        """Read this one, too."""
+        """Add a source to those read."""
         self.sources.append(source)
-        self._attend(source)
+        self._register(source)
 
     def remove(self, source: Source) -> None:
-        """Read this one no longer; it stays open."""
+        """Stop reading a source; it stays open."""
         self.sources.remove(source)
-        self._neglect(source)
+        self._unregister(source)
 
     def wake(self) -> None:
-        """Let `wait` return at once; from any thread."""
-        os.write(self._wake, b"\0")
+        """Make `wait` return at once; callable from any thread."""
+        os.write(self._wake_writer, b"\0")
 
     def wait(self, timeout: float | None = None) -> list[Source]:
-        """Sources whose `read` may have something now; none if the time is over, or it was woken.
-        Ten times a second all of them are.
+        """Wait for input; return the sources to read now, none after a timeout or `wake`.
+
+        All sources are returned ten times a second.
         """
         if self._blind:
             for source in [s for s in self._blind if s.fileno() >= 0]:
-                self._neglect(source)
-                self._attend(source)
+                self._unregister(source)
+                self._register(source)
         now = time.monotonic()
         if now >= self._look_at:
             self._look_at = now + LOOK_S
@@ -85,15 +85,15 @@ class Reader:
             time.sleep(self._gather_s)
             found = self._poll.poll(0)
         ready = [self._lines[fd] for fd, _ in found if fd in self._lines]
-        if len(ready) < len(found):  # the other is `wake`
-            os.read(self._woken, 4096)
+        if len(ready) < len(found):  # the other descriptor is that of `wake`
+            os.read(self._wake_reader, 4096)
         return ready + self._blind if self._blind else ready
 
     def take(self, source: Source) -> Chunk | None:
-        """What has come of a source that is ready; None: nothing, or it has ended.
+        """Read a source that is ready; return None if it has nothing or has ended.
 
         Raises:
-            SourceError: the device broke, and is read no longer.
+            SourceError: the device failed; it is read no longer.
         """
         try:
             chunk = source.read(0.0)
@@ -103,16 +103,15 @@ class Reader:
                 return None
             raise
         if self._lines.get(source.fileno()) is not source and source not in self._blind:
-            self._neglect(source)  # its line is gone, or another
-            self._attend(source)
+            self._unregister(source)  # its line is gone or was replaced
+            self._register(source)
         return chunk
 
     def read(self, timeout: float | None = None) -> list[tuple[Source, Chunk]]:
-        """What has come of any of them since the last call; nothing when the time is over, or no
-        source is left.
+        """Wait for input; return (source, chunk) pairs, none after a timeout or without sources.
 
         Raises:
-            SourceError: a device broke; it is among the sources no longer.
+            SourceError: a device failed; it is removed from the sources.
         """
         end = None if timeout is None else time.monotonic() + timeout
         while self.sources:
@@ -126,14 +125,14 @@ class Reader:
         while self.sources:
             yield from self.read()
 
-    def _attend(self, source: Source) -> None:
+    def _register(self, source: Source) -> None:
         if (fd := source.fileno()) < 0:
             self._blind.append(source)
             return
         self._lines[fd] = source
         self._poll.register(fd, select.POLLIN)
 
-    def _neglect(self, source: Source) -> None:
+    def _unregister(self, source: Source) -> None:
         if source in self._blind:
             self._blind.remove(source)
         for fd in [fd for fd, known in self._lines.items() if known is source]:

@@ -1,9 +1,8 @@
-"""slcan: CAN frames as lines of text over a serial line, as most USB adapters speak it.
+"""The slcan protocol of most USB adapters: CAN frames as text over a serial line.
 
 After the LAWICEL CANUSB and CAN232 manuals (t, T, r, R, commands, answers, time stamps) and the
-CANable 2 firmware (d, D, b, B: CAN FD). The format has no checksum and no counter: what a damaged
-line makes of itself can't always be told, and lost lines not at all. USB has a checksum of its
-own.
+CANable 2 firmware (d, D, b, B: CAN FD). The format has no checksum and no counter: a damaged line
+is not always detected, a lost line never. USB has a checksum of its own.
 """
 
 from collections.abc import Iterable
@@ -38,28 +37,28 @@ _LONGEST: Final = 1 + 8 + 1 + 2 * 64 + 8
 
 
 class SlcanDecoder:
-    """The host's side: bytes to frames. Never raises, holds one line at most.
+    """Decoder of the host's side: bytes to frames. It never raises and holds one line at most.
 
-    Answers to commands are passed over, and so is what is no frame. Time stamps, 4 or 8 hexadecimal
-    digits after a frame's data, are allowed but not used: they are the adapter's, not the device's.
-    Whether frames have them is learnt from the first line; it changes when two lines in succession
-    agree that it has, so that a damaged length is noticed.
+    Answers to commands and anything else that is no frame are skipped. Time stamps, 4 or 8
+    hexadecimal digits after a frame's data, are allowed but not used: they are the adapter's, not
+    the device's. The first line shows their length; a new length is accepted only when two
+    successive lines have it, so that a damaged length is noticed.
     """
 
     def __init__(self) -> None:
         self._rest = b""
         self._stamp: int | None = None  # digits of a time stamp
-        self._other: int | None = None  # of the line before, if it differed
+        self._other: int | None = None  # those of the previous line, if they differed
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """The frames that these bytes complete; the result does not depend on how they were cut."""
+        """Return the frames that these bytes complete, however the bytes are cut."""
         data = self._rest + data
         if BELL in data:
             data = data.replace(BELL, BELL + CR)
         if b"\n" in data:  # some adapters end their lines with CR LF
             data = data.replace(b"\n", b"")
         *lines, rest = data.split(CR)
-        self._rest = rest[: _LONGEST + 1]  # one too long is corrupt, however much longer it is
+        self._rest = rest[: _LONGEST + 1]  # a line that is longer is corrupt
         frames = []
         for line in lines:
             kind = _KINDS.get(line[0]) if line else None
@@ -73,7 +72,7 @@ class SlcanDecoder:
             stamp = len(line) - stop
             if stamp == self._stamp:
                 self._other = None
-            elif not self._stamped(stamp):
+            elif not self._accept_stamp(stamp):
                 continue
             try:
                 ident = int(line[1:end], 16)
@@ -86,8 +85,8 @@ class SlcanDecoder:
                 frames.append(CanFrame(ident, body, extended, fd, remote))
         return frames
 
-    def _stamped(self, digits: int) -> bool:
-        """Whether a line with so many more digits than expected is to be believed."""
+    def _accept_stamp(self, digits: int) -> bool:
+        """Return whether a line may have this many digits after its data."""
         if digits not in (0, 4, 8):
             return False
         if self._stamp is not None and self._other != digits:
@@ -98,11 +97,10 @@ class SlcanDecoder:
 
 
 def encode(frames: Iterable[CanFrame], stamp_ms: int | None = None) -> bytes:
-    """Frames as lines; FD frames with bit-rate switching.
+    """Return CAN frames as lines of slcan; FD frames have bit-rate switching.
 
     Args:
-        frames: Frames to write; data longer than 8 bytes is padded with zeros to the next length
-            CAN FD has.
+        frames: Frames to write; FD data is padded with zeros to the next length that CAN FD has.
         stamp_ms: Time to append to each frame, ms, modulo a minute; None for no time stamps.
     """
     end = b"\r" if stamp_ms is None else b"%04X\r" % (stamp_ms % 60_000)
@@ -123,10 +121,10 @@ def encode(frames: Iterable[CanFrame], stamp_ms: int | None = None) -> bytes:
 
 
 def opening(bitrate: int) -> tuple[bytes, ...]:
-    """What a host sends, one after the other, to open the channel; each is answered.
+    """Return the commands by which a host opens the channel, in order; each is answered.
 
-    The first empties what an adapter has of an unfinished line, the second closes the channel: an
-    error in answer to either means nothing.
+    The first ends an unfinished line in the adapter, the second closes the channel: an error in
+    answer to either means nothing.
 
     Raises:
         ConfigError: slcan has no such bit rate.
@@ -138,17 +136,17 @@ def opening(bitrate: int) -> tuple[bytes, ...]:
 
 
 def closing() -> bytes:
-    """What a host sends to close the channel."""
+    """Return the command by which a host closes the channel."""
     return b"C\r"
 
 
 class SlcanAdapter:
-    """The device's side: an adapter that answers commands, for an emulator.
+    """The device's side, for an emulator: an adapter that answers commands.
 
     Args:
-        bitrate: Speed of the bus that the adapter is on, bit/s; opened with another one, the
-            adapter hears and says nothing and reports bus errors. None accepts whichever the host
-            chooses.
+        bitrate: Speed of the bus that the adapter is on, bit/s. If the host opens the channel at
+            another speed, the adapter passes no frames and reports bus errors. None accepts any
+            speed that the host chooses.
 
     Attributes:
         hears: Whether frames come through: the channel is open, and at the bus's bit rate.
@@ -162,8 +160,8 @@ class SlcanAdapter:
     def __init__(self, bitrate: int | None = None) -> None:
         self.open = False
         self.flags = 0
-        self._right = None if bitrate is None else BITRATES[bitrate]
-        self._rate = self._right
+        self._bus_rate = None if bitrate is None else BITRATES[bitrate]
+        self._rate = self._bus_rate
         self._stamps = False
         self._silent = False
         self._rest = b""
@@ -171,15 +169,15 @@ class SlcanAdapter:
 
     @property
     def bitrate(self) -> int:
-        """Speed of the bus, bit/s: its own, or what the host has set, or 1 Mbit/s."""
+        """Speed of the bus, bit/s; 1 Mbit/s if neither side has set it."""
         return next((rate for rate, code in BITRATES.items() if code == self._rate), 1_000_000)
 
     @property
     def hears(self) -> bool:
-        return self.open and self._rate == (self._right or self._rate)
+        return self.open and self._rate == (self._bus_rate or self._rate)
 
     def respond(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
-        """What the host has sent: (the answer, the frames for the bus)."""
+        """Process data from the host; return (the answer, the frames for the bus)."""
         *lines, rest = (self._rest + data).split(CR)
         self._rest = rest[: _LONGEST + 1]
         answers, frames = [], []
@@ -190,19 +188,19 @@ class SlcanAdapter:
                 frames += found if self.hears else []
                 answers.append((b"Z\r" if line[:1].isupper() else b"z\r") if found else BELL)
             else:
-                answers.append(self._command(line))
+                answers.append(self._run_command(line))
         return b"".join(answers), frames
 
     def encode(self, frames: Iterable[CanFrame], time_ns: int = 0) -> bytes:
-        """Frames from the bus as the host gets them; nothing unless `hears`."""
+        """Return frames from the bus as lines for the host; empty unless `hears`."""
         if not self.hears:
             return b""
         return encode(frames, time_ns // 1_000_000 if self._stamps else None)
 
-    def _command(self, line: bytes) -> bytes:
+    def _run_command(self, line: bytes) -> bytes:
         name, value = line[:1], line[1:]
         if name in (b"O", b"L", b"S", b"s", b"Y", b"Z", b"M", b"m", b"W") and self.open:
-            return BELL  # only while it is closed
+            return BELL  # these are allowed only while the channel is closed
         match name:
             case b"":
                 return CR
@@ -230,7 +228,7 @@ class SlcanAdapter:
             case b"Y" if line in DATA_BITRATES.values():
                 self.data_bitrate = next(r for r, code in DATA_BITRATES.items() if code == line)
             case b"s" | b"Y" | b"X" | b"M" | b"m" | b"W" | b"Q":
-                pass  # taken, and of no effect here
+                pass  # accepted without effect
             case _:
                 return BELL
         return CR

@@ -1,14 +1,14 @@
-"""Which codec do these bytes, or these frames of a CAN bus, speak?
+"""Identification of the codec of unknown bytes, or of frames of a CAN bus.
 
-What is needed: an answer from one second of a line that is cut anywhere, in the middle of a frame,
-of a device with a protocol that is checked or hardly so; and none where nothing fits.
+Requirement: an answer from one second of a line, cut anywhere, even within a frame, for protocols
+with and almost without checks; and no answer if nothing fits.
 
-The plan. Every codec is fed with all of it, also with the options that change what its device sends
-(`Codec.variants`). A codec fits if it found frames, made samples of them, and left little beside.
-If several do, the one whose frames prove more is right: the same bytes are fed once more with a bit
-in every so many turned over, and whoever does not notice had no reason to believe them before. On a
-bus two identifiers in a row prove little; there it counts that a sensor hardly ever measures the
-most that it can.
+Method. Each codec decodes all of the data, also with the options that change its device's frames
+(`Codec.variants`). A codec fits if it found frames, made samples of them, and skipped little. If
+several fit, the one whose frames prove more wins: the same bytes are decoded again with single bits
+flipped at intervals, and a codec that does not notice the damage had no proof before either. On a
+bus, two successive identifiers prove little; it counts there that a sensor hardly ever measures its
+full scale.
 """
 
 import time
@@ -31,33 +31,33 @@ from tactile_rt.drivers.opening import make_codec, open_line
 LOOK_BYTES: Final = 65_536
 LOOK_FRAMES: Final = 20_000
 PIECE: Final = 512  # bytes fed at a time
-LEAST: Final = 3  # frames, and samples of a device that is known
-EXPLAINED: Final = 0.6  # of the bytes
-EXPLAINED_UNPROVED: Final = 0.95  # by frames in which no damage is noticed
-PROVED: Final = 0.1
-OF_THE_BUS: Final = 0.02  # of its frames: other devices may be on it
-COMPLETE: Final = 0.5  # of the samples
-BORNE: Final = 0.9  # of the full scale: a load is less, but for a blow
+LEAST: Final = 3  # frames, and samples of a device that has described itself
+EXPLAINED: Final = 0.6  # least share of the bytes
+EXPLAINED_UNPROVED: Final = 0.95  # the same, if the codec notices no damage
+PROVED: Final = 0.1  # least share of damaged frames that the codec notices
+OF_THE_BUS: Final = 0.02  # least share of a bus's frames: it may have other devices
+COMPLETE: Final = 0.5  # least share of the samples
+BORNE: Final = 0.9  # of the full scale: a load is less, except in an impact
 DAMAGE_EVERY: Final = 24  # bytes
-NEEDS_A_FILE: Final = ("mapping", "columns")  # options without which there is no such codec
-# Of boards that print, besides those that codecs name.
+NEEDS_A_FILE: Final = ("mapping", "columns")  # options that such a codec requires
+# Further usual speeds of boards that print text, bit/s.
 SPEEDS: Final = (9600, 57600, 230_400, 38_400, 250_000, 500_000)
-FIRST_S: Final = 2.5  # for a board that begins anew when its port is opened
+FIRST_S: Final = 2.5  # for a board that resets when its port is opened
 START_S: Final = 0.6  # for a device that was asked
 MOST_BYTES: Final = 262_144
 
-Heard = tuple[int, str, bytes]  # baud, parity, what came
+Heard = tuple[int, str, bytes]  # baud, parity, received bytes
 Tried = tuple[str, Mapping[str, str]]  # codec, options
 
 
 @dataclass(frozen=True)
 class CodecFit:
-    """A codec that fits.
+    """A codec that may fit, and how well.
 
     Attributes:
-        samples: Number of samples; of a device that has not described itself 0.
-        explained: Part of the bytes, or of the bus's frames, that is of this device's frames.
-        proof: Part of damaged frames that the codec notices, 0 to 1.
+        samples: Number of samples; 0 for a device that has not described itself.
+        explained: Share of the bytes, or of the bus's frames, that belong to this device.
+        proof: Share of damaged frames that the codec notices, 0 to 1.
     """
 
     wire: str
@@ -78,67 +78,67 @@ class CodecFit:
 
 
 def sniff_bytes(data: bytes, further: Sequence[Tried] = ()) -> list[CodecFit]:
-    """The codecs that fit what came over a serial line, the best first; none where none does.
+    """Return the codecs that fit bytes of a serial line, the best first.
 
     Args:
-        data: bytes as they came, cut anywhere; the first 64 kB are looked at, and where nothing
-            fits them, the second half of these.
+        data: raw bytes, cut anywhere; the first 64 kB are used; if none fits, their second half.
+        further: further codecs to try, with their options.
     """
     data = data[:LOOK_BYTES]
-    # what comes first may be a device that starts, or the line before it was plugged in
-    return _fitting(data, further) or _fitting(data[len(data) // 2 :], further)
+    # the beginning may be of a device that starts, or of the line before it was plugged in
+    return _find_fits(data, further) or _find_fits(data[len(data) // 2 :], further)
 
 
-def _fitting(data: bytes, further: Sequence[Tried]) -> list[CodecFit]:
+def _find_fits(data: bytes, further: Sequence[Tried]) -> list[CodecFit]:
     if any(data[p:] == data[:-p] for p in (1, 2, 3, 4)):
-        return []  # nothing is said in it
+        return []  # it only repeats up to four bytes: no information
     pieces, worse = (
         [whole[at : at + PIECE] for at in range(0, len(data), PIECE)]
-        for whole in (data, _damaged(data))
+        for whole in (data, _flip_bits(data))
     )
     fits = []
-    for codec, options in _candidates("serial", further, ()):
-        fit = _fed("serial", codec, options, pieces, len(data))
+    for codec, options in _list_candidates("serial", further, ()):
+        fit = _try_codec("serial", codec, options, pieces, len(data))
         if not fit.likely or fit.explained < EXPLAINED or fit.corrupt > 2 * fit.intact:
             continue
-        again = _fed("serial", codec, options, worse, len(data))
+        again = _try_codec("serial", codec, options, worse, len(data))
         fit = replace(fit, proof=1.0 - min(1.0, again.intact / fit.intact))
         if fit.proof >= PROVED or fit.explained >= EXPLAINED_UNPROVED:
             fits.append(fit)
-    return _ranked(fits)
+    return _rank(fits)
 
 
 def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> list[CodecFit]:
-    """The codecs that fit frames of a CAN bus, the best first; none where none does.
+    """Return the codecs that fit frames of a CAN bus, the best first.
 
     Args:
-        frames: as they came; other devices may be on the bus.
+        frames: frames in the order received; other devices may be on the bus.
     """
     frames = frames[:LOOK_FRAMES]
     packets = [[frame] for frame in frames]
     counts = Counter(f.id for f in frames if not f.extended)
     seen = {i for i, n in counts.items() if n >= max(LEAST, OF_THE_BUS * len(frames) / 4)}
     fits = []
-    for codec, options in _candidates("can", further, seen):
-        fit = _fed("can", codec, options, packets, len(frames))
+    for codec, options in _list_candidates("can", further, seen):
+        fit = _try_codec("can", codec, options, packets, len(frames))
         if fit.likely and fit.explained >= OF_THE_BUS and 4 * fit.corrupt <= fit.intact:
             fits.append(fit)
-    return _ranked(fits)
+    return _rank(fits)
 
 
-def _candidates(
+def _list_candidates(
     wire: str, further: Iterable[Tried], seen: Collection[int]
 ) -> Iterable[tuple[str, dict[str, str]]]:
     for codec, options in further:
-        make_codec(wire, codec, dict(options))  # refused before anything is fed
+        make_codec(wire, codec, dict(options))  # raises at wrong options before any is tried
         yield codec, dict(options)
-    for name, kind in _codecs(wire):
+    for name, kind in _list_codecs(wire):
         if not _needs_file(kind):
             yield from ((name, options) for options in ({}, *kind.variants(seen)))
 
 
-def _codecs(wire: str) -> Iterator[tuple[str, type[Codec[Any]]]]:
-    """List the codecs of a wire, but those whose library is not installed."""
+def _list_codecs(wire: str) -> Iterator[tuple[str, type[Codec[Any]]]]:
+    """List the codecs of a wire, except those whose library is not installed."""
     for of, name in CODECS:
         if of == wire:
             with suppress(ConfigError):
@@ -149,7 +149,7 @@ def _needs_file(kind: type[Codec[Any]]) -> bool:
     return bool(set(NEEDS_A_FILE) & set(kind.Options.__dataclass_fields__))
 
 
-def _fed(
+def _try_codec(
     wire: str, name: str, options: Mapping[str, str], packets: Sequence[Any], total: int
 ) -> CodecFit:
     codec: Codec[Any] = make_codec(wire, name, dict(options))
@@ -165,7 +165,7 @@ def _fed(
     described = codec.spec is not None
     if described and min(valid, samples - stats.incomplete) < COMPLETE * samples:
         samples = 0
-    silent = not described or bool(codec.complaint)  # there may be samples all the same
+    silent = not described or bool(codec.complaint)  # a right codec may have no samples then
     return CodecFit(
         wire, name, options, stats.intact, stats.corrupt, samples,
         max(0.0, 1.0 - stats.skipped / max(1, total)), described=described,
@@ -173,8 +173,8 @@ def _fed(
     )  # fmt: skip
 
 
-def _damaged(data: bytes) -> bytes:
-    """The bytes with one bit of every so many turned over, the same ones every time."""
+def _flip_bits(data: bytes) -> bytes:
+    """Flip one bit in every `DAMAGE_EVERY` bytes, reproducibly."""
     hurt = np.frombuffer(data, np.uint8).copy()
     draw = np.random.default_rng(0)
     at = np.arange(DAMAGE_EVERY // 2, len(hurt), DAMAGE_EVERY)
@@ -182,21 +182,21 @@ def _damaged(data: bytes) -> bytes:
     return hurt.tobytes()
 
 
-def _ranked(fits: list[CodecFit]) -> list[CodecFit]:
-    """The best first: what explains more, or as much with more proof, or with fewer options."""
+def _rank(fits: list[CodecFit]) -> list[CodecFit]:
+    """Sort by share explained with proof, then by share alone, fewer options and frames."""
     return sorted(fits, reverse=True, key=lambda fit: (
         round(min(1.0, fit.explained) * (0.5 + 0.5 * fit.proof), 1),
         round(fit.explained, 2), -len(fit.options), fit.intact,
     ))  # fmt: skip
 
 
-# what comes over a line that nobody knows anything about
+# listening to lines with unknown devices
 
 
 def line_speeds() -> list[tuple[int, str]]:
-    """(baud, parity) of every serial codec, the most usual first, then of other boards."""
+    """Return (baud, parity) of all serial codecs, the most usual first, then further speeds."""
     found: list[tuple[int, str]] = []
-    for name, kind in _codecs("serial"):
+    for name, kind in _list_codecs("serial"):
         codec: Any = kind if _needs_file(kind) else make_codec("serial", name, {})
         found.append((codec.baud, codec.parity))
     usual = sorted(set(found), key=lambda speed: (-found.count(speed), speed))
@@ -204,10 +204,10 @@ def line_speeds() -> list[tuple[int, str]]:
 
 
 def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Iterator[Heard]:
-    """Listen to a serial port, which is opened once, at each of these speeds.
+    """Listen to a serial port at each of these speeds; the port is opened once.
 
     Args:
-        seconds: how long to listen at each, s.
+        seconds: time to listen at each speed, s.
         speeds: (baud, parity) of each.
     """
     with closing(SerialLink(port, *speeds[0])) as link:
@@ -226,7 +226,7 @@ def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Itera
 
 
 def hear_bus(url: str, seconds: float) -> list[CanFrame]:
-    """The frames that come over a CAN bus.
+    """Return the frames received on a CAN bus during this time.
 
     Args:
         url: ``can:INTERFACE:CHANNEL``, with the bus's options.
@@ -243,30 +243,30 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
 def ask_devices(
     wire: str, connect: Callable[[Codec[Any]], Link[Any]], seconds: float
 ) -> Iterator[tuple[Codec[Any], Any]]:
-    """Start the device of each codec that waits for it; return what then comes.
+    """Start a device with each codec that has a start command; yield (codec, received data).
 
     Args:
-        seconds: how long to listen after the first sample, s.
+        seconds: time to listen after the first sample, s.
     """
-    connect(make_codec(wire, "native", {})).close()  # told once, not for every codec
-    for name, kind in _codecs(wire):
+    connect(make_codec(wire, "native", {})).close()  # raises once if the line cannot be opened
+    for name, kind in _list_codecs(wire):
         if _needs_file(kind):
             continue
         codec = make_codec(wire, name, {})
         if not codec.polls and not codec.commands(Command.START):
             continue
-        heard: list[Any] = []
+        received: list[Any] = []
         try:
             with DeviceSource(
                 lambda codec=codec: connect(codec), codec,  # type: ignore[misc]
                 DeviceOptions(name, start_s=START_S, reconnect=False), name,
             ) as source:  # fmt: skip
-                source.tap(lambda packet, _, heard=heard: heard.append(packet))  # type: ignore[misc]
+                source.tap(lambda packet, _, to=received: to.append(packet))  # type: ignore[misc]
                 end = time.monotonic() + seconds
                 while (left := end - time.monotonic()) > 0:
                     source.read(left)
         except (SourceError, EndOfStream):
             continue
-        packets = [p for p in heard if p is not None]
+        packets = [p for p in received if p is not None]
         whole: Any = b"".join(packets) if wire == "serial" else [f for p in packets for f in p]
         yield codec, whole

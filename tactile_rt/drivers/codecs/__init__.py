@@ -1,7 +1,6 @@
-"""One device, one module, named like its codec; a frame, a checksum or a command is wrong there.
+"""The codecs, one module for each device, which defines its frames, checksum and commands.
 
-Two protocols need more room: the native one is spoken over serial lines (`native`) and CAN
-(`native_can`), and both share `native_common`; and what a user writes of an unknown device is read
-by `ascii_mapping` and `dbc_file`. `framing` holds what many share: the checksums themselves, and
-how frames are found.
+The native protocol has a module for serial lines (`native`), one for CAN (`native_can`) and their
+common part, `native_common`. `ascii_mapping` and `dbc_file` read the users' descriptions of other
+devices. `framing` has what many codecs share: checksums, and the search for frames.
 """

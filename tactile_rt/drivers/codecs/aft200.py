@@ -15,7 +15,7 @@ from tactile_rt.drivers.codecs.framing import CodecOfParts
 COMMAND_ID: Final = 0x102
 BIAS, TRANSMIT, PERIOD = 2, 3, 5  # second byte of a command
 XYZ: Final = struct.Struct(">3H")
-# SI units per count, and the value of a 0: force in N, torque in N m
+# SI units per count, and value at count 0: force in N, torque in N m
 SCALE: Final = np.array([0.01] * 3 + [0.002] * 3)
 ZERO: Final = np.array([-300.0] * 3 + [-50.0] * 3)
 BIAS_S: Final = 1.0  # the sensor is silent while it takes its bias
@@ -27,9 +27,9 @@ class Aft200Options:
 
     Attributes:
         sensor: Number of the sensor, the first byte of each command.
-        force_id: CAN identifier of the force frames; the torque frames have the next one.
-        rate_hz: Sample rate that the sensor is set to, 15.3 to 1000 Hz.
-        bias: Whether the sensor takes its present load as zero at the start.
+        force_id: CAN identifier of the force frames; that of the torque frames follows it.
+        rate_hz: Sample rate to set, 15.3 to 1000 Hz.
+        bias: Whether the sensor takes its load at the start as zero.
     """
 
     sensor: int = 1
@@ -47,9 +47,9 @@ class Aft200Options:
 
 
 class Aft200(CodecOfParts):
-    """A frame of forces, then one of torques, three u16 big-endian each.
+    """Codec of a frame of forces, then one of torques, three u16 big-endian each.
 
-    Of a sample without its torques, or without its forces, nothing is valid.
+    A sample without its torques, or without its forces, is invalid.
 
     Source: the public driver rise_aft_can (class AFT200D80).
     """
@@ -73,24 +73,24 @@ class Aft200(CodecOfParts):
         super().__init__(six_axis("AFT200-D80", 1e6 / self._period_us), parts=2)
         self.streaming = False
 
-    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+    def _identify_part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
         part = identifier - self._first
         return (part, XYZ.size) if 0 <= part <= 1 else None
 
-    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+    def _add_sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
         raw = b"".join([p[: XYZ.size] if p else bytes(XYZ.size) for p in parts])
         batch.values.append(np.frombuffer(raw, ">u2") * SCALE + ZERO)
         batch.valid.append((None not in parts,))
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if command != Command.START:  # how to stop it is not public
+        if command != Command.START:  # the stop command is not public
             return ()
-        steps = [self._command(PERIOD, *self._period_us.to_bytes(2, "big"))]
+        steps = [self._make_command(PERIOD, *self._period_us.to_bytes(2, "big"))]
         if self._options.bias:
-            steps.append(self._command(BIAS, 1, pause_s=BIAS_S))
-        return (*steps, self._command(TRANSMIT, 1))
+            steps.append(self._make_command(BIAS, 1, pause_s=BIAS_S))
+        return (*steps, self._make_command(TRANSMIT, 1))
 
-    def _command(self, *data: int, pause_s: float = 0.0) -> Step[Sequence[CanFrame]]:
+    def _make_command(self, *data: int, pause_s: float = 0.0) -> Step[Sequence[CanFrame]]:
         whole = bytes((self._options.sensor, *data)).ljust(8, b"\0")
         return Step((CanFrame(COMMAND_ID, whole),), pause_s=pause_s)
 

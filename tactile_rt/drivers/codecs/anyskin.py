@@ -1,7 +1,7 @@
 """AnySkin and ReSkin: magnetometers under a magnetised elastomer.
 
-A frame (``frames/anyskin.toml``) has neither beginning, counter nor check, and its line end also
-occurs inside the floats: where frames end is concluded from several at once (`endings`).
+A frame (``frames/anyskin.toml``) has no beginning, counter or check, and its line end also occurs
+inside the floats: the place of the frames is inferred from several at once (`endings`).
 """
 
 import struct
@@ -19,7 +19,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import Element
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD
 
-CHIPS: Final = 5  # of the board whose places are known
+CHIPS: Final = 5  # of the board whose chip positions are known
 BYTES: Final = 16  # of a chip
 ABSENT: Final = -998.1  # C, a chip that does not answer: raw temperature 0
 
@@ -31,8 +31,7 @@ class AnySkinOptions:
     Attributes:
         magnetometers: Number of magnetometers on the board: 5 on the 5X board, 1 on a single one.
         temperature: Whether to deliver each chip's temperature (K) as a fourth channel.
-        rate_hz: Rate at which the board sends, Hz; the firmware runs as fast as the I2C bus lets
-            it.
+        rate_hz: Rate at which the board sends, Hz, which the speed of its I2C bus limits.
     """
 
     magnetometers: int = 5
@@ -79,10 +78,10 @@ class AnySkin(DescribedFrame):
         good = chunk.valid & np.isfinite(chunk.values).all(axis=2)
         values = np.where(good[..., None], chunk.values, 0.0).astype(np.float32)
         packets = super().encode(Chunk(chunk.seq, chunk.t_ns, values, np.ones_like(good)))
-        return [self._without(p, np.flatnonzero(~g)) for p, g in zip(packets, good, strict=True)]
+        return [self._blank(p, np.flatnonzero(~g)) for p, g in zip(packets, good, strict=True)]
 
-    def _without(self, packet: bytes, absent: NDArray[np.intp]) -> bytes:
-        """A chip that does not answer reads as a raw temperature of 0, and no field."""
+    def _blank(self, packet: bytes, absent: NDArray[np.intp]) -> bytes:
+        """Return the packet with the absent chips' temperatures set to the raw value 0."""
         frame = bytearray(packet)
         for chip in absent.tolist():
             struct.pack_into("<f", frame, BYTES * chip, ABSENT)

@@ -1,9 +1,9 @@
-"""Any board that prints numbers; a file, or a few words, say which number is what.
+"""Codec of any board that prints numbers, described by a file or a few words.
 
 Numbers stand at their places in a line, between spaces, tabs, commas, semicolons and brackets; or
 after their names, in one line, in several, or in JSON. Lines end with a carriage return, a line
-feed or both. The first line after joining is not believed, for it may have lost its beginning (a
-file is read as if a line end came before it); banners and headers are known by their words.
+feed or both. The first line after joining is not used, since it may lack its beginning (a file is
+read as if a line end came before it); banners and headers are recognised by their words.
 """
 
 import re
@@ -30,13 +30,13 @@ from tactile_rt.drivers.codecs.ascii_text import Names, fields, is_text, number,
 
 TICK_NS: Final = {"s": 1e3, "iso": 1e3, "ms": 1e6, "us": 1e3, "ns": 1.0}
 NEVER_WRAPS: Final = 62  # bits, for a time in seconds
-EXACT: Final = 2.0**53  # whole numbers up to here are exact
+EXACT: Final = 2.0**53  # up to which integers are exact in a float64
 NAN: Final = float("nan")
 NO_TEXT: Final = "what comes is not text: wrong baud rate?"
-SCRAP: Final = 8  # characters that binary data may hold between two line ends
+SCRAP: Final = 8  # characters, as binary data may have between two line ends by chance
 
 _SPACES: Final = bytes.maketrans(b",;\t", b"   ")
-_WORDS: Final = re.compile(r"[^:=]*[\w\0][^:=]*")  # no other label, no ruled line
+_WORDS: Final = re.compile(r"[^:=]*[\w\0][^:=]*")  # without labels; no ruled line
 _PLAIN: Final = re.compile(rb"[-+0-9.eE \t;,]*")
 
 
@@ -46,12 +46,12 @@ class AsciiLineOptions:
 
     Attributes:
         mapping: Path of a TOML file, like docs/codecs/ascii_line.toml.
-        columns: The columns between commas, e.g. ``time:ms,A0.fx*0.5:mN,A0.fy*0.5:mN,-``; how they
-            are written is told in `ascii_mapping`.
+        columns: The columns between commas, e.g. ``time:ms,A0.fx*0.5:mN,A0.fy*0.5:mN,-``;
+            `ascii_mapping` describes their form.
         rate_hz: Rate at which the board prints, Hz; 0 stands for the rate in the file, else 100 Hz.
-        start: Text to send so that the board begins (in a URL ``%0A`` is a line feed).
-        stop: Text to send so that the board ends.
-        poll: Text to send for each sample; without one the board prints by itself.
+        start: Text that starts the board (in a URL ``%0A`` is a line feed).
+        stop: Text that stops the board.
+        poll: Text to send for each sample; empty if the board prints by itself.
     """
 
     mapping: str = ""
@@ -74,13 +74,13 @@ def _has_digit(word: str) -> bool:
 
 
 class AsciiLine(SerialCodec):
-    """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter.
+    """Codec of printed lines: capacitive skins, lab whiskers, sketches for a serial plotter.
 
     Attributes:
-        line_end: What stands before the first line of a file.
-        claims_rate: Whether somebody told at what rate the board prints.
-        unfinished: Number of bytes that came of a sample not yet whole.
-        passed: Number of lines of words that came between samples.
+        line_end: Line end to assume before the first line of a file.
+        claims_rate: Whether the user has given the board's rate.
+        unfinished: Number of bytes received of an incomplete sample.
+        passed: Number of lines of words between samples.
     """
 
     Options = AsciiLineOptions
@@ -108,7 +108,7 @@ class AsciiLine(SerialCodec):
         self._scale = np.array([columns[i].scale for i in self._order])
         self._offset = np.array([columns[i].offset for i in self._order])
         self._count = self._time = -1
-        self._per_tick = 1.0  # numbers on the wire
+        self._per_tick = 1.0  # units of the printed time
         for i, c in enumerate(columns):
             if c.kind == "count":
                 self._count, self.count_bits = i, c.bits
@@ -124,8 +124,8 @@ class AsciiLine(SerialCodec):
         self.polls = bool(self._poll)
         self.streaming = not self._start and not self.polls
         self._longest = 256 + 64 * self._width
-        self._data, self._heard = bytearray(), b""
-        self._printed = False
+        self._data, self._host_text = bytearray(), b""
+        self._has_printed = False
         self.forget()
 
     # the host's side
@@ -134,9 +134,9 @@ class AsciiLine(SerialCodec):
         self._data += packet
         *lines, self._data = self._data.replace(b"\r", b"\n").split(b"\n")
         self._rows: list[list[float]] = []
-        self._about: list[tuple[int, int]] = []  # of each: arrival, and frames damaged before
+        self._arrivals: list[tuple[int, int]] = []  # arrival of each, and damaged lines before
         for line in lines:
-            self._line(line, t_ns)
+            self._read_line(line, t_ns)
         if len(self._data) > self._longest:
             self.stats.skipped += len(self._data)
             self._overlong = True
@@ -146,14 +146,14 @@ class AsciiLine(SerialCodec):
             self._data.clear()
         self.unfinished = len(self._data) + (self._open_bytes if self._open else 0)
         self.stats.intact += len(self._rows)
-        return self._samples() if self._rows else None
+        return self._make_samples() if self._rows else None
 
     def forget(self) -> None:
         self._data.clear()
         self._joined = self._overlong = False
         self._damaged = 0
-        self._open: dict[int, float] = {}  # of a sample of several lines: what has come
-        self._begun = False  # not in the middle of it
+        self._open: dict[int, float] = {}  # numbers so far of a sample in several lines
+        self._has_beginning = False  # whether that sample has its beginning
         self._open_ns = self._open_bytes = 0
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
@@ -179,95 +179,95 @@ class AsciiLine(SerialCodec):
                 words[self._time] = f"{ticks * self._per_tick:.9f}" if decimal else str(ticks)
                 if self._columns[self._time].kind == "iso":
                     words[self._time] = f"{datetime.fromtimestamp(1e-6 * ticks, UTC):%F %T.%f}"
-            # one who joins does not believe what stands before the first line end
-            begin = b"" if self._printed else b"\r\n"
-            self._printed = True
-            packets.append(begin + self._printed_line(words).encode() + b"\r\n")
+            # a host that joins does not use the text before the first line end
+            begin = b"" if self._has_printed else b"\r\n"
+            self._has_printed = True
+            packets.append(begin + self._format_line(words).encode() + b"\r\n")
         return packets
 
-    def _printed_line(self, words: list[str]) -> str:
+    def _format_line(self, words: list[str]) -> str:
         if self._names is None:
             return ",".join(words)
-        said: dict[str, Any] = {}
+        tree: dict[str, Any] = {}
         for column, word in zip(self._columns, words, strict=True):
             *path, last = column.label.split(".")
             if path and last.isdecimal():
-                row = said.setdefault(".".join(path), [])
+                row = tree.setdefault(".".join(path), [])
                 row += [0.0] * (int(last) + 1 - len(row))
                 row[int(last)] = float(word)
             elif column.kind != "-":
-                here = said
+                here = tree
                 for key in path:
                     here = here.setdefault(key, {})
                 here[last] = word if column.kind == "iso" else float(word)
-        return msgspec.json.encode(said).decode()
+        return msgspec.json.encode(tree).decode()
 
     def respond(self, packet: bytes) -> bytes:
         words = [w for w in (self._start, self._stop, self._poll) if w]
-        heard = self._heard + packet
-        while found := [(heard.find(w), w) for w in words if w in heard]:
+        text = self._host_text + packet
+        while found := [(text.find(w), w) for w in words if w in text]:
             at, word = min(found)
-            heard = heard[at + len(word) :]
+            text = text[at + len(word) :]
             if word == self._poll:
                 self.polled += 1
             else:
                 self.streaming = word == self._start and not self.polls
-        self._heard = heard[-max(map(len, words), default=1) :]
+        self._host_text = text[-max(map(len, words), default=1) :]
         return b""
 
     # lines
 
-    def _line(self, line: bytearray, t_ns: int) -> None:
+    def _read_line(self, line: bytearray, t_ns: int) -> None:
         joined, self._joined = self._joined, True
         overlong, self._overlong = self._overlong or len(line) > self._longest, False
         if not joined or overlong:
             self.stats.skipped += len(line)
             if joined:
-                self._refuse()
+                self._count_damaged()
             return
         words = line.translate(_SPACES).split() if self._names is None else []
         if len(words) == self._width and _PLAIN.fullmatch(line) and b",," not in line:
             try:
-                self._take([float(word) for word in words], t_ns)
+                self._add_row([float(word) for word in words], t_ns)
                 return
-            except ValueError:  # 1-2, say
+            except ValueError:  # for example 1-2
                 pass
         text = line.decode("utf-8", "replace")
         if self._names is not None:
-            self._gather(text, t_ns)
-        elif (row := self._row(text)) is not None:
-            self._take(row, t_ns)
+            self._collect_named(text, t_ns)
+        elif (row := self._parse_row(text)) is not None:
+            self._add_row(row, t_ns)
         else:
-            self._refused(text)
+            self._explain_line(text)
 
-    def _take(self, row: list[float], t_ns: int) -> None:
-        """A row is a sample, if what counts in it is a whole number, and the time a time."""
+    def _add_row(self, row: list[float], t_ns: int) -> None:
+        """Add a row if its count is an integer and its time in range."""
         count = row[self._count] if self.count_bits is not None else 0.0
         ticks = row[self._time] / self._per_tick if self.tick_ns is not None else 0.0
         counts = abs(count) < EXACT and count.is_integer()
         if counts and abs(ticks) < EXACT:
             self._rows.append(row)
-            self._about.append((t_ns, self._damaged))
+            self._arrivals.append((t_ns, self._damaged))
             self._damaged = 0
         else:
             at = self._time if counts else self._count
             self.complaint = f"column {at + 1} ({self._columns[at].kind}) is {row[at]:g}"
-            self._refuse()
+            self._count_damaged()
 
-    def _row(self, text: str) -> list[float] | None:
-        """The numbers of a sample, by their places."""
+    def _parse_row(self, text: str) -> list[float] | None:
+        """Return the numbers of a sample by their places, or None."""
         for words_are_names in (False, True):
             words = fields(text, words_are_names)
             if text.rstrip().endswith((",", ";")) and len(words) == self._width - 1:
                 words.append("nan")
             for some in (words, [w for w in words if _has_digit(w) or number(w)]):
-                row = self._fitting(some)
+                row = self._parse_words(some)
                 if row is not None and 2 * len(row) >= len(words):
                     return row
         return None
 
-    def _fitting(self, words: list[str]) -> list[float] | None:
-        """The numbers of these words if they are a sample; a word in place of one is none (NaN)."""
+    def _parse_words(self, words: list[str]) -> list[float] | None:
+        """Return the numbers of a sample's words, NaN for others; None if no sample."""
         if len(words) != self._width:
             return None
         row, measured, missing = [], 0, 0
@@ -281,18 +281,18 @@ class AsciiLine(SerialCodec):
             row.append(NAN if value is None else value)
         return row if 2 * missing <= measured else None
 
-    def _gather(self, text: str, t_ns: int) -> None:
-        """Numbers by their names: a sample is whole when all have come, and over when one comes
-        again, or that of the first column, with which each begins."""
+    def _collect_named(self, text: str, t_ns: int) -> None:
+        """Collect named numbers. A sample ends when all have come, when a name repeats, or at the
+        name of the first column, with which each sample begins."""
         assert self._names is not None
         while rest := self._names.cut_glued(text):
             self.complaint = f"line {quoted(text)} breaks off in a number, and another begins"
-            self._refuse()
+            self._count_damaged()
             text = rest
         found = self._names.find(text)
         if not found:
             if _WORDS.fullmatch(text):
-                self._refused(text)
+                self._explain_line(text)
             else:
                 self.stats.skipped += len(text)
             if text.strip():
@@ -300,9 +300,9 @@ class AsciiLine(SerialCodec):
                 self.complaint = f"line {quoted(text)} has none of {names}"
             return
         if 0 in found or not found.keys().isdisjoint(self._open):
-            if self._open and self._begun:
+            if self._open and self._has_beginning:
                 self._end_sample()
-            self._open, self._open_bytes, self._begun = {}, 0, True
+            self._open, self._open_bytes, self._has_beginning = {}, 0, True
         self._open |= found
         self._open_bytes += len(text) + 1
         self._open_ns = t_ns
@@ -316,23 +316,23 @@ class AsciiLine(SerialCodec):
             self.complaint = f"{', '.join(map(repr, absent))} did not come"
         if 2 * len(came) >= self._width:
             self.stats.incomplete += len(came) < self._width
-            self._take([came.get(i, NAN) for i in range(self._width)], self._open_ns)
+            self._add_row([came.get(i, NAN) for i in range(self._width)], self._open_ns)
         else:
-            self._refuse()
+            self._count_damaged()
 
-    def _refused(self, text: str) -> None:
-        """Count a line that is no sample as what it is, and say why it is none."""
+    def _explain_line(self, text: str) -> None:
+        """Count a line that is no sample as text or damage; explain it in `complaint`."""
         words = fields(text)
         numbers = [w for w in words if number(w) is not None and w.strip("-")]
         if words and (len(text) > SCRAP or self.complaint != NO_TEXT):
-            self.complaint = self._why(text, words)
-        if 2 * len(numbers) < len(words):  # mostly words: not meant as a sample
+            self.complaint = self._describe_problem(text, words)
+        if 2 * len(numbers) < len(words):  # mostly words: not intended as a sample
             self.stats.skipped += len(text)
             self.passed += bool(words and (self.stats.intact or self._rows))
         elif words:
-            self._refuse()
+            self._count_damaged()
 
-    def _why(self, text: str, words: list[str]) -> str:
+    def _describe_problem(self, text: str, words: list[str]) -> str:
         if not is_text(text):
             return NO_TEXT
         line = f"line {quoted(text.strip())}"
@@ -343,14 +343,14 @@ class AsciiLine(SerialCodec):
         last = f"column {len(words)} is {words[-1]!r}"
         return f"{line} has {len(words)} columns, {self._width} are described; {last}"
 
-    def _refuse(self) -> None:
+    def _count_damaged(self) -> None:
         self.stats.corrupt += 1
         self._damaged += 1
 
-    def _samples(self) -> Samples:
+    def _make_samples(self) -> Samples:
         assert self.spec is not None
         wire: NDArray[np.float64] = np.array(self._rows)
-        arrived, damaged = np.array(self._about, np.int64).T
+        arrived, damaged = np.array(self._arrivals, np.int64).T
         with np.errstate(over="ignore", invalid="ignore"):
             values = (wire[:, self._order] * self._scale + self._offset).astype(np.float32)
         values = values.reshape(len(wire), *self.spec.shape)
@@ -364,13 +364,13 @@ class AsciiLine(SerialCodec):
 
 
 def _find_names(columns: tuple[Column, ...], where: str) -> Names | None:
-    """Return what finds numbers by their names; None where places tell."""
+    """Return a finder of numbers by their names; None if columns have no names."""
     labels = {c.label: i for i, c in enumerate(columns) if c.label}
     if not labels:
         return None
     if len(labels) != len(columns):
-        told = [c.label for c in columns]
-        what = [f"{t!r} stands there twice" for t in labels if told.count(t) > 1]
-        what.append("give all columns a name, NAME=COLUMN, or none")
-        raise ConfigError(f"{where}: {what[0]}")
+        given = [c.label for c in columns]
+        why = [f"{name!r} stands there twice" for name in labels if given.count(name) > 1]
+        why.append("give all columns a name, NAME=COLUMN, or none")
+        raise ConfigError(f"{where}: {why[0]}")
     return Names(labels)

@@ -1,8 +1,8 @@
-"""What the columns of a board that prints numbers are, from a TOML file or a few words.
+"""Description of the columns that a board prints, in a file or words.
 
-A column is written in one word:
+A column is written as one word:
 
-    -                                 nothing of interest
+    -                                 ignored
     count[:BITS]                      the sample's number, which wraps at 2^BITS (32)
     time[*SCALE]:s                    seconds, with decimals
     time:ms|us|ns[:BITS]              whole milli-, micro- or nanoseconds, wrapping at 2^BITS (32)
@@ -11,13 +11,13 @@ A column is written in one word:
     time:mdy, time:dmy                05/10/2024 09:48:16, of May or of October
     ELEMENT.CHANNEL[*SCALE][:UNIT]    a measurement
 
-or, where names stand before the numbers, ``NAME=COLUMN``: ``X=M0.bx:uT``. Then numbers are found
-by their names, in whatever order they come and in as many lines, or in JSON: ``mag.x=M0.bx:uT`` is
-in an object, ``Raw.6=M0.bx`` the seventh number after a name.
+or, if names stand before the numbers, as ``NAME=COLUMN``: ``X=M0.bx:uT``. Then numbers are found
+by their names, in any order and in any number of lines, or in JSON: ``mag.x=M0.bx:uT`` is in an
+object, ``Raw.6=M0.bx`` the seventh number after a name.
 
-A word with a range stands for several columns, as `column_words` tells: ``T{0..15}.pressure``.
+A word with a range stands for several columns (see `column_words`): ``T{0..15}.pressure``.
 
-SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Without UNIT it is SI.
+SCALE is the value in UNIT of a one on the wire; samples are in SI. Without UNIT, SCALE is in SI.
 """
 
 import re
@@ -36,7 +36,7 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codecs.column_words import expand_columns
 
 VERSION: Final = 1
-MOST_BITS: Final = 53  # of a counter: what a float64 holds
+MOST_BITS: Final = 53  # of a counter: exact in a float64
 
 _G: Final = 9.80665  # m/s^2
 _SCALES: Final[dict[str, dict[str, float]]] = {  # SI unit: units on the wire, and SI units in each
@@ -62,7 +62,7 @@ UNITS: Final = {  # unit on the wire: (SI unit, SI units in it, offset)
     for si, scales in _SCALES.items()
     for unit, scale in scales.items()
 }
-# SI units of channels whose names say what they are
+# SI units of channels, by their usual names
 _KNOWN: Final = {
     **dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my", "mz"), "N m"),
     **dict.fromkeys(("bx", "by", "bz"), "T"), "temperature": "K", "angle": "rad", "pressure": "Pa",
@@ -75,13 +75,13 @@ _WHISKER: Final = re.compile(r"([A-Z])(\d{1,2})")
 
 
 class Element(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where one element is.
+    """Pose of one element.
 
     Attributes:
         grid: Place of the element on the grid, (row, column).
         position: Position of the element's base in the mount frame, m.
-        orientation: Unit quaternion (w, x, y, z) that turns the element's own frame into the mount
-            frame.
+        orientation: Unit quaternion (w, x, y, z) that rotates the element's own frame into the
+            mount frame.
     """
 
     grid: tuple[int, int] | None = None
@@ -90,13 +90,12 @@ class Element(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The array that a mapping file is of.
+    """The array that a mapping file describes.
 
     Attributes:
         rate_hz: Rate at which the device sends samples, Hz.
-        elements: The place of each element, by name. Elements without a grid get their row and
-            column from their names if all are named like whiskers, A0 to Z99; else they stand in
-            one row.
+        elements: Pose of each element, by name. Elements without a grid get their row and column
+            from their names if all are named like whiskers, A0 to Z99; else they form one row.
     """
 
     version: int = VERSION
@@ -110,12 +109,11 @@ Table = TypeVar("Table", bound=ArrayTable)
 
 
 class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
+    """Mapping file of a board that prints lines, such as docs/codecs/ascii_line.toml.
 
     Attributes:
-        columns: The columns of a line, in order or with their names, as the module's docstring
-            says.
-        poll: Text to send for each sample; without one the board prints by itself.
+        columns: The columns of a line, in order or with their names; see the module's docstring.
+        poll: Text to send for each sample; empty if the board prints by itself.
     """
 
     columns: tuple[str, ...]
@@ -127,14 +125,14 @@ class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 @dataclass(frozen=True)
 class Column:
-    """One column; what is measured is number x scale + offset in SI.
+    """One column; its measured value in SI is number x scale + offset.
 
     Attributes:
-        kind: What the column is: ``value``, ``count``, ``s`` (decimal time), ``iso`` (a date),
+        kind: Kind of the column: ``value``, ``count``, ``s`` (decimal time), ``iso`` (a date),
             ``ms``, ``us``, ``ns`` or ``-``.
-        bits: Width of a counter or of a whole-numbered time, in bits.
+        bits: Width of a counter or of an integer time, in bits.
         unit: SI unit of the measured value; of a date the order of its numbers, ``mdy`` or ``dmy``.
-        label: Name that stands before the number; empty where places tell.
+        label: Name before the number; empty if the number is found by its place.
     """
 
     kind: str
@@ -148,14 +146,16 @@ class Column:
 
     @classmethod
     def measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
-        """A measurement, of which a one stands for `scale` of a unit of `UNITS`; without a unit
-        for that which the channel's name says."""
+        """Return a column of measurements, whose numbers count `scale` units.
+
+        The unit is one of `UNITS`; empty for the SI unit of a channel with a usual name.
+        """
         si, factor, offset = UNITS[unit or _KNOWN.get(channel, "1")]
         return cls("value", scale * factor, offset, 0, element, channel, si)
 
 
 def read_mapping(path: str, kind: type[Table]) -> Table:
-    """Read a mapping file of this kind."""
+    """Read a mapping file as this kind of table."""
     nodes = read_toml(Path(path))
     mapping: Table = convert(nodes, kind)
     if mapping.version != VERSION:
@@ -164,10 +164,10 @@ def read_mapping(path: str, kind: type[Table]) -> Table:
 
 
 def parse_column(word: str, where: str) -> Column:
-    """One column from its word.
+    """Return the column that a word describes.
 
     Raises:
-        ConfigError: not of that form, an unknown unit, a scale that is none.
+        ConfigError: the word has another form, an unknown unit or an invalid scale.
     """
     label, named, plain = word.rpartition("=")
     if named:
@@ -184,9 +184,9 @@ def parse_column(word: str, where: str) -> Column:
             raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
         return Column(found[1].removeprefix("time:"), bits=bits)
     if word == "time:days":
-        return Column("s", scale=86_400.0, offset=-86_400.0 * 25_569)  # of 1970
+        return Column("s", scale=86_400.0, offset=-86_400.0 * 25_569)  # days from 1899 to 1970
     if found := _SECONDS.fullmatch(word):
-        return Column("s", scale=_scale(found[1], where))
+        return Column("s", scale=_parse_scale(found[1], where))
     found = _MEASUREMENT.fullmatch(word)
     if found is None:
         raise ConfigError(
@@ -196,20 +196,20 @@ def parse_column(word: str, where: str) -> Column:
     element, channel, scale, unit = found.groups()
     if unit and unit not in UNITS:
         raise ConfigError(f"{where}: unknown unit {unit!r}; {nearest(unit, UNITS)}")
-    return Column.measured(element, channel, unit or "", _scale(scale, where))
+    return Column.measured(element, channel, unit or "", _parse_scale(scale, where))
 
 
 def parse_columns(words: Iterable[str], where: str) -> tuple[Column, ...]:
-    """The columns of a line, from its words; one with a range is several."""
+    """Return the columns of a line from words; a word with a range gives several."""
     each = [word for text in words for word in expand_columns(text, where)]
     return tuple(parse_column(word, f"{where}[{i}]") for i, word in enumerate(each))
 
 
 def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> ArraySpec:
-    """The array that the columns make up, elements and channels as they first come.
+    """Return the array of the columns, elements and channels in order of appearance.
 
     Raises:
-        ConfigError: a column is missing, doubled or of another unit, or a pose of no element.
+        ConfigError: a column is missing, doubled or of another unit, or a pose has no element.
     """
     values = [c for c in columns if c.kind == "value"]
     if not values:
@@ -242,7 +242,7 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
         return ArraySpec(
             name=mapping.name,
             elements=elements,
-            grid=_grid(elements, poses),
+            grid=_make_grid(elements, poses),
             positions=tuple(p.position for p in poses),
             orientations=tuple(p.orientation for p in poses),
             channels=tuple(units),
@@ -255,12 +255,12 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
 
 
 def order_columns(columns: Sequence[Column], spec: ArraySpec) -> list[int]:
-    """Return the place of each element's channels among the columns."""
+    """Return the index of the column of each element's channels, element by element."""
     at = {(c.element, c.channel): k for k, c in enumerate(columns)}
     return [at[e, c] for e in spec.elements for c in spec.channels]
 
 
-def _grid(elements: tuple[str, ...], poses: list[Element]) -> tuple[tuple[int, int], ...]:
+def _make_grid(elements: tuple[str, ...], poses: list[Element]) -> tuple[tuple[int, int], ...]:
     names = [_WHISKER.fullmatch(e) for e in elements]
     cells = [
         p.grid or ((ord(n[1]) - ord("A"), int(n[2])) if n and all(names) else (0, i))
@@ -269,7 +269,7 @@ def _grid(elements: tuple[str, ...], poses: list[Element]) -> tuple[tuple[int, i
     return tuple(cells)
 
 
-def _scale(text: str | None, where: str) -> float:
+def _parse_scale(text: str | None, where: str) -> float:
     try:
         scale = float(text or 1.0)
     except ValueError:

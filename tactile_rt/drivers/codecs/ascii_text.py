@@ -1,4 +1,4 @@
-"""Numbers in a line that a board prints for people: beside words, units, brackets, dates and names.
+"""Parser of numbers in lines of text, among words, units, brackets, dates and names.
 
 one, two = fields("2024-05-10 09:48:16.222  (6.37, kg)")       by their places
 Names({"x": 0, "Raw.6": 1}).find('{"x": 1.5, "Raw": [0, 1, ...]}')  by the names before them
@@ -12,7 +12,7 @@ from typing import Any, Final
 import msgspec
 
 NAN: Final = float("nan")
-# What boards print in place of a number; ovf is Arduino's for what is over 4e9.
+# Words that boards print in place of a number; ovf is Arduino's for a number over 4e9.
 MISSING: Final = frozenset(
     "ovf null none na n/a n.a. n.a nil (null) <null> <na> - -- --- ---- err error fail failed "
     "timeout undefined missing #n/a #na #value! #div/0! #num! #ref! #null! #name? -nan(ind) "
@@ -34,26 +34,26 @@ _HALF_DAY: Final = re.compile(
 )
 _NAME: Final = re.compile(r"[A-Za-z_]\w*\s*[:=](?!=)")
 _NAMES: Final = re.compile(r"[A-Za-z_]\w*(?:[ \t]+[A-Za-z_]\w*)*\s*[:=](?!=)")
-_NOTHING: Final = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;])")  # between two commas, or before one
+_NOTHING: Final = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;])")  # between or before commas
 _BRACKETS: Final = str.maketrans(dict.fromkeys("()[]{}<>\"'|", " "))
 _SEPARATORS: Final = re.compile(r"[\s,;]+")
 _ARROW: Final = re.compile(r"[-=]>")
-_BETWEEN: Final = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"  # a name and its number
+_BETWEEN: Final = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"  # between a name and its number
 _SIGNS: Final = frozenset("=:/~#*")
 
 
 def is_text(line: str) -> bool:
-    """Return whether at most an eighth of the characters are none that a board prints."""
+    """Return whether at most an eighth of the characters are not printable."""
     return 8 * sum(not (c.isprintable() or c == "\t") or c == "\ufffd" for c in line) <= len(line)
 
 
 def number(word: Any) -> float | None:
-    """What is printed; NaN for what a board prints in place of a number, None for another word."""
+    """Return a printed word as a number: NaN if in `MISSING`, None for other words."""
     if isinstance(word, int | float):
         return float(word) if abs(word) < 1e300 else NAN
     if not isinstance(word, str):
         return NAN if word is None else None
-    word = word.replace("\u2212", "-")  # a minus of typographers
+    word = word.replace("\u2212", "-")  # the typographic minus sign
     try:
         return None if "_" in word else float(word)
     except ValueError:
@@ -67,9 +67,10 @@ def number(word: Any) -> float | None:
 
 
 def fields(line: str, words_are_names: bool = False) -> list[str]:
-    """The words of a line: between spaces, commas, semicolons and brackets. The name before a
-    number (``x:``, ``y =``) is none of them, a date with a time is one (in seconds), and between
-    two commas with nothing between them is one, too (``nan``).
+    """Split a line into words at spaces, commas, semicolons and brackets.
+
+    A name before a number (``x:``, ``y =``) is left out, a date with a time is one word (in
+    seconds), and an empty place between two commas is ``nan``.
 
     Args:
         words_are_names: whether a name may be several words, ``one reading: 5``.
@@ -81,46 +82,46 @@ def fields(line: str, words_are_names: bool = False) -> list[str]:
 
 
 class Names:
-    """Finds numbers by what stands before them.
+    """Finder of numbers by the names before them.
 
     Args:
-        names: place of each, by its name; ``a.b`` for a number in an object of JSON, ``a.2`` for
-            the third after a name.
+        names: place of each number, by its name; ``a.b`` for a number in an object of JSON,
+            ``a.2`` for the third number after a name.
     """
 
     def __init__(self, names: Mapping[str, int]) -> None:
         self._names = names
-        self._patterns = {place: _pattern(name) for name, place in names.items()}
+        self._patterns = {place: _compile_name(name) for name, place in names.items()}
         known = "|".join(map(re.escape, names))
         then = rf"(?=[{{\"']*({known})[\"']?\s*[:=])"
         self._glued = re.compile(rf"(?<![\w.])({known}){_BETWEEN}(?>{NUMBER}){then}")
 
     def find(self, line: str) -> dict[int, float]:
-        """The numbers of a line, by their places: NaN where a name stands before none."""
+        """Return the numbers of a line by place; NaN if a name precedes no number."""
         if line.lstrip()[:1] == "{":
             try:
-                said = msgspec.json.decode(line)
+                decoded = msgspec.json.decode(line)
             except (msgspec.DecodeError, UnicodeEncodeError):
-                said = None  # Python's dictionaries look alike
-            if isinstance(said, dict):
+                decoded = None  # Python's dictionaries look alike
+            if isinstance(decoded, dict):
                 return {
-                    place: _or_nan(value)
+                    place: _to_number(value)
                     for name, place in self._names.items()
-                    if (value := _within(said, name.split("."))) is not ABSENT
+                    if (value := _get_value(decoded, name.split("."))) is not ABSENT
                 }
         text = in_seconds(line)
         return {
-            place: _or_nan(found[1])
+            place: _to_number(found[1])
             for place, pattern in self._patterns.items()
             if (found := pattern.search(text))
         }
 
     def cut_glued(self, line: str) -> str:
-        """Return what follows where a sample broke off and another begins; empty: nowhere."""
+        """Return the text after a sample that breaks off; empty if none does."""
         for found in self._glued.finditer(line):
             one, other = (self._patterns[self._names[name]] for name in found.groups())
             rest = line[found.end() :]
-            if other.search(line[: found.end()]) or one.search(rest):  # one of them comes again
+            if other.search(line[: found.end()]) or one.search(rest):  # one of the names repeats
                 return rest
         return ""
 
@@ -128,29 +129,29 @@ class Names:
 ABSENT: Final = object()
 
 
-def _within(said: Any, path: list[str]) -> Any:
-    """The value at a path of keys and places; a key may have dots itself."""
+def _get_value(value: Any, path: list[str]) -> Any:
+    """Return the value at a path of keys, which may contain dots, and places."""
     if not path:
-        return said
-    if isinstance(said, list):
-        at = int(path[0]) if path[0].isdecimal() else len(said)
-        return _within(said[at], path[1:]) if at < len(said) else ABSENT
-    if not isinstance(said, dict):
+        return value
+    if isinstance(value, list):
+        at = int(path[0]) if path[0].isdecimal() else len(value)
+        return _get_value(value[at], path[1:]) if at < len(value) else ABSENT
+    if not isinstance(value, dict):
         return ABSENT
     for n in range(len(path), 0, -1):
-        if (key := ".".join(path[:n])) in said:
-            return _within(said[key], path[n:])
+        if (key := ".".join(path[:n])) in value:
+            return _get_value(value[key], path[n:])
     return ABSENT
 
 
-def _or_nan(value: Any) -> float:
+def _to_number(value: Any) -> float:
     if isinstance(value, str) and (dated := in_seconds(value)) != value:
         value = dated
     found = number(value)
     return NAN if found is None else found
 
 
-def _pattern(name: str) -> re.Pattern[str]:
+def _compile_name(name: str) -> re.Pattern[str]:
     base, _, place = name.rpartition(".")
     if not (base and place.isdecimal()):
         base, place = name, "0"
@@ -162,18 +163,17 @@ def _pattern(name: str) -> re.Pattern[str]:
 
 
 def in_seconds(line: str, order: str = "") -> str:
-    """The line with dates and times of day in seconds: since 1970 (UTC unless it says), or since
-    midnight.
+    """Convert dates and times of day to seconds since 1970 (UTC by default) or midnight.
 
     Args:
-        order: of the numbers of 05/10/2024, ``mdy`` or ``dmy``; empty: as a number over 12 tells.
+        order: of numbers as in 05/10/2024, ``mdy`` or ``dmy``; empty to infer it from one over 12.
     """
     if ":" not in line:
         return line
     line = _HALF_DAY.sub(_count_hours, line) if "m" in line or "M" in line else line
     if "/" in line or "-" in line:
         line = _DAY.sub(lambda found: _put_year_first(found, order), line)
-    return _CLOCK.sub(_of_day, _DATE.sub(_since_1970, line))
+    return _CLOCK.sub(_since_midnight, _DATE.sub(_since_1970, line))
 
 
 def _count_hours(found: re.Match[str]) -> str:
@@ -203,11 +203,11 @@ def _since_1970(found: re.Match[str]) -> str:
     return f"{seconds}.{part or 0}"
 
 
-def _of_day(found: re.Match[str]) -> str:
+def _since_midnight(found: re.Match[str]) -> str:
     hours, minutes, seconds, part = found.groups()
     return f"{3600 * int(hours) + 60 * int(minutes) + int(seconds)}.{part or 0}"
 
 
 def quoted(line: str) -> str:
-    """A line as a message can show it."""
+    """Return a line quoted and shortened for a message."""
     return repr(line if len(line) <= 70 else line[:67] + "...")

@@ -2,13 +2,13 @@
 
 The sensor is a Modbus slave (RTU, even parity) until its function 46 is called with 55; it answers,
 then sends frames of 13 bytes without a pause: the strain gauges 0, 2, 4, 1, 3, 5 as big-endian i16,
-and the sum of those 12 bytes (low 7 bits) with the status in bit 7. Nothing marks where a frame
-begins. A jam of 14 zero bytes makes it a slave again.
+and the sum of those 12 bytes (low 7 bits) with the status in bit 7. Nothing marks the beginning of
+a frame. A jam of 14 zero bytes makes it a slave again.
 
-Where frames begin is found by elimination: of the 13 places, only the right one passes the sum
+The beginning of frames is found by elimination: of the 13 places, only the right one passes the sum
 every time. A wrong one passes with a chance of 1/64 (the sum minus one byte, plus the sum, must be
-that byte: 2 sum = 2 byte modulo 128), anew each time that the sum changes, but for ever if it does
-not: 17 % of all constant frames have such a place (1 - (63/64)^12).
+that byte: 2 sum = 2 byte modulo 128), independently each time that the sum changes, but always if
+it does not: 17 % of all constant frames have such a place (1 - (63/64)^12).
 
 Sources: ATI, Digital F/T sensor manual (RS-485 streaming); request, answer and registers as in
 public firmware for the sensor.
@@ -27,13 +27,13 @@ from tactile_rt.drivers.codec import SIX_AXES, Command, Samples, SerialCodec, St
 from tactile_rt.drivers.codecs.framing import seal_modbus
 
 SIZE: Final = 13
-ORDER: Final = np.array([0, 2, 4, 1, 3, 5])  # the gauges as they come
+ORDER: Final = np.array([0, 2, 4, 1, 3, 5])  # of the gauges in a frame
 STREAM: Final = b"\x46\x55"  # Modbus function and its argument
 STREAMS: Final = b"\x46\x01"  # the answer
 JAM: Final = bytes(14)
 SILENCE_S: Final = 0.05
 AHEAD: Final = 3  # frames by which the right place must lead the others
-KEPT: Final = 64 * SIZE  # bytes that wait for a decision
+KEPT: Final = 64 * SIZE  # bytes kept while the place is uncertain
 ANSWER: Final = 5  # bytes of the answer, with CRC
 
 
@@ -43,10 +43,10 @@ class Ati485Options:
 
     Attributes:
         matrix: Path of the sensor's calibration, 6 x 6 numbers: a row for each of fx, fy, fz (N per
-            count), mx, my, mz (N m per count), a column for each gauge. Without one the samples are
+            count), mx, my, mz (N m per count), a column for each gauge. Without it the samples are
             the gauges' counts.
         slave: Modbus address of the sensor, 1 to 247.
-        rate_hz: Rate at which the sensor sends, Hz, which the wire does not tell.
+        rate_hz: Rate at which the sensor sends, Hz, which the protocol does not report.
     """
 
     matrix: str = ""
@@ -59,10 +59,10 @@ class Ati485Options:
 
 
 class Ati485(SerialCodec):
-    """One six-axis sensor: forces and moments, N and N m, or the counts of its six gauges.
+    """Codec of a six-axis sensor: forces (N) and moments (N m), or gauge counts.
 
-    A frame is told when it is certain where frames begin: at once after the answer to START, else
-    some frames later, when one place leads by 3 frames. Until then they wait (64 at most).
+    Frames are delivered once their place is certain: at once after the answer to START, else some
+    frames later, when one place leads by 3 frames. Until then they wait (64 at most).
     """
 
     Options = Ati485Options
@@ -84,24 +84,24 @@ class Ati485(SerialCodec):
         self._request = seal_modbus(bytes((options.slave,)) + STREAM)
         self._answer = seal_modbus(bytes((options.slave,)) + STREAMS)
         self.streaming = False
-        self._heard = b""
+        self._host_bytes = b""
         self._damaged = 0
         self.forget()
 
     def forget(self) -> None:
-        self._data = bytearray()  # not yet told; if locked, it begins with a frame
-        self._was_locked = False  # whether it begins where frames did begin, once
-        self._changes = 0  # frames of another sum than the one before, since locked
+        self._data = bytearray()  # not yet decoded; if locked, it begins with a frame
+        self._was_locked = False  # whether it begins where frames began earlier
+        self._changes = 0  # frames whose sum differs from the previous one, since locked
         self._last = -1  # the last sum
-        self._search()
+        self._start_search()
 
     # the host's side
 
     @property
     def lock_confidence(self) -> float:
-        """How sure it is where frames begin, 0 to 1.
+        """Certainty about the place of the frames, 0 to 1.
 
-        With k places that pass the sums, and n frames since whose sum changed and passed:
+        With k places that pass the sums, and n later frames whose sum changed and passed:
         1 - (1 - 1/k) / 64^n; after the answer to START, k is 1. While no place is chosen: 1/k.
         """
         if self._locked:
@@ -114,9 +114,9 @@ class Ati485(SerialCodec):
         parts: list[NDArray[np.uint8]] = []
         damaged: list[int] = []
         while True:
-            if not self._locked and not self._find():
+            if not self._locked and not self._lock():
                 break
-            frames = self._tell()
+            frames = self._take_frames()
             if len(frames):
                 parts.append(frames)
                 damaged += [self._damaged] + [0] * (len(frames) - 1)
@@ -140,15 +140,15 @@ class Ati485(SerialCodec):
             status=status.astype(np.int64),
         )
 
-    def _tell(self) -> NDArray[np.uint8]:
-        """The frames (n, 13) up to the first that fails its sum; that ends the lock."""
+    def _take_frames(self) -> NDArray[np.uint8]:
+        """Remove and return the (n, 13) frames before the first whose sum fails."""
         n = len(self._data) // SIZE
         frames = np.frombuffer(bytes(self._data[: n * SIZE]), np.uint8).reshape(n, SIZE)
         sums = frames[:, :-1].sum(axis=1, dtype=np.int64)
         bad = np.flatnonzero((sums ^ frames[:, -1]) & 127)
         if len(bad):
             n = int(bad[0])
-            self._search()
+            self._start_search()
             self._was_locked = True
         del self._data[: n * SIZE]
         if n:
@@ -157,21 +157,21 @@ class Ati485(SerialCodec):
             self._last = int(sums[n - 1])
         return frames[:n]
 
-    def _search(self) -> None:
+    def _start_search(self) -> None:
         self._locked = False
-        self._at = 0  # bytes of data looked at
-        self._runs = [0] * SIZE  # frames in succession that pass, by place
+        self._at = 0  # bytes of data searched so far
+        self._runs = [0] * SIZE  # successive frames that pass, by place
         self._rivals = 1
 
-    def _find(self) -> bool:
-        """Look on until it is certain where frames begin; drop what is before."""
+    def _lock(self) -> bool:
+        """Search for the place of the frames; drop the bytes before; return success."""
         data, runs = self._data, self._runs
         while self._at < len(data):
             self._at += 1
             end = self._at
             if data.endswith(self._answer, 0, end):
                 del data[:end]
-                self._begin(end - ANSWER, 1)
+                self._set_lock(end - ANSWER, 1)
                 return True
             if end < SIZE:
                 continue
@@ -187,29 +187,29 @@ class Ati485(SerialCodec):
             ):
                 start = max(end - run * SIZE, place)
                 del data[:start]
-                self._begin(start, sum(r > run - AHEAD for r in runs))
+                self._set_lock(start, sum(r > run - AHEAD for r in runs))
                 return True
             if end >= KEPT + SIZE:
                 del data[:SIZE]
                 self._at -= SIZE
-                self._lose(SIZE)
+                self._skip(SIZE)
         return False
 
-    def _begin(self, before: int, rivals: int) -> None:
-        self._lose(before)
+    def _set_lock(self, before: int, rivals: int) -> None:
+        self._skip(before)
         self._locked, self._was_locked = True, True
         self._rivals, self._changes, self._last = rivals, 0, -1
 
-    def _lose(self, n: int) -> None:
+    def _skip(self, n: int) -> None:
         self.stats.skipped += n
-        if self._was_locked and n:  # a byte more or less is part of the damage
+        if self._was_locked and n:  # round, since damage may add or remove bytes
             frames = max(1, round(n / SIZE))
             self.stats.corrupt += frames
             self._damaged += frames
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         jam = Step(JAM, pause_s=SILENCE_S)
-        if command == Command.START:  # it may be streaming, and then takes no request
+        if command == Command.START:  # a streaming sensor accepts no request
             return jam, Step(self._request, self._answer, what="the request to stream")
         return (jam,) if command == Command.STOP else ()
 
@@ -229,17 +229,17 @@ class Ati485(SerialCodec):
     def respond(self, packet: bytes) -> bytes:
         answer = b""
         for byte in packet:
-            self._heard = (self._heard + bytes((byte,)))[-len(JAM) :]
-            if self._heard == JAM:
-                self.streaming, self._heard = False, b""
-            elif not self.streaming and self._heard.endswith(self._request):
-                self.streaming, self._heard = True, b""
+            self._host_bytes = (self._host_bytes + bytes((byte,)))[-len(JAM) :]
+            if self._host_bytes == JAM:
+                self.streaming, self._host_bytes = False, b""
+            elif not self.streaming and self._host_bytes.endswith(self._request):
+                self.streaming, self._host_bytes = True, b""
                 answer += self._answer
         return answer
 
 
 def _matrix(path: str) -> NDArray[np.float64] | None:
-    """The 6 x 6 numbers of a file; None without a path."""
+    """Read the 6 x 6 calibration matrix from a file; None without a path."""
     if not path:
         return None
     try:

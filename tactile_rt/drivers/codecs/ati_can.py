@@ -1,4 +1,4 @@
-"""ATI force/torque transducers with the NETCANOEM board on CAN: asked for each sample."""
+"""ATI force/torque transducers with the NETCANOEM board on CAN, polled for each sample."""
 
 import struct
 from collections import deque
@@ -26,8 +26,8 @@ GAUGES_A, GAUGES_B, ROW_A, ROW_B, ROW_C = range(5)
 CALIBRATION, COUNTS, UNITS = 6, 7, 8
 FRAME_A: Final = struct.Struct(">H3h")  # status, gauges 0, 2, 4
 FRAME_B: Final = struct.Struct(">3h")  # gauges 1, 3, 5
-WAITING: Final = 8  # first frames kept for a second one
-NEVER_EMPTY: Final = 64  # samples after which a first frame still left over is without a second one
+WAITING: Final = 8  # first frames kept until their second frames come
+NEVER_EMPTY: Final = 64  # samples after which a surplus first frame counts as without a second
 
 POUND_N: Final = 4.4482216152605
 # SI units of the unit codes
@@ -35,7 +35,7 @@ FORCES: Final = {1: POUND_N, 2: 1.0, 3: 1e3 * POUND_N, 4: 1e3, 5: 9.80665, 6: 9.
 TORQUES: Final = {
     1: POUND_N * 0.0254, 2: POUND_N * 0.3048, 3: 1.0, 4: 1e-3, 5: 9.80665e-2, 6: 1e3,
 }  # fmt: skip
-INVALIDATING: Final = 0x01FE  # supply, reference, calibration and memory: no value is to be trusted
+INVALIDATING: Final = 0x01FE  # supply, reference, calibration, memory: values are not reliable
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ class AtiCanOptions:
 
 
 class AtiCan(CanCodec):
-    """Six strain gauges in two frames; the calibration matrix makes forces and torques of them.
+    """Codec of six strain gauges in two frames, with a matrix to forces and torques.
 
     The matrix, its counts per unit and its units are read from the board at the start; a sample
-    that comes before them is not delivered. Two requests close together may be answered as
-    first, first, second, second frame: they are paired in the order in which they come.
+    received before is not delivered. Two requests close together may be answered as
+    first, first, second, second frame: they are paired in order of arrival.
 
     Source: ATI 9610-05-1030 (CAN interface), by way of the public drivers ati_netcanoem_ft_driver
     and Georgia Tech's lwa4_ft (unit codes).
@@ -117,7 +117,7 @@ class AtiCan(CanCodec):
         self.forget()
 
     def forget(self) -> None:
-        self._first: deque[bytes] = deque()  # frames that wait for their second
+        self._first: deque[bytes] = deque()  # first frames that wait for their second
         self._never_empty = 0  # samples since none waited
         self._row: list[bytes] = []
         self._rows: list[bytes] = []
@@ -139,7 +139,7 @@ class AtiCan(CanCodec):
         return batch.take((1, 6), t_ns)
 
     def _take(self, batch: SampleBatch, code: int, data: bytes) -> bool:
-        """Take a reply; False if it is not one."""
+        """Decode a reply; return whether it is valid."""
         if code == GAUGES_A:
             if len(data) != FRAME_A.size:
                 return False
@@ -149,9 +149,9 @@ class AtiCan(CanCodec):
         elif code == GAUGES_B:
             if len(data) != FRAME_B.size:
                 return False
-            self._pair(batch, data)
+            self._pair_frames(batch, data)
         elif code in (ROW_A, ROW_B, ROW_C):
-            return len(data) == 8 and self._part_of_row(code, data)
+            return len(data) == 8 and self._add_row_part(code, data)
         elif code == COUNTS:
             if len(data) != 8:
                 return False
@@ -163,10 +163,10 @@ class AtiCan(CanCodec):
             if len(data) != 2 or data[0] not in FORCES or data[1] not in TORQUES:
                 return False
             self._units = FORCES[data[0]], TORQUES[data[1]]
-            self._rows, self._row = [], []  # the matrix is asked for next
+            self._rows, self._row = [], []  # the matrix is requested next
         return True
 
-    def _pair(self, batch: SampleBatch, second: bytes) -> None:
+    def _pair_frames(self, batch: SampleBatch, second: bytes) -> None:
         if not self._first:
             self.stats.incomplete += 1
             return
@@ -188,8 +188,8 @@ class AtiCan(CanCodec):
         self._never_empty = 0
         self.stats.incomplete += 1
 
-    def _part_of_row(self, code: int, data: bytes) -> bool:
-        """A third of a row of the matrix; the rows come in the order in which they are asked."""
+    def _add_row_part(self, code: int, data: bytes) -> bool:
+        """Add the next third of a matrix row; return whether it is valid."""
         if code == ROW_A:
             self._row = []
         if code - ROW_A != len(self._row):
@@ -198,7 +198,7 @@ class AtiCan(CanCodec):
         if len(self._row) < 3:
             return True
         row = b"".join(self._row)
-        # a row asked for again because its answer was late: no matrix has a row twice
+        # skip a row that was requested again since its answer was late: no matrix has it twice
         if not self._rows or row != self._rows[-1]:
             self._rows.append(row)
         if len(self._rows) == 6 and self._counts and self._units:
@@ -231,13 +231,13 @@ class AtiCan(CanCodec):
 
     # the device's side: a transducer without cross-talk, a million counts per N and N m
 
-    def _emulated(self) -> NDArray[np.float32]:
+    def _make_matrix(self) -> NDArray[np.float32]:
         full = [self._options.force_n] * 3 + [self._options.torque_nm] * 3
         return np.diag(np.array(full) * 1e6 / 32767).astype(np.float32)
 
     def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         counts = np.nan_to_num(chunk.values[:, 0].astype(np.float64)) * 1e6
-        gauges = np.clip(np.rint(counts / np.diag(self._emulated())), -32767, 32767).astype(int)
+        gauges = np.clip(np.rint(counts / np.diag(self._make_matrix())), -32767, 32767).astype(int)
         return [
             [
                 CanFrame(self._base | GAUGES_A, FRAME_A.pack(0, g[0], g[2], g[4])),
@@ -255,7 +255,7 @@ class AtiCan(CanCodec):
             if code == GAUGES_A and not frame.data:
                 self.polled += 1
             elif code == ROW_A and len(frame.data) == 1 and frame.data[0] < 6:
-                row = self._emulated()[frame.data[0]].astype(">f4").tobytes()
+                row = self._make_matrix()[frame.data[0]].astype(">f4").tobytes()
                 answers += [
                     CanFrame(self._base | ROW_A + i, row[8 * i : 8 * i + 8]) for i in range(3)
                 ]
@@ -269,5 +269,5 @@ class AtiCan(CanCodec):
 
 
 def _is_request(code: int, data: bytes) -> bool:
-    """Whether this is what a host asks, as another one on the bus may: no reply is so short."""
+    """Return whether a frame is a request, of another host: no reply is so short."""
     return len(data) == (code == ROW_A) and code in (GAUGES_A, ROW_A, COUNTS, UNITS)

@@ -1,4 +1,4 @@
-"""Any sensor that sends frames of one length over a serial line, described in a TOML file."""
+"""Codec of any sensor with frames of one length on a serial line, described in a TOML file."""
 
 import textwrap
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
 from tactile_rt.drivers.codecs.frame_mapping import FrameMapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
 
-DISTINCT = 4  # bytes of an ending that no measurement has
+DISTINCT = 4  # least bytes of an ending that no measurement contains
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions:
-    """Options of a device whose frame is described.
+    """Options of a device with a shipped description of its frame.
 
     Attributes:
-        rate_hz: Rate at which the device sends, or is asked, Hz; 0 for that of its description.
+        rate_hz: Rate at which the device sends or is polled, Hz; 0 for that of its description.
     """
 
     rate_hz: float = 0.0
@@ -35,7 +35,7 @@ class FrameOptions:
 
 @dataclass(frozen=True)
 class BinaryFrameOptions(FrameOptions):
-    """Options of a binary frame that you describe.
+    """Options of a binary frame with the user's description.
 
     Attributes:
         mapping: Path of a TOML file, like docs/codecs/binary_frame.toml.
@@ -52,10 +52,10 @@ class BinaryFrameOptions(FrameOptions):
 
 
 class DescribedFrame(SerialCodec):
-    """Frames of one length; counter, clock, status and checksum if they have one.
+    """Codec of frames of one length, optionally with counter, clock, status and checksum.
 
     Args:
-        rate_hz: rate at which the device sends, or is asked, Hz; 0 for that of the description.
+        rate_hz: rate at which the device sends or is polled, Hz; 0 for that of the description.
     """
 
     cannot_detect = (
@@ -73,12 +73,12 @@ class DescribedFrame(SerialCodec):
         self.count_bits = frame.count.bits if frame.count else None
         if mapping.time is not None and frame.time is not None:
             self.tick_ns, self.tick_bits = 1e3 * mapping.time.tick_us, frame.time.bits
-        self._invalid = self._refused = 0
+        self._invalid = self._invalid_bit = 0
         if mapping.status is not None:
             self.status_bits = frame.meanings  # type: ignore[misc]
             self.harmless_bits = frozenset(mapping.status.harmless)  # type: ignore[misc]
             self._invalid = sum(1 << bit for bit in mapping.status.invalid)
-            self._refused = sum(1 << bit for bit in mapping.status.invalid[:1])
+            self._invalid_bit = sum(1 << bit for bit in mapping.status.invalid[:1])
         self._steps = {
             command: tuple(
                 Step(
@@ -106,12 +106,11 @@ class DescribedFrame(SerialCodec):
             self._finder = EndFinder(frame.ends, mapping.length, self.stats)
         else:
             self._finder = StrideFinder(frame.ends, mapping.length, frame.possible, self.stats)
-        self._heard = b""
+        self._host_bytes = b""
 
     @property
     def lock_confidence(self) -> float:
-        """Certainty about where frames begin: below 1 while other places fit as well, for frames
-        that have neither a beginning nor an ending of their own."""
+        """Certainty about the place of frames; 1 if they have a distinct sync or ending."""
         return self._finder.confidence if isinstance(self._finder, StrideFinder) else 1.0
 
     @property
@@ -139,7 +138,7 @@ class DescribedFrame(SerialCodec):
         data = b"".join(found)
         values = np.empty((n, frame.spec.shape[0] * frame.spec.shape[1]))
         valid = np.ones((n, frame.spec.shape[0]), np.bool_)
-        with np.errstate(over="ignore", invalid="ignore"):  # a damaged value may be any
+        with np.errstate(over="ignore", invalid="ignore"):  # a damaged value may be anything
             for block in frame.blocks:
                 raw = block.numbers.read(data, n, length).astype(np.float64)
                 if len(block.cells):
@@ -175,46 +174,46 @@ class DescribedFrame(SerialCodec):
     def encode(self, chunk: Chunk) -> list[bytes]:
         known = chunk.valid & np.isfinite(chunk.values).all(axis=2)
         values = np.where(chunk.valid[..., None], chunk.values, np.nan).astype(np.float64)
-        if self._refused:  # it says so in its status
+        if self._invalid_bit:  # the status marks invalid values
             values = np.nan_to_num(values)
         flat = values.reshape(len(chunk), -1)
         ticks = np.rint(chunk.t_ns / (self.tick_ns or 1.0))
         return [
-            self._encoded(flat[k], bool(known[k].all()), int(chunk.seq[k]), int(ticks[k]))
+            self._encode_one(flat[k], bool(known[k].all()), int(chunk.seq[k]), int(ticks[k]))
             for k in range(len(chunk))
         ]
 
-    def _encoded(self, values: NDArray[np.float64], good: bool, count: int, ticks: int) -> bytes:
+    def _encode_one(self, values: NDArray[np.float64], good: bool, count: int, ticks: int) -> bytes:
         frame = self.frame
-        made = bytearray(frame.mapping.length)
-        made[: len(frame.sync)] = frame.sync
-        made[len(made) - len(frame.ends) :] = frame.ends
+        data = bytearray(frame.mapping.length)
+        data[: len(frame.sync)] = frame.sync
+        data[len(data) - len(frame.ends) :] = frame.ends
         for block in frame.blocks:
-            block.write(made, values)
-        status = 0 if good else self._refused
+            block.write(data, values)
+        status = 0 if good else self._invalid_bit
         for number, place in ((count, frame.count), (ticks, frame.time), (status, frame.status)):
             if place is not None:
-                place.write(made, np.array([number % (1 << place.bits)]))
-        return frame.seal(made)
+                place.write(data, np.array([number % (1 << place.bits)]))
+        return frame.seal(data)
 
     def respond(self, packet: bytes) -> bytes:
         answer = b""
         longest = max((len(s.send) for steps in self._steps.values() for s in steps), default=1)
         for k in range(len(packet)):
-            self._heard = (self._heard + packet[k : k + 1])[-longest:]
-            answer += self._hear()
+            self._host_bytes = (self._host_bytes + packet[k : k + 1])[-longest:]
+            answer += self._answer_command()
         return answer
 
-    def _hear(self) -> bytes:
+    def _answer_command(self) -> bytes:
         for command, steps in self._steps.items():
             for step in steps:
-                if step.send and self._heard.endswith(step.send):
-                    self._heard = b""
-                    self._follow(command, step)
+                if step.send and self._host_bytes.endswith(step.send):
+                    self._host_bytes = b""
+                    self._apply_command(command, step)
                     return step.expect if isinstance(step.expect, bytes) else b""
         return b""
 
-    def _follow(self, command: Command, step: Step[Any]) -> None:
+    def _apply_command(self, command: Command, step: Step[Any]) -> None:
         if command == Command.POLL:
             self.polled += 1
         elif command == Command.STOP:
@@ -224,7 +223,7 @@ class DescribedFrame(SerialCodec):
 
 
 class BinaryFrame(DescribedFrame):
-    """A frame of which you give the description, ``mapping=FILE.toml``."""
+    """Codec of a frame that the user describes, ``mapping=FILE.toml``."""
 
     Options = BinaryFrameOptions
 
@@ -234,13 +233,13 @@ class BinaryFrame(DescribedFrame):
 
 
 def shipped_frame(name: str) -> FrameMapping:
-    """The description in `FRAMES` of a device's frame."""
+    """Read the description of a device's frame in `FRAMES`."""
     return read_mapping(str(FRAMES / f"{name}.toml"), FrameMapping)
 
 
 @cache
 def frame_codec(name: str) -> type[DescribedFrame]:
-    """The codec of a device whose frame is described in `FRAMES`, and of which that is all."""
+    """Return the codec of a device that needs only its description in `FRAMES`."""
 
     class Described(DescribedFrame):
         Options = FrameOptions

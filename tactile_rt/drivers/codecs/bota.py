@@ -1,8 +1,8 @@
 """Bota Systems SensONE and Rokubi, generation 2, over RS-422 or USB.
 
-Its frame and where we have it from: ``frames/bota.toml``; a float32 after the time is the
-temperature in degrees Celsius. Commands are ASCII without an end; the device reads 64 bytes of them
-at once and answers ``r,0,COMMAND,ERROR``.
+``frames/bota.toml`` has its frame and the sources; the float32 after the time is the temperature in
+degrees Celsius. Commands are ASCII without an ending; the device reads 64 bytes of them at once and
+answers ``r,0,COMMAND,ERROR``.
 """
 
 import re
@@ -20,10 +20,10 @@ from tactile_rt.drivers.codecs.frame_mapping import Values
 BAUDS: Final = {9600: 0, 57_600: 1, 115_200: 2, 230_400: 3, 460_800: 4}
 SINC_S: Final = 19.53125e-6  # of time between samples, for each unit of the sinc filter's length
 LEAST_SINC, LARGEST_SINC = 51, 512
-TEMPERATURE: Final = 31  # place in a frame
-ROOM: Final = 25.0  # C, of an emulated device that does not measure it
+TEMPERATURE: Final = 31  # offset in a frame
+ROOM: Final = 25.0  # C, sent by an emulated device that does not measure the temperature
 COMMAND: Final = re.compile(rb"c(?:,\d){4}|f,\d{2,3}(?:,\d){3}|[CIR#s]")
-INPUT: Final = 64  # bytes that the device can hold of commands
+INPUT: Final = 64  # bytes of commands that the device can hold
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class BotaOptions:
             length: 512 gives 100 Hz, 64 gives 800 Hz.
         chop: Whether the device chops its inputs, against offset drift.
         fast: Whether the device's filters settle fast.
-        skip_fir: Whether the FIR filter is left out, which is faster and noisier.
-        temperature_compensation: Whether the device's own temperature compensation is on; the maker
-            leaves it off.
+        skip_fir: Whether to skip the FIR filter, which is faster and noisier.
+        temperature_compensation: Whether the device's own temperature compensation is on; the
+            maker's default is off.
         temperature: Whether to add the device's temperature (K) as a seventh channel.
         baud: Speed of the line, bit/s: 9600, 57600, 115200, 230400 or 460800.
     """
@@ -59,7 +59,7 @@ class BotaOptions:
 
 
 class Bota(DescribedFrame):
-    """One six-axis sensor: forces and moments at its reference point, N and N m."""
+    """Codec of one six-axis sensor: forces (N) and moments (N m) at its reference point."""
 
     Options = BotaOptions
     greeting = b"App Init\r\n"
@@ -92,9 +92,9 @@ class Bota(DescribedFrame):
 
     def encode(self, chunk: Chunk) -> list[bytes]:
         packets = super().encode(chunk)
-        return packets if self._measures_temperature else [self._at_room(p) for p in packets]
+        return packets if self._measures_temperature else [self._set_ambient(p) for p in packets]
 
-    def _at_room(self, packet: bytes) -> bytes:
+    def _set_ambient(self, packet: bytes) -> bytes:
         frame = bytearray(packet)
         struct.pack_into("<f", frame, TEMPERATURE, ROOM)
         return self.frame.seal(frame)
@@ -103,13 +103,13 @@ class Bota(DescribedFrame):
         self._commands += packet
         answer, done = b"", 0
         for command in COMMAND.finditer(bytes(self._commands)):
-            answer += self._obey(command[0])
+            answer += self._execute(command[0])
             done = command.end()
         del self._commands[:done]
         del self._commands[:-INPUT]
         return answer
 
-    def _obey(self, command: bytes) -> bytes:
+    def _execute(self, command: bytes) -> bytes:
         kind, error = command[:1], 0
         if kind == b"#":
             self.streaming, self._configuring = True, False

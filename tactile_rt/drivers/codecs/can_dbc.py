@@ -1,4 +1,4 @@
-"""Any CAN sensor, from the DBC file of its maker and a mapping: no code.
+"""Codec of any CAN sensor, configured by its maker's DBC file and a mapping file.
 
 ``docs/codecs/can_dbc.toml`` is an example with all fields explained.
 """
@@ -32,11 +32,11 @@ class CanDbcOptions:
 
 
 class CanDbc(CanCodec):
-    """Samples that are one message, several, or one message multiplexed.
+    """Codec of samples in one message, several messages, or a multiplexed message.
 
-    A sample ends with its last frame, or when a frame comes that belongs to the next one: one that
-    is not after the frame before, or whose counter differs. Elements of which a signal did not
-    come are invalid; a sample without its counter, time or status is not delivered.
+    A sample ends with its last frame, or when a frame of the next sample comes: one that is not
+    after the previous frame, or whose counter differs. Elements with a missing signal are invalid;
+    a sample without its counter, time or status is not delivered.
     """
 
     Options = CanDbcOptions
@@ -46,7 +46,7 @@ class CanDbc(CanCodec):
         self._map = read_mapping(Path(options.mapping))
         super().__init__(self._map.spec)
         self.tick_ns = self._map.tick_ns
-        self.names = self._map.names  # of messages, as some logs have them for identifiers
+        self.names = self._map.names  # of messages, since some logs have them for identifiers
         if self._map.counter:
             self.count_bits = self._map.counter[0].length
         if self._map.time:
@@ -57,7 +57,7 @@ class CanDbc(CanCodec):
         for index, part in enumerate(self._map.parts):
             self._parts.setdefault((part.id, part.extended), []).append((index, part))
         self._rounds: Rounds[bytes] = Rounds(len(self._map.parts))
-        self._count: float | None = None  # of the round that has begun
+        self._count: float | None = None  # counter of the unfinished round
 
     def forget(self) -> None:
         self._rounds.forget()
@@ -77,11 +77,11 @@ class CanDbc(CanCodec):
             data = data[: parts[0][1].length]
             for index, part in parts:
                 if part.matches(data):
-                    self._part(batch, index, data)
+                    self._add_part(batch, index, data)
                     break
         return batch.take(self._map.spec.shape, t_ns)
 
-    def _part(self, batch: SampleBatch, index: int, data: bytes) -> None:
+    def _add_part(self, batch: SampleBatch, index: int, data: bytes) -> None:
         ended: list[list[bytes | None]] = []
         counter = self._map.counter
         if counter and index in counter[1]:
@@ -90,14 +90,14 @@ class CanDbc(CanCodec):
                 ended = self._rounds.end()
             self._count = count
         for parts in ended + self._rounds.add(index, data):
-            self._sample(batch, parts)
+            self._add_sample(batch, parts)
 
-    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+    def _add_sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
         mapping = self._map
         self.stats.incomplete += None in parts
-        numbers = [_read(cell, parts) for cell in mapping.cells]
+        numbers = [_read_cell(cell, parts) for cell in mapping.cells]
         whole = [
-            _read(single, parts) if single else 0
+            _read_cell(single, parts) if single else 0
             for single in (mapping.counter, mapping.time, mapping.status)
         ]
         if None in whole:
@@ -106,7 +106,7 @@ class CanDbc(CanCodec):
         count, ticks, status = (int(x or 0) for x in whole)
         came = np.asarray(np.isfinite(raw).all(axis=1))
         values = np.where(came[:, None], raw * mapping.gain + mapping.bias, 0.0)
-        with np.errstate(over="ignore"):  # becomes infinite, and so invalid
+        with np.errstate(over="ignore"):  # an overflow becomes infinite, and so invalid
             batch.values.append(values.astype(np.float32))
         batch.valid.append(came if not status & mapping.invalid else np.zeros_like(came))
         for single, number, numbers_so_far in (
@@ -142,8 +142,8 @@ class CanDbc(CanCodec):
                 (mapping.time, int(t_ns // tick_ns)),
             ):
                 if single:
-                    fields.append((*single, _wrapped(single[0], number)))
-            packets.append([_encoded(i, p, fields) for i, p in enumerate(mapping.parts)])
+                    fields.append((*single, _wrap(single[0], number)))
+            packets.append([_encode_part(i, p, fields) for i, p in enumerate(mapping.parts)])
         return packets
 
     def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
@@ -161,8 +161,8 @@ class CanDbc(CanCodec):
         return answers
 
 
-def _read(cell: tuple[Signal, tuple[int, ...]], parts: list[bytes | None]) -> float | None:
-    """The signal, from the first of its parts that came."""
+def _read_cell(cell: tuple[Signal, tuple[int, ...]], parts: list[bytes | None]) -> float | None:
+    """Return a signal's number from its first part that came; None if none did."""
     signal, inside = cell
     for index in inside:
         data = parts[index]
@@ -171,14 +171,14 @@ def _read(cell: tuple[Signal, tuple[int, ...]], parts: list[bytes | None]) -> fl
     return None
 
 
-def _wrapped(signal: Signal, number: int) -> int:
+def _wrap(signal: Signal, number: int) -> int:
     number &= (1 << signal.length) - 1
     return (
         number - (1 << signal.length) if signal.signed and number >> signal.length - 1 else number
     )
 
 
-def _encoded(
+def _encode_part(
     index: int, part: FramePart, fields: list[tuple[Signal, tuple[int, ...], float]]
 ) -> CanFrame:
     numbers: dict[str, float] = {s.name: 0 for s in part.message.signals}

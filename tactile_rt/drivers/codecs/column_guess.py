@@ -1,8 +1,8 @@
-"""What may be in the columns of a table, or of what a board prints, for a user to change.
+"""Guesses of the columns of a table or of a board's lines, for users to correct.
 
-Names say most: ``Fx [N]``, ``wrench.force.x``, ``p0_x``, ``timestamp_ms``. What has none is told by
-how it goes: a number that goes up by one counts, one that goes up is a time, all else measures. No
-unit is made up: a number of which nobody says what it is in keeps its own (1).
+Names reveal most: ``Fx [N]``, ``wrench.force.x``, ``p0_x``, ``timestamp_ms``. A column without a
+name is classified by its numbers: steps of one are a count, rising numbers a time, all others
+measurements. No unit is invented: a number without a stated unit keeps its own (1).
 """
 
 import re
@@ -20,14 +20,14 @@ from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 
 LOOKED_AT: Final = 400  # lines
 LEAST: Final = 5
-MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
+MOSTLY: Final = 0.8  # least share of alike lines, and of cells with numbers
 PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
-FASTEST_HZ: Final = 50_000  # of readings of touch
+FASTEST_HZ: Final = 50_000  # highest rate of tactile readings
 DAYS: Final = (25_569, 80_000)  # of a spreadsheet: 1970 to 2119
-SELDOM: Final = 50  # one row in so many: a counter wraps or is set back
+SELDOM: Final = 50  # rows at least between wraps or resets of a counter
 Rows = Sequence[Sequence[float | None]]
 
-_UNITS_OF_TIME: Final = {  # as names say them, and what is said of the column
+_UNITS_OF_TIME: Final = {  # by their names, with the word for the column
     unit: word
     for word, units in (
         ("time:s", "s sec secs second seconds"), ("time:ms", "ms msec msecs"),
@@ -50,12 +50,12 @@ _COUNT: Final = re.compile(
 _TIME_UNIT: Final = re.compile(rf"(?:^|[\W_]|millis|micros)({'|'.join(_UNITS_OF_TIME)})\W*$")
 _IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
-_OTHER_UNIT: Final = re.compile(r"\[[^\d\]]")  # which keeps to its own column
+_OTHER_UNIT: Final = re.compile(r"\[[^\d\]]")  # an unknown unit in brackets
 _TAIL_UNIT: Final = re.compile(
     r"_(mN|uN|kN|N|[mk]?Nm|Nmm|gf|kgf|[hkM]?Pa|mbar|[unm]?T|degC|C|K|rad|deg|mV|V|[cmu]m|pF)$"
 )
 _BEGIN, _END = r"(?:^|[\W_])", r"(?:$|[\W_]|(?=\d))"
-_QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
+_QUANTITY: Final = tuple(  # (name, channel, unit if the name implies it)
     (re.compile(pattern, re.IGNORECASE), channel, unit)
     for pattern, channel, unit in (
         (_BEGIN + r"(?:f|force|forces)[\W_]*([xyz])" + _END, "f{}", "N"),
@@ -83,101 +83,101 @@ _WEIGHED: Final = re.compile(
     r"force|load|weight|mass|cell|grip|press|gewicht|kraft|last|poids|peso", re.IGNORECASE
 )
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
-_NAMED: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
+_HAS_NAMES: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
 
 
 def guess_columns(
     names: Sequence[str], rows: Rows, dated: Collection[int] = ()
 ) -> tuple[list[str], bool]:
-    """A word for each column, as `ascii_mapping` has them, and whether one is a time.
+    """Return a word of `ascii_mapping` for each column, and whether any is a time.
 
     Args:
-        rows: cells of some rows, None for what is no number.
+        rows: cells of some rows, None for a cell without a number.
     """
     width = len(names) or max(map(len, rows), default=0)
-    series = [_column(rows, k) for k in range(width)]
+    series = [_read_column(rows, k) for k in range(width)]
     kinds: list[str] = ["" if s is not None else "-" for s in series]
     if (time := _place_time(names, series, dated)) is not None:
         kinds[time[0]] = time[1]
     if (count := _place_count(names, series, kinds)) is not None:
         kinds[count] = "count"
-    for k, name in enumerate(names):  # times and counts beside those
-        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _counts(name)):
+    for k, name in enumerate(names):  # ignore further times and counts
+        if not kinds[k] and (_TIME.fullmatch(_strip_units(name)) or _is_count(name)):
             kinds[k] = "-"
     measured = [k for k, kind in enumerate(kinds) if not kind]
     plain = {k: f"T{i}.value" for i, k in enumerate(measured)}
-    words = _by_names(names, measured) if names else plain
+    words = _name_words(names, measured) if names else plain
     return [words.get(k, kinds[k] or "-") for k in range(width)], time is not None
 
 
 def list_unread_units(names: Sequence[str], words: Sequence[str]) -> list[str]:
-    """List what stands in brackets behind names of measurements that keep their own unit."""
+    """List the units in brackets after names that could not be converted to SI."""
     alone = [
         n
         for n, w in zip(names, words, strict=False)
-        if w.endswith(":1") or (w.startswith("time") and w != "time:iso" and not _named_unit(n))
+        if w.endswith(":1") or (w.startswith("time") and w != "time:iso" and not _time_word(n))
     ]
-    told = [unit.strip() for name in alone for unit in _BRACKET.findall(name)]
-    return [unit for unit in dict.fromkeys(told) if unit not in ("", "-", "1")]
+    units = [unit.strip() for name in alone for unit in _BRACKET.findall(name)]
+    return [unit for unit in dict.fromkeys(units) if unit not in ("", "-", "1")]
 
 
 def guess_line_columns(data: bytes) -> list[str] | None:
-    """Guess the columns of what a board prints, by names where numbers have them."""
+    """Guess the columns of a board's lines, by names if numbers have them; or None."""
     first, *lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")
     label = _LABELLED.match(first)
-    if label and any(line.startswith(label[1]) for line in lines):  # whole; it may begin a sample
+    if label and any(line.startswith(label[1]) for line in lines):  # the first line is whole
         lines.insert(0, first)
     lines = [x for x in lines[:-1] if re.search(r"\w", x)][:LOOKED_AT]
     text = "".join(lines).replace("\t", " ")
     odd = sum(not c.isprintable() or c == "\ufffd" for c in text)
     if len(lines) < LEAST or 20 * odd > len(text):
         return None
-    return _of_objects(lines) or _of_places(lines) or _of_labels(lines)
+    return _guess_objects(lines) or _guess_places(lines) or _guess_labelled(lines)
 
 
-def _of_objects(lines: list[str]) -> list[str] | None:
-    """Lines of JSON."""
-    said = []
+def _guess_objects(lines: list[str]) -> list[str] | None:
+    """Guess the columns of lines of JSON, or return None."""
+    objects = []
     for line in lines:
         with suppress(msgspec.DecodeError, UnicodeEncodeError):
-            said.append(msgspec.json.decode(line, type=dict[str, Any]))
-    each = [dict(_numbers(one, "")) for one in said]
-    return _named(each) if len(said) >= MOSTLY * len(lines) else None
+            objects.append(msgspec.json.decode(line, type=dict[str, Any]))
+    each = [dict(_list_numbers(one, "")) for one in objects]
+    return _guess_named(each) if len(objects) >= MOSTLY * len(lines) else None
 
 
-def _of_labels(lines: list[str]) -> list[str] | None:
-    """Numbers after their names, in one line or in several."""
+def _guess_labelled(lines: list[str]) -> list[str] | None:
+    """Guess the columns of numbers after names, in one or several lines, or return None."""
     each: list[dict[str, float]] = []
     used = 0
     for line in lines:
         labels = _LABELLED.finditer(in_seconds(line))
-        told = [(label, v) for label in labels if (v := number(label[2])) is not None]
-        found = {label[1].strip(): value for label, value in told}
-        # a log in words has a number here and there
-        if not found or 2 * sum(len(label[0]) for label, _ in told) < len(line.strip()):
+        pairs = [(label, v) for label in labels if (v := number(label[2])) is not None]
+        found = {label[1].strip(): value for label, value in pairs}
+        # a log in words has occasional numbers
+        if not found or 2 * sum(len(label[0]) for label, _ in pairs) < len(line.strip()):
             continue
         used += 1
         if each and set(found).isdisjoint(each[-1]):
             each[-1] |= found
         else:
             each.append(found)
-    return _named(each) if used >= MOSTLY * len(lines) else None
+    return _guess_named(each) if used >= MOSTLY * len(lines) else None
 
 
-def _named(each: list[dict[str, float]]) -> list[str] | None:
+def _guess_named(each: list[dict[str, float]]) -> list[str] | None:
     often = Counter(name for one in each for name in one)
     names = [name for name, n in often.items() if n >= MOSTLY * len(each)]
     if not names or len(each) < LEAST:
         return None
     rows = [[one.get(name) for name in names] for one in each]
     words, _ = guess_columns(names, rows)
-    told = [f"{name}={w}" for name, w in zip(names, words, strict=True) if w != "-"]
+    columns = [f"{name}={w}" for name, w in zip(names, words, strict=True) if w != "-"]
     whole = sum(all(cell is not None for cell in row) for row in rows)
-    return told if _measures(words) and whole >= MOSTLY * len(each) else None
+    return columns if _has_measurement(words) and whole >= MOSTLY * len(each) else None
 
 
-def _of_places(lines: list[str]) -> list[str] | None:
-    """Numbers at their places between spaces, commas and the like."""
+def _guess_places(lines: list[str]) -> list[str] | None:
+    """Guess the columns of numbers at their places between separators, or return None."""
     cut = [fields(line) for line in lines]
     width, often = Counter(len(c) for c in cut).most_common(1)[0]
     if often < MOSTLY * len(lines):
@@ -188,8 +188,8 @@ def _of_places(lines: list[str]) -> list[str] | None:
     numeric = [k for k in range(width) if share[k] >= MOSTLY]
     if 2 * len(numeric) < width or (2 * len(numeric) == width and width > 2):
         return None
-    if sum(_NAMED.search(line) is not None for line, _ in same) > len(same) / 2:
-        labelled = _of_labels(lines)  # names tell more than places
+    if sum(_HAS_NAMES.search(line) is not None for line, _ in same) > len(same) / 2:
+        labelled = _guess_labelled(lines)  # names reveal more than places
         if labelled is not None and len(labelled) >= len(numeric) - 1:
             return labelled
     clocks = [(line, c) for line, c in same[:20] if in_seconds(line) != line]
@@ -202,47 +202,47 @@ def _of_places(lines: list[str]) -> list[str] | None:
     heads = [c for c in cut if not any(number(word) is not None for word in c)]
     times = {k for c in heads for k, word in enumerate(c) if _TIME.fullmatch(word)}
     words = ["-" if k in times and "." in w else w for k, w in enumerate(words)]
-    if not _measures(words):
+    if not _has_measurement(words):
         return None
     varied = {tuple(row) for row in rows}
     return words if len(varied) > 1 or width > 1 else None
 
 
-def _measures(words: Iterable[str]) -> bool:
+def _has_measurement(words: Iterable[str]) -> bool:
     return any("." in word for word in words if not word.startswith("time"))
 
 
-def _numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
+def _list_numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
     if isinstance(value, dict):
         for key, one in value.items():
-            yield from _numbers(one, f"{at}.{key}" if at else str(key))
+            yield from _list_numbers(one, f"{at}.{key}" if at else str(key))
     elif isinstance(value, list):
         for k, one in enumerate(value):
-            yield from _numbers(one, f"{at}.{k}")
+            yield from _list_numbers(one, f"{at}.{k}")
     elif isinstance(value, int | float) and not isinstance(value, bool) and at:
         yield at, float(value)
 
 
-# what a column is
+# kinds of columns
 
 
-def _column(rows: Rows, k: int) -> NDArray[np.float64] | None:
-    """The numbers of a column, NaN where there are none; None if it hardly has any."""
+def _read_column(rows: Rows, k: int) -> NDArray[np.float64] | None:
+    """Return a column with NaN for cells without a number; None if these are many."""
     cells = [row[k] if k < len(row) else None for row in rows]
-    there = sum(c is not None for c in cells)
-    if not cells or there < MOSTLY * len(cells):
+    filled = sum(c is not None for c in cells)
+    if not cells or filled < MOSTLY * len(cells):
         return None
     column = np.array([np.nan if c is None else c for c in cells], np.float64)
     return None if np.isnan(column).all() else column
 
 
-def _bare(name: str) -> str:
+def _strip_units(name: str) -> str:
     return _BRACKET.sub("", name).strip().strip('"')
 
 
-def _counts(name: str) -> bool:
-    """Return whether a name is that of a count; Fx_N is none."""
-    return _COUNT.fullmatch(_TAIL_UNIT.sub("", _bare(name))) is not None
+def _is_count(name: str) -> bool:
+    """Return whether a name is that of a count; the unit in Fx_N is none."""
+    return _COUNT.fullmatch(_TAIL_UNIT.sub("", _strip_units(name))) is not None
 
 
 def _place_time(
@@ -250,35 +250,35 @@ def _place_time(
 ) -> tuple[int, str] | None:
     if dated:
         return min(dated), "time:iso"
-    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))]
+    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_strip_units(name))]
     known = known or [k for k, name in enumerate(names) if _IN_SECONDS.search(name)]
     for k in [*known, *(() if known else range(len(series)))]:
         v = series[k]
-        if v is not None and k in known:  # a foot, or a second head, is among them
+        if v is not None and k in known:  # skip the cells of footers and repeated headers
             v = v[np.isfinite(v)]
         if v is None or len(v) < 2 or not np.isfinite(v).all():
             continue
         steps = np.diff(v)
         rising = (steps >= 0).all() and v[-1] > v[0]
         if k in known:
-            if rising or (steps >= 0).mean() > MOSTLY or (steps < 0).all():  # the newest first
-                return k, _named_unit(names[k]) or f"time:{_time_unit(names[k], v)}"
+            if rising or (steps >= 0).mean() > MOSTLY or (steps < 0).all():  # or newest first
+                return k, _time_word(names[k]) or f"time:{_guess_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
-            # a ramp of a measurement is as steady hardly ever, and none counts from 1970
+            # a measurement hardly ever rises as steadily, and none counts from 1970
             since_1970 = any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in PER_SECOND)
             if np.std(steps) <= np.mean(steps) or since_1970:
-                return k, f"time:{_time_unit('', v)}"
+                return k, f"time:{_guess_time_unit('', v)}"
     return None
 
 
-def _named_unit(name: str) -> str:
-    """Return the word for a time whose name tells its unit; empty: it does not."""
+def _time_word(name: str) -> str:
+    """Return the word for a time by the unit in its name; empty without one."""
     found = _TIME_UNIT.search(name.strip().lower().replace("μ", "µ"))
     return _UNITS_OF_TIME[found[1]] if found else ""
 
 
-def _time_unit(name: str, v: NDArray[np.float64]) -> str:
-    """The unit of a time, by its name, by how long ago it began, or by its steps."""
+def _guess_time_unit(name: str, v: NDArray[np.float64]) -> str:
+    """Guess the unit of a time by its name, magnitude (since 1970) or steps."""
     for word, unit in (("millis", "ms"), ("micros", "us")):
         if word in name.lower():
             return unit
@@ -297,28 +297,28 @@ def _place_count(
     names: Sequence[str], series: Sequence[NDArray[np.float64] | None], kinds: Sequence[str]
 ) -> int | None:
     for k, v in enumerate(series):
-        if v is None or kinds[k] or (names and not _counts(names[k])):
+        if v is None or kinds[k] or (names and not _is_count(names[k])):
             continue
         if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all() and (v >= 0).all():
-            steps = np.diff(v)  # what falls more often is a reading that goes round
+            steps = np.diff(v)  # a column that falls more often is a periodic reading
             if (steps == 1).mean() > MOSTLY and (steps < 0).sum() <= 1 + len(v) // SELDOM:
                 return k
     return None
 
 
-def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
-    """Element, channel and unit of each; those alone of which every element has all channels."""
-    parsed = {k: _parsed(names[k]) for k in measured}
+def _name_words(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
+    """Return words ELEMENT.CHANNEL:UNIT from names, for the elements with all channels."""
+    parsed = {k: _parse_name(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())
     others = [unit for _, channel, unit in parsed.values() if not channel]
     if others and (len({*others}) > 1 or 2 * len(known) >= len(parsed)):
-        # quantities of one place, such as force and temperature, each in its own unit
-        told = {k: p[1] or p[0].lower() for k, p in parsed.items()}
+        # quantities of one element, such as force and temperature, each in its own unit
+        named = {k: p[1] or p[0].lower() for k, p in parsed.items()}
         alone = all(p[0] == "S" and p[1] in ALONE for p in known.values())
-        if alone and len(set(told.values())) == len(told):
-            return {k: f"S.{channel}:{parsed[k][2] or '1'}" for k, channel in told.items()}
-    if 2 * len(known) < len(parsed) and not loads:  # where something is, beside what it feels
+        if alone and len(set(named.values())) == len(named):
+            return {k: f"S.{channel}:{parsed[k][2] or '1'}" for k, channel in named.items()}
+    if 2 * len(known) < len(parsed) and not loads:  # the known ones are positions, not loads
         known = {k: (e, "value", u) for k, (e, c, u) in parsed.items() if not c}
     chosen = known or {k: (e, "value", u) for k, (e, _, u) in parsed.items()}
     groups: dict[str, dict[str, int]] = {}
@@ -334,22 +334,22 @@ def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     return {k: f"{e}.{c}:{units[c] or '1'}" for e, g in whole.items() for c, k in g.items()}
 
 
-def _parsed(name: str) -> tuple[str, str, str]:
-    """Element, channel (empty: none is known) and unit that a name tells."""
+def _parse_name(name: str) -> tuple[str, str, str]:
+    """Split a name into its element, channel (empty if unknown) and unit."""
     unit = ""
-    for told in _BRACKET.findall(name):
-        word = told.strip()
+    for inside in _BRACKET.findall(name):
+        word = inside.strip()
         unit = word if word in UNITS else _ALIASES.get(word.lower(), "")
-    bare = _bare(name)
+    bare = _strip_units(name)
     if not unit and (tail := _TAIL_UNIT.search(bare)):
         unit, bare = _ALIASES.get(tail[1].lower(), tail[1]), bare[: tail.start()]
-    unit = "gf" if unit == "g" and _WEIGHED.search(bare) else unit  # and no acceleration
+    unit = "gf" if unit == "g" and _WEIGHED.search(bare) else unit  # gram-force, no acceleration
     for pattern, channel, usual in _QUANTITY:
         if (found := pattern.search(bare)) is None:
             continue
         axis = next((g for g in found.groups() if g), "").lower()
         if channel == "temperature" and unit not in ("K", "degC"):
-            unit = ""  # F is farad, and no unit of a temperature
+            unit = ""  # F is farad, no unit of a temperature
         rest = bare[: found.start()] + " " + bare[found.end() :]
         rest = re.sub(r"(?i)(?:^|\W)(?:field|wrench|data|msg)(?=\W|$)", " ", rest)
         element = _PLAIN.sub("_", rest).strip("_-") or "S"

@@ -1,12 +1,12 @@
-"""Columns in words: a list of them, in which a group stands for many.
+"""Lists of column words, with short forms for groups of columns.
 
 time:s,A0.fx,A0.fy                        three columns
 T{0..15}.pressure                         sixteen: T0.pressure, T1.pressure, ...
 (M{0..4}.bx:uT,M{0..4}.by:uT)             ten: M0.bx, M0.by, M1.bx, M1.by, ...
-p{0..35}_x=T{0..35}.fx:N                  by names; ranges of a group go in step
+p{0..35}_x=T{0..35}.fx:N                  by names; the ranges of a group advance together
 c{00..15}=T{0..15}.raw                    c00, c01, ...
--{1..9}                                   nine of no interest
-"Force, x"=A0.fx                          a name that holds a comma
+-{1..9}                                   nine ignored columns
+"Force, x"=A0.fx                          a name that contains a comma
 """
 
 import re
@@ -22,11 +22,11 @@ _NOTHING: Final = re.compile(r"-\d+")
 
 
 def expand_columns(text: str, where: str = "columns") -> tuple[str, ...]:
-    """The columns of a list, one word each.
+    """Expand a list of columns into one word for each column.
 
     Raises:
-        ConfigError: a quote or parenthesis that is not closed, ranges of a group that are not of
-            one length, or too many columns.
+        ConfigError: a quote or parenthesis is not closed, ranges of a group differ in length, or
+            the columns are too many.
     """
     found: list[str] = []
     for item in _split(text, where):
@@ -36,28 +36,28 @@ def expand_columns(text: str, where: str = "columns") -> tuple[str, ...]:
         ranges = [(int(a), int(b)) for word in words for a, b in _RANGE.findall(word)]
         lengths = {abs(b - a) + 1 for a, b in ranges} or {1}
         if len(lengths) > 1:
-            told = ", ".join(map(str, sorted(lengths)))
-            raise ConfigError(f"{where}: the ranges in {item!r} are of different lengths: {told}")
+            each = ", ".join(map(str, sorted(lengths)))
+            raise ConfigError(f"{where}: the ranges in {item!r} are of different lengths: {each}")
         (n,) = lengths
         if len(found) + n * len(words) > MOST:
             raise ConfigError(f"{where}: more than {MOST} columns")
         for k in range(n):
-            found += [_NOTHING.sub("-", _at(word, k)) if word[:1] == "-" else _at(word, k)
+            found += [_NOTHING.sub("-", _expand(word, k)) if word[:1] == "-" else _expand(word, k)
                       for word in words]  # fmt: skip
     return tuple(found)
 
 
 def compress_columns(words: Sequence[str]) -> str:
-    """Write words as a list for `expand_columns`, with a range for words that count up."""
-    quoted = [_quoted(word) for word in words]
+    """Write words as a list for `expand_columns`, with ranges for words that count up."""
+    quoted = [_quote(word) for word in words]
     parts: list[str] = []
     at = 0
     while at < len(quoted):
         n = 1
         while at + n < len(quoted) and _counts_up(quoted[at], quoted[at + n], n):
             n += 1
-        text = _ranged(quoted[at], quoted[at + n - 1], n)
-        if expand_columns(text) != tuple(words[at : at + n]):  # of numbers of one width, say
+        text = _write_range(quoted[at], quoted[at + n - 1], n)
+        if expand_columns(text) != tuple(words[at : at + n]):  # for example numbers of one width
             text, n = quoted[at], 1
         parts.append(text)
         at += n
@@ -65,7 +65,7 @@ def compress_columns(words: Sequence[str]) -> str:
 
 
 def _split(text: str, where: str) -> Iterator[str]:
-    """The items between commas, but for commas in quotes and parentheses that hold a range."""
+    """Split at commas, except in quotes and in parentheses that contain a range."""
     item, quoted, depth = "", False, 0
     for at, c in enumerate(text):
         if c == '"':
@@ -75,27 +75,27 @@ def _split(text: str, where: str) -> Iterator[str]:
         elif not quoted and c == ")" and depth:
             depth -= 1
         if c == "," and not quoted and not depth:
-            yield _plain(item)
+            yield _unquote(item)
             item = ""
         else:
             item += c
     if quoted or depth:
         raise ConfigError(f"{where}: {'a quote' if quoted else 'a parenthesis'} is not closed")
-    yield _plain(item)
+    yield _unquote(item)
 
 
-def _plain(item: str) -> str:
+def _unquote(item: str) -> str:
     item = item.strip()
     return item if item.startswith("(") else item.replace('"', "")
 
 
-def _quoted(word: str) -> str:
+def _quote(word: str) -> str:
     name, named, column = word.rpartition("=")
     return f'"{name}"={column}' if named and ("," in name or name[:1] == "(") else word
 
 
-def _at(word: str, k: int) -> str:
-    """The k-th of the words that a range stands for."""
+def _expand(word: str, k: int) -> str:
+    """Return the k-th of the words that a range stands for."""
 
     def number(found: re.Match[str]) -> str:
         first, last = int(found[1]), int(found[2])
@@ -106,7 +106,7 @@ def _at(word: str, k: int) -> str:
 
 
 def _counts_up(first: str, other: str, n: int) -> bool:
-    """Return whether numbers of the other are n more, or the same."""
+    """Return whether the other word's numbers are n more, or the same."""
     steps = {
         int(b) - int(a)
         for a, b in zip(_NUMBER.findall(first), _NUMBER.findall(other), strict=False)
@@ -114,7 +114,7 @@ def _counts_up(first: str, other: str, n: int) -> bool:
     return _NUMBER.split(first) == _NUMBER.split(other) and n in steps and steps <= {0, n}
 
 
-def _ranged(first: str, last: str, n: int) -> str:
+def _write_range(first: str, last: str, n: int) -> str:
     """Write the first word with a range for each number that differs in the last."""
     if n == 1:
         return first

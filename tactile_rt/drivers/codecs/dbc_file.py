@@ -1,8 +1,8 @@
-"""Where in a device's CAN frames its samples are: a DBC file, and a mapping that names signals.
+"""Layout of samples in a device's CAN frames, from a DBC file and a mapping of its signals.
 
-`Signal` reads a number out of a frame's data, `FramePart` knows a frame by its multiplexers, and
-`DbcMapping` says how a sample is put together of both. `read_mapping` makes one from a mapping like
-``docs/codecs/can_dbc.toml``; cantools reads the DBC file that it names.
+`Signal` reads a number from a frame's data, `FramePart` recognises a frame by its multiplexers, and
+`DbcMapping` defines how a sample is assembled from both. `read_mapping` makes one from a mapping
+like ``docs/codecs/can_dbc.toml``; cantools reads the DBC file named there.
 """
 
 import math
@@ -24,7 +24,7 @@ from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
 
-LARGEST: Final = 1e30  # reading that an integer of a frame may stand for
+LARGEST: Final = 1e30  # largest reading that an integer in a frame may represent
 FLOATS: Final = {16: ">e", 32: ">f", 64: ">d"}
 
 Cell = tuple[int, int]
@@ -33,7 +33,7 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Signal:
-    """Where a number is in a frame's data.
+    """Place and type of a number in a frame's data.
 
     Attributes:
         start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
@@ -50,7 +50,7 @@ class Signal:
     real: bool
 
     def read(self, data: bytes) -> float:
-        """The number as it is in the data, before the DBC file's factor and offset."""
+        """Return the raw number, before the DBC file's factor and offset are applied."""
         if self.big:
             raw = int.from_bytes(data, "big") >> (8 * len(data) - self.start - self.length)
         else:
@@ -64,7 +64,7 @@ class Signal:
         return raw
 
     def nearest(self, value: float) -> float:
-        """What it can hold that is nearest to this value; NaN is 0."""
+        """Return the nearest number that the signal can hold; 0 for NaN and infinity."""
         if not math.isfinite(value):
             value = 0.0
         if self.real:
@@ -76,11 +76,11 @@ class Signal:
 
 @dataclass(frozen=True)
 class FramePart:
-    """A frame that every sample has: a message, with these values of its multiplexers.
+    """A frame in every sample: a message with given values of its multiplexers.
 
     Attributes:
         length: Length of the message's data, bytes.
-        when: The multiplexers in the message, and the values of each that make a frame this part.
+        when: The multiplexers in the message, and the values of each that identify this part.
     """
 
     id: int
@@ -90,24 +90,24 @@ class FramePart:
     message: Any
 
     def matches(self, data: bytes) -> bool:
-        """Whether the multiplexers in the data have these values."""
+        """Return whether the multiplexers in the data have the values of this part."""
         return all(signal.read(data) in values for signal, values in self.when)
 
 
 @dataclass(frozen=True)
 class DbcMapping:
-    """How a sample is put together.
+    """Layout of a sample.
 
     Attributes:
         parts: The frames of a sample, in the order in which the device sends them.
-        cells: The signal of each of (element * channel) values, and the parts that each is in.
+        cells: The signal of each of (element * channel) values, and the parts that contain it.
         gain: Scale of each value, (element, channel), SI units per raw count.
         bias: Value of a raw 0, (element, channel), SI.
-        counter: The signal that counts samples, and the parts that have it; None if there is none.
+        counter: The signal that counts samples, and the parts that contain it; None without one.
             The same holds for `time` and `status`.
         tick_ns: Length of a tick of `time`, ns; None if the device sends no time.
-        commands: What the host sends and when: (command, frame, identifier of the answer).
-        names: Identifiers of all messages of the DBC file, and whether they have 29 bits.
+        commands: (command, frame to send, identifier of the answer) of each command.
+        names: Identifier of each message of the DBC file, and whether it has 29 bits.
     """
 
     spec: ArraySpec
@@ -196,7 +196,7 @@ class _Reader:
                 f"{self.dbc}: larger than {MOST_BYTES >> 20} MiB; keep the messages of the sensor"
             )
         try:
-            text = content.decode("cp1252")  # as cantools takes them to be
+            text = content.decode("cp1252")  # the encoding that cantools assumes
             check_dbc(str(self.dbc), text)
             database: Any = cantools.database.load_string(text, "dbc")
         except (DatabaseError, ValueError, LookupError, TypeError, RecursionError) as error:
@@ -204,12 +204,12 @@ class _Reader:
             why = " ".join(why.split())[:200]
             raise ConfigError(f"{self.dbc}: is not a DBC file that cantools reads: {why}") from None
         self.messages: dict[str, Any] = {m.name: m for m in database.messages}
-        # (message, multiplexers' values) of each signal that is used
+        # (multiplexer, its values) for each (message, signal) used, innermost first
         self.used: dict[tuple[str, str], tuple[tuple[str, frozenset[int]], ...]] = {}
 
     def mapping(self) -> DbcMapping:
         file, path = self.file, self.path
-        spec = self._spec()
+        spec = self._make_spec()
         names = [c.name for c in file.channel]
         signals, gain, bias = [], [], []
         for element in file.element:
@@ -222,7 +222,7 @@ class _Reader:
                     raise ConfigError(f"{where}: no signal for channel {channel.name}; add one")
                 if not (math.isfinite(channel.scale) and channel.scale):
                     raise ConfigError(f"{path}, channel {channel.name}: scale must not be 0")
-                signal, found = self._find(
+                signal, found = self._find_signal(
                     f"{where}, channel {channel.name}", element.signals[channel.name]
                 )
                 signals.append(found)
@@ -234,15 +234,15 @@ class _Reader:
                         f"{where}, channel {channel.name}: by the factor and offset of signal "
                         f"{found.name} its readings go up to {largest:.3g}, as no sensor's do"
                     )
-        singles = [
-            self._integer(what, getattr(file, what)) for what in ("counter", "time", "status")
+        roles = [
+            self._find_integer(what, getattr(file, what)) for what in ("counter", "time", "status")
         ]
-        parts = self._parts()
-        counter, time, status = (None if s is None else (s, self._in(s, parts)) for s in singles)
+        parts = self._make_parts()
+        counter, time, status = (None if s is None else (s, self._locate(s, parts)) for s in roles)
         return DbcMapping(
             spec,
             parts,
-            tuple((s, self._in(s, parts)) for s in signals),
+            tuple((s, self._locate(s, parts)) for s in signals),
             np.array(gain).reshape(spec.shape),
             np.array(bias).reshape(spec.shape),
             counter,
@@ -250,11 +250,11 @@ class _Reader:
             status,
             file.time.tick_us * 1e3 if file.time else None,
             file.status.invalid if file.status else 0,
-            tuple(self._command(i, c) for i, c in enumerate(file.command, 1)),
+            tuple(self._make_command(i, c) for i, c in enumerate(file.command, 1)),
             {m.name: (m.frame_id, m.is_extended_frame) for m in self.messages.values()},
         )
 
-    def _spec(self) -> ArraySpec:
+    def _make_spec(self) -> ArraySpec:
         elements, channels = self.file.element, self.file.channel
         try:
             return ArraySpec(
@@ -271,25 +271,25 @@ class _Reader:
         except ConfigError as error:
             raise ConfigError(f"{self.path}: {error}") from None
 
-    def _message(self, where: str, name: str) -> Any:
+    def _get_message(self, where: str, name: str) -> Any:
         if name not in self.messages:
             hint = nearest(name, [known[:40] for known in self.messages])
             raise ConfigError(f"{where}: no message {name[:40]!r} in {self.dbc}; {hint}")
         return self.messages[name]
 
-    def _find(self, where: str, name: str) -> tuple[Any, Signal]:
-        """cantools' signal, and ours, of ``Message.Signal``."""
-        of, dot, signal_name = name.partition(".")
+    def _find_signal(self, where: str, name: str) -> tuple[Any, Signal]:
+        """Return cantools' signal and ours for a name ``Message.Signal``."""
+        owner, dot, signal_name = name.partition(".")
         if not dot:
             owners = [m.name for m in self.messages.values() for s in m.signals if s.name == name]
             hint = f" (did you mean {owners[0]}.{name}?)" if owners else ""
             raise ConfigError(f"{where}: {name!r} must be written Message.Signal{hint}")
-        message = self._message(where, of)
+        message = self._get_message(where, owner)
         known = {s.name: s for s in message.signals}
         if signal_name not in known:
             hint = nearest(signal_name, [n[:40] for n in known])
             raise ConfigError(
-                f"{where}: no signal {signal_name!r} in message {of[:40]} of {self.dbc}; {hint}"
+                f"{where}: no signal {signal_name!r} in message {owner[:40]} of {self.dbc}; {hint}"
             )
         signal = known[signal_name]
         chain: list[tuple[str, frozenset[int]]] = []
@@ -299,43 +299,43 @@ class _Reader:
                 raise ConfigError(f"{self.dbc}: {name} is within {DEEPEST} multiplexers, or itself")
             chain.append((outer.multiplexer_signal, frozenset(outer.multiplexer_ids)))
             outer = known[outer.multiplexer_signal]
-        self.used[of, signal_name] = tuple(chain)
-        return signal, _signal(message, signal)
+        self.used[owner, signal_name] = tuple(chain)
+        return signal, _convert_signal(message, signal)
 
-    def _integer(self, what: str, wanted: _Signal | None) -> Signal | None:
-        if wanted is None:
+    def _find_integer(self, what: str, entry: _Signal | None) -> Signal | None:
+        if entry is None:
             return None
-        _, signal = self._find(f"{self.path}, {what}", wanted.signal)
+        _, signal = self._find_signal(f"{self.path}, {what}", entry.signal)
         if signal.real:
-            raise ConfigError(f"{self.path}, {what}: {wanted.signal} must be of whole numbers")
+            raise ConfigError(f"{self.path}, {what}: {entry.signal} must be of whole numbers")
         return signal
 
-    def _parts(self) -> tuple[FramePart, ...]:
-        chains = {(of, frozenset(chain)) for (of, _), chain in self.used.items()}
-        # what every frame of a message has belongs to each of its multiplexed parts
+    def _make_parts(self) -> tuple[FramePart, ...]:
+        chains = {(owner, frozenset(chain)) for (owner, _), chain in self.used.items()}
+        # signals in every frame of a message belong to each of its multiplexed parts
         last = [c for c in chains if not any(c[0] == o[0] and c[1] < o[1] for o in chains)]
-        order, messages = self.file.order, {of for of, _ in last}
+        order, messages = self.file.order, {owner for owner, _ in last}
         for name in order:
-            self._message(f"{self.path}, order", name)
+            self._get_message(f"{self.path}, order", name)
         if order and (left := sorted(messages - set(order))):
             raise ConfigError(f"{self.path}, order: {left[0]} is missing; name every message used")
         parts = []
-        for of, chain in last:
-            message = self.messages[of]
+        for owner, chain in last:
+            message = self.messages[owner]
             known = {s.name: s for s in message.signals}
             when = tuple(
                 sorted(
-                    ((_signal(message, known[m]), values) for m, values in chain),
+                    ((_convert_signal(message, known[m]), values) for m, values in chain),
                     key=lambda w: w[0].name,
                 )
             )
             extended = bool(message.is_extended_frame)
             part = FramePart(message.frame_id, extended, message.length, when, message)
-            rank = order.index(of) if order else message.frame_id
+            rank = order.index(owner) if order else message.frame_id
             parts.append((rank, sorted(min(v) for _, v in when), part))
         return tuple(part for *_, part in sorted(parts, key=lambda p: p[:2]))
 
-    def _in(self, signal: Signal, parts: Sequence[FramePart]) -> tuple[int, ...]:
+    def _locate(self, signal: Signal, parts: Sequence[FramePart]) -> tuple[int, ...]:
         needs = self.used[signal.message, signal.name]
         return tuple(
             i
@@ -344,7 +344,7 @@ class _Reader:
             and {(m, v) for m, v in needs} <= {(s.name, v) for s, v in part.when}
         )
 
-    def _command(self, number: int, command: _Command) -> tuple[str, CanFrame, int | None]:
+    def _make_command(self, number: int, command: _Command) -> tuple[str, CanFrame, int | None]:
         where = f"{self.path}, command {number}"
         try:
             data = bytes.fromhex(command.data)
@@ -358,7 +358,7 @@ class _Reader:
         return command.when, frame, command.answer
 
 
-def _signal(message: Any, signal: Any) -> Signal:
+def _convert_signal(message: Any, signal: Any) -> Signal:
     big = signal.byte_order == "big_endian"
     # a DBC file counts bits from the lowest of each byte, in either order
     start = signal.start // 8 * 8 + 7 - signal.start % 8 if big else signal.start

@@ -1,8 +1,8 @@
-"""A DBC file held against what CAN can do, before cantools reads it.
+"""Check of a DBC file against the limits of CAN, before cantools reads it.
 
-A file may come from elsewhere. cantools lays out every bit of every message and every value of a
+The file may be untrusted. cantools lays out every bit of every message and every value of a
 multiplexer's range in memory: a message of 100,000 bytes takes it minutes. So sizes are checked in
-the text. It is not parsed: what looks like a size in a comment counts as one.
+the text, without parsing it: a size in a comment counts, too.
 """
 
 import re
@@ -10,7 +10,7 @@ from typing import Final
 
 from tactile_rt.core.errors import ConfigError
 
-MOST_BYTES: Final = 1 << 20  # of the file; 20,000 signals, a second
+MOST_BYTES: Final = 1 << 20  # of the file: 20,000 signals, read in a second
 MOST_FRAME: Final = 64  # bytes of a CAN FD frame
 MOST_MESSAGES: Final = 10_000
 MOST_SIGNALS: Final = 20_000
@@ -24,18 +24,18 @@ _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
 
 def check_dbc(file: str, text: str) -> None:
-    """Refuse what no CAN bus can carry, and more than a sensor has."""
+    """Raise a ConfigError if sizes exceed those of CAN frames or of any sensor."""
     messages = signals = 0
     for found in _MESSAGE.finditer(text):
         messages += 1
-        if _number(found[2]) > MOST_FRAME:
+        if _parse_number(found[2]) > MOST_FRAME:
             raise ConfigError(
                 f"{file}: message {found[1][:50]} of {found[2][:20]} bytes; "
                 f"a CAN frame has {MOST_FRAME} at most"
             )
     for found in _SIGNAL.finditer(text):
         signals += 1
-        start, length = _number(found[2]), _number(found[3])
+        start, length = _parse_number(found[2]), _parse_number(found[3])
         if not (start < 8 * MOST_FRAME and 0 < length <= 8 * MOST_FRAME):
             raise ConfigError(
                 f"{file}: signal {found[1][:50]} of {found[3][:20]} bits at bit {found[2][:20]}; "
@@ -52,12 +52,12 @@ def check_dbc(file: str, text: str) -> None:
     values = 0
     for ranges in _RANGES.finditer(text):
         for low, high in _RANGE.findall(ranges[1]):
-            values += max(0, _number(high) - _number(low))
+            values += max(0, _parse_number(high) - _parse_number(low))
     if values > MOST_MULTIPLEXED:
         raise ConfigError(
             f"{file}: multiplexers of more than {MOST_MULTIPLEXED} values; keep those in use"
         )
 
 
-def _number(digits: str) -> int:
+def _parse_number(digits: str) -> int:
     return int(digits[:20])

@@ -1,11 +1,11 @@
-"""Frames that have no beginning, only an ending: found by that, in a stream that is cut anywhere.
+"""Finders of frames that have a fixed ending, but no fixed beginning.
 
-`EndFinder` takes an ending at its word, as one of six bytes that no measurement has can be. A short
-one, such as a line end, also occurs inside the numbers: `StrideFinder` concludes from several
-frames at once where they end.
+`EndFinder` trusts each ending, such as six bytes that no measurement contains. A short ending, such
+as a line end, also occurs inside the numbers: `StrideFinder` infers from several frames at once
+where they end.
 
-Both give, of what has arrived, the frames that it completes, how many were damaged before each, and
-when each had arrived (ns).
+Both take bytes cut anywhere and return the frames that they complete, the number of damaged ones
+before each, and the arrival time of each (ns).
 """
 
 from bisect import bisect_left
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import WireStats
 
-GAP: Final = 16  # frames without an ending, then what comes is not this device's
-FIRST: Final = 2  # frames in a row that must fit before any is believed
+GAP: Final = 16  # frames without an ending, after which the bytes are not this device's
+FIRST: Final = 2  # successive frames that must fit before any is accepted
 MOST: Final = 8  # frames to wait for while several places fit
 
 Found: TypeAlias = tuple[list[bytes], list[int], list[int]]
@@ -28,8 +28,8 @@ Raw: TypeAlias = NDArray[np.uint8]
 class EndFinder:
     """Finds frames of one length whose ending never occurs inside them.
 
-    What lies between two endings is a frame if it has the length. Longer by whole frames: the
-    endings between were damaged, and the last frame is whole.
+    The bytes between two endings are a frame if they have the length. If they are longer by whole
+    frames, the endings between were damaged, and the last frame is intact.
 
     Args:
         size: length of a frame with its ending, bytes.
@@ -41,14 +41,14 @@ class EndFinder:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, as after a reconnection."""
+        """Discard all state, as after a reconnection."""
         self._data.clear()
-        self._dropped = 0  # bytes since the last ending, of those that are not kept
+        self._dropped = 0  # bytes since the last ending that are not kept
         self._damaged = 0
         self._joined = False
 
     def find(self, packet: bytes, t_ns: int) -> Found:
-        """Take what has arrived."""
+        """Return the frames that received bytes complete."""
         self._data += packet
         frames: list[bytes] = []
         damaged: list[int] = []
@@ -69,11 +69,11 @@ class EndFinder:
         return frames, damaged, [t_ns] * len(frames)
 
     def _is_frame(self, segment: int) -> bool:
-        """Whether so many bytes between two endings end with a frame."""
+        """Return whether this many bytes between two endings end with a frame."""
         size, body = self._size, self._size - len(self._end)
         length = self._dropped + segment
         joined, self._joined, self._dropped = self._joined, True, 0
-        # before the first ending anything may come, an answer for one
+        # before the first ending anything may come, such as an answer
         whole = (length + len(self._end)) % size == 0 if joined else length >= body
         whole = whole and length <= GAP * size
         if joined:
@@ -88,11 +88,11 @@ class EndFinder:
 class StrideFinder:
     """Finds frames of one length whose ending may occur inside them, too.
 
-    The ending must come at every length of a frame, and what lies between must be what the device
-    can measure.
+    The ending must occur at every frame length, and the values between must be in the device's
+    range.
 
     Args:
-        possible: of (n, size) bytes, which of these n the device can have sent.
+        possible: Returns, for (n, size) bytes, (n,) whether the device can have sent each frame.
     """
 
     def __init__(
@@ -105,34 +105,33 @@ class StrideFinder:
         self._end, self._size = np.frombuffer(end, np.uint8), size
         self._possible, self._stats = possible, stats
         self._data = bytearray()
-        self._rivals: list[int] = []  # other places in a frame where each one so far had an ending
-        self._times: list[tuple[int, int]] = []  # (bytes until then, arrival) of what waits
+        self._rivals: list[int] = []  # other places at which every frame so far had an ending
+        self._times: list[tuple[int, int]] = []  # (bytes received, arrival) of waiting packets
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew, as after a reconnection."""
+        """Discard all state, as after a reconnection."""
         self._data.clear()
         self._rivals.clear()
         self._times.clear()
-        self._locked = self._joined = False  # whether the place is known, and was before
-        self._taken = self._damaged = 0  # bytes, of those come so far; frames
+        self._locked = self._joined = False  # whether the place is known, and ever was
+        self._taken = self._damaged = 0  # bytes consumed so far; damaged frames
         self._gap = 0  # bytes dropped since the last frame
 
     @property
     def confidence(self) -> float:
-        """Certainty about the place of the frames: 0 while unknown, else 1 / (places at which every
-        frame so far could end). It reaches 1 once the bytes in question change."""
+        """Certainty about the place of the frames: 0 while unknown, else 1 / (possible places)."""
         return 1.0 / (1 + len(self._rivals)) if self._locked else 0.0
 
     def find(self, packet: bytes, t_ns: int) -> Found:
-        """Take what has arrived."""
+        """Return the frames that received bytes complete."""
         self._data += packet
         self._times.append((self._taken + len(self._data), t_ns))
         frames: list[bytes] = []
         ends: list[int] = []
         damaged: list[int] = []
         while self._locked or self._lock():
-            found = self._run()
+            found = self._take_frames()
             if found:
                 frames += found
                 first = self._taken - len(found) * self._size
@@ -141,27 +140,27 @@ class StrideFinder:
                 self._damaged = 0
             if not self._skip_one():
                 break
-        # while the place was not known frames waited: each has arrived when its last byte did
+        # frames waited while the place was unknown: each arrived with its last byte
         times = self._times
         arrived = [times[bisect_left(times, (end,))][1] for end in ends]
         del times[: bisect_left(times, (self._taken + 1,))]
         return frames, damaged, arrived
 
     def _lock(self) -> bool:
-        """Find where frames begin and drop what lies before; False while that is not known."""
+        """Find where frames begin and drop the bytes before; return whether it is known."""
         size, tail = self._size, len(self._end)
         while len(self._data) >= (FIRST + 1) * size - 1:
             data = np.frombuffer(bytes(self._data), np.uint8)
             windows = np.lib.stride_tricks.sliding_window_view(data, tail)
             ended = (windows == self._end).all(axis=1)
             often = ended[size - tail : 2 * size - tail] & ended[2 * size - tail :][:size]
-            fitting = [s for s in np.flatnonzero(often).tolist() if self._fits(data, s, FIRST)]
+            fitting = [s for s in np.flatnonzero(often).tolist() if self._can_begin(data, s, FIRST)]
             k = FIRST
             while len(fitting) > 1 and k < MOST:
                 k += 1
                 if len(data) < (k + 1) * size - 1:
-                    return False  # of several places, the next frame may exclude some
-                fitting = [s for s in fitting if self._fits(data, s, k)] or fitting[:1]
+                    return False  # the next frame may exclude some of the places
+                fitting = [s for s in fitting if self._can_begin(data, s, k)] or fitting[:1]
             if not fitting:
                 self._drop(size)
                 continue
@@ -176,26 +175,26 @@ class StrideFinder:
             return True
         return False
 
-    def _fits(self, data: Raw, start: int, frames: int) -> bool:
-        """Whether so many whole frames can lie there."""
+    def _can_begin(self, data: Raw, start: int, frames: int) -> bool:
+        """Return whether this many whole frames can begin at `start`."""
         whole = data[start : start + frames * self._size].reshape(frames, self._size)
-        return bool(self._ends(whole, 0).all() and self._possible(whole).all())
+        return bool(self._have_ending(whole, 0).all() and self._possible(whole).all())
 
-    def _ends(self, whole: Raw, at: int) -> NDArray[np.bool_]:
-        """Which of these have an ending that many bytes after their beginning; 0: at their end."""
+    def _have_ending(self, whole: Raw, at: int) -> NDArray[np.bool_]:
+        """Return (n,) whether each frame has an ending before byte `at`; 0: at its end."""
         places = np.arange(at - len(self._end), at)
         found: NDArray[np.bool_] = (whole[:, places] == self._end).all(axis=1)
         return found
 
-    def _run(self) -> list[bytes]:
-        """Take the whole frames up to the first without its ending."""
+    def _take_frames(self) -> list[bytes]:
+        """Remove and return the whole frames before the first without its ending."""
         size = self._size
         n = len(self._data) // size
         whole = np.frombuffer(bytes(self._data[: n * size]), np.uint8).reshape(n, size)
-        ended = self._ends(whole, 0)
+        ended = self._have_ending(whole, 0)
         n = n if ended.all() else int(ended.argmin())
         if self._rivals and n:
-            self._rivals = [r for r in self._rivals if self._ends(whole[:n], r).all()]
+            self._rivals = [r for r in self._rivals if self._have_ending(whole[:n], r).all()]
         frames = [bytes(self._data[k * size : (k + 1) * size]) for k in range(n)]
         del self._data[: n * size]
         self._taken += n * size
@@ -203,13 +202,13 @@ class StrideFinder:
         return frames
 
     def _skip_one(self) -> bool:
-        """Decide about a frame without its ending; False while there is nothing to decide."""
+        """Skip a frame without its ending, or search again; return False to wait for bytes."""
         size = self._size
         if len(self._data) < 2 * size:
             return False
-        # one damaged ending does not put the place in doubt, if nothing else does
+        # a single damaged ending does not make the place uncertain
         following = np.frombuffer(bytes(self._data[size : 2 * size]), np.uint8)
-        if not self._rivals and self._fits(following, 0, 1):
+        if not self._rivals and self._can_begin(following, 0, 1):
             self._drop(size)
             self._gap = 0
             self._stats.corrupt += 1

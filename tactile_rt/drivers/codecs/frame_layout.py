@@ -1,4 +1,4 @@
-"""A binary frame as its mapping file describes it: checked, and ready to be read and written."""
+"""Layout of a binary frame, made from its checked mapping file, to read and write frames."""
 
 import binascii
 import re
@@ -17,7 +17,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import UNITS, Column, array_of
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD, FrameCounter, FrameMapping, Values
 from tactile_rt.drivers.codecs.framing import crc16_modbus, crc16_x25, crc16_xmodem
 
-# Name: width in bytes, and what it is of the bytes that it covers.
+# Name: (width in bytes, function of the bytes that it covers).
 CHECKSUMS: Final[dict[str, tuple[int, Callable[[bytes], int]]]] = {
     "sum8": (1, lambda data: sum(data) & 0xFF),
     "negative_sum8": (1, lambda data: -sum(data) & 0xFF),
@@ -34,11 +34,11 @@ Row: TypeAlias = NDArray[np.float64]
 
 
 class Numbers:
-    """Where numbers of one type are in a frame.
+    """Places of numbers of one type in a frame.
 
     Args:
-        groups, n: how many groups there are, of how many that touch.
-        stride: bytes from one group to the next; 0 if groups touch, too.
+        groups, n: number of groups, and of adjacent numbers in each.
+        stride: bytes from one group to the next; 0 if groups are adjacent, too.
     """
 
     def __init__(
@@ -65,15 +65,15 @@ class Numbers:
 
     @property
     def covered(self) -> set[int]:
-        """Offsets of all bytes that they take."""
-        return {at + b for at in self._places() for b in range(self.width)}
+        """Offsets of all bytes of the numbers."""
+        return {at + b for at in self._list_offsets() for b in range(self.width)}
 
-    def _places(self) -> list[int]:
+    def _list_offsets(self) -> list[int]:
         groups, n = self.shape
         return [self.at + g * self.stride + k * self.width for g in range(groups) for k in range(n)]
 
     def read(self, frames: bytes, count: int, length: int) -> NDArray[Any]:
-        """(count, number) of so many frames."""
+        """Return (count, number) raw numbers of `count` frames of `length` bytes."""
         shape, strides = (count, *self.shape), (length, self.stride, self.width)
         if not self._odd:
             found = np.ndarray(shape, self._dtype, frames, self.at, strides)
@@ -84,11 +84,11 @@ class Numbers:
         return np.where(found >> 23, found - (1 << 24), found) if self._signed else found
 
     def write(self, frame: bytearray, values: NDArray[Any]) -> None:
-        """Put these, clipped to what the type can tell, into a frame."""
+        """Write values into a frame, clipped to the range of the type."""
         numbers = np.clip(values, self.low, self.high)
         if self.whole:
             numbers = np.rint(np.nan_to_num(numbers))
-        for at, number in zip(self._places(), numbers.tolist(), strict=True):
+        for at, number in zip(self._list_offsets(), numbers.tolist(), strict=True):
             if self.whole:
                 order: Literal["little", "big"] = "little" if self._little else "big"
                 raw = (int(number) & ((1 << self.bits) - 1)).to_bytes(self.width, order)
@@ -98,33 +98,33 @@ class Numbers:
 
 
 class Block:
-    """Measured numbers, with where they go and what they stand for."""
+    """Measured numbers of a frame, with their scales and their places in a sample."""
 
     def __init__(
         self, values: Values, numbers: Numbers, gain: Row, bias: Row, cells: list[int],
         elements: list[int],
     ) -> None:  # fmt: skip
         self.numbers, self.gain, self.bias = numbers, gain, bias
-        self.cells = np.array(cells, np.intp)  # of a sample; of none for numbers not delivered
+        self.cells = np.array(cells, np.intp)  # places in a sample; empty if not delivered
         self._values, self._elements = values, elements
         self._limited = bool(values.possible or values.valid or values.smallest)
 
     def possible(self, raw: Row) -> NDArray[np.bool_]:
-        """Which of these the device can send."""
+        """Return whether the device can send each of these raw numbers."""
         values, size = self._values, np.abs(raw)
         can: NDArray[np.bool_] = (size >= values.smallest) | (size == 0)
-        return can & _within(raw, values.possible)
+        return can & _is_within(raw, values.possible)
 
     def judge(self, raw: Row, valid: NDArray[np.bool_]) -> None:
-        """Make the elements, (n, element), of numbers that are no measurements invalid."""
+        """Set `valid`, (n, element), to False where a number is no measurement."""
         if not self._limited:
             return
-        good = self.possible(raw) & _within(raw, self._values.valid)
+        good = self.possible(raw) & _is_within(raw, self._values.valid)
         for k, element in enumerate(self._elements):
             valid[:, element] &= good[:, k]
 
     def write(self, frame: bytearray, sample: Row) -> None:
-        """Put what a device would send of a sample into its frame."""
+        """Write the numbers that a device would send for a sample into its frame."""
         if not len(self.cells):
             return
         wire = (sample[self.cells] - self.bias) / self.gain
@@ -133,30 +133,30 @@ class Block:
         self.numbers.write(frame, np.where(np.abs(wire) < self._values.smallest, 0.0, wire))
 
 
-def _within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_]:
+def _is_within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_]:
     least, most = limits or (-np.inf, np.inf)
     within: NDArray[np.bool_] = (raw >= least) & (raw <= most)
     return within
 
 
 class FrameLayout:
-    """A mapping, checked, as a codec wants it.
+    """A checked mapping, in the form that a codec uses.
 
     Attributes:
         sync, ends: The bytes with which a frame begins and ends.
-        count, time, status: The place of each of these; None without it.
+        count, time, status: The place of each in a frame; None without it.
         check_at, check_first: Offsets of the checksum, and of the first byte that it covers.
     """
 
     def __init__(self, mapping: FrameMapping, path: str) -> None:
         self.mapping = mapping
-        patterns = [_pattern(text, f"{path}: between") for text in mapping.between]
+        patterns = [_compile_pattern(text, f"{path}: between") for text in mapping.between]
         answers = [m.expect for m in (*mapping.start, *mapping.stop) if m.expect]
         patterns += [re.escape(as_bytes(text, f"{path}: expect")) for text in answers]
         self.between = re.compile(b"|".join(patterns) or rb"(?!)", re.DOTALL)
-        self.sync = _bytes(mapping.sync, f"{path}: sync")
-        self.ends = _bytes(mapping.ends, f"{path}: ends") if mapping.ends else b""
-        self.usually = _bytes(mapping.usually, f"{path}: usually")
+        self.sync = _parse_hex(mapping.sync, f"{path}: sync")
+        self.ends = _parse_hex(mapping.ends, f"{path}: ends") if mapping.ends else b""
+        self.usually = _parse_hex(mapping.usually, f"{path}: usually")
         if not self.sync and not self.ends:
             raise ConfigError(f"{path}: give the bytes that each frame begins with, or ends: sync")
         if self.usually and not self.usually.startswith(self.sync):
@@ -179,7 +179,7 @@ class FrameLayout:
 
         take(set(range(len(self.sync))), "sync")
         take(set(range(length - len(self.ends), length)), "ends")
-        self._check(path, take)
+        self._place_checksum(path, take)
         self.count = place(mapping.count, "count") if mapping.count else None
         self.time = place(mapping.time, "time") if mapping.time else None
         self.status = place(mapping.status, "status") if mapping.status else None
@@ -188,10 +188,10 @@ class FrameLayout:
             if not (bit.isdecimal() and self.status and int(bit) < self.status.bits):
                 raise ConfigError(f"{path}: status.bits: {bit!r} is no bit of it")
             self.meanings[int(bit)] = meaning
-        self.spec, self.blocks = self._measured(path, take)
+        self.spec, self.blocks = self._lay_out_values(path, take)
         self.begun = self.ended_otherwise = 0
 
-    def _check(self, path: str, take: Callable[[set[int], str], None]) -> None:
+    def _place_checksum(self, path: str, take: Callable[[set[int], str], None]) -> None:
         check = self.mapping.checksum
         self.check_at = self.check_first = self.check_width = 0
         if check is None:
@@ -207,13 +207,13 @@ class FrameLayout:
         take(set(range(self.check_at, self.check_at + self.check_width)), "checksum")
         self._check_order: Literal["little", "big"] = check.order or self.mapping.order
 
-    def _measured(
+    def _lay_out_values(
         self, path: str, take: Callable[[set[int], str], None]
     ) -> tuple[ArraySpec, list[Block]]:
         found: list[tuple[Values, Numbers, Row, Row, list[Column]]] = []
         for k, values in enumerate(self.mapping.values):
             where = f"values[{k}]"
-            elements = _elements(values.elements, f"{path}: {where}")
+            elements = _name_elements(values.elements, f"{path}: {where}")
             pairs = list(product(elements, values.channels))
             if values.by == "channel":
                 pairs = [(e, c) for c, e in product(values.channels, elements)]
@@ -256,43 +256,43 @@ class FrameLayout:
         return spec, blocks
 
     def possible(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which of these, (n, length) bytes, the device can have sent."""
+        """Return (n,) whether the device can have sent each of (n, length) bytes."""
         n, data = len(frames), frames.tobytes()
         can = np.array([frame.tobytes().endswith(self.ends) for frame in frames], np.bool_)
-        with np.errstate(invalid="ignore"):  # a signalling NaN is only a NaN
+        with np.errstate(invalid="ignore"):  # treat a signalling NaN as any NaN
             for block in self.blocks:
                 raw = block.numbers.read(data, n, self.mapping.length).astype(np.float64)
                 can &= block.possible(raw).all(axis=1)
         return can
 
     def intact(self, frame: bytes) -> bool:
-        """Whether a frame that begins right ends right, and its checksum is its own."""
+        """Return whether a frame with the right beginning has a right ending and checksum."""
         self.begun += 1
         if not frame.endswith(self.ends):
             self.ended_otherwise += 1
             return False
         if not self.check_width:
             return True
-        return frame[self.check_at :][: self.check_width] == self._sum_of(frame)
+        return frame[self.check_at :][: self.check_width] == self._make_sum(frame)
 
     def seal(self, frame: bytearray) -> bytes:
-        """The frame with its checksum."""
+        """Return the frame with its checksum."""
         if self.check_width:
-            frame[self.check_at : self.check_at + self.check_width] = self._sum_of(bytes(frame))
+            frame[self.check_at : self.check_at + self.check_width] = self._make_sum(bytes(frame))
         return bytes(frame)
 
-    def _sum_of(self, frame: bytes) -> bytes:
+    def _make_sum(self, frame: bytes) -> bytes:
         covered = frame[self.check_first : self.check_at]
         return self._sum(covered).to_bytes(self.check_width, self._check_order)
 
 
-def _elements(told: int | tuple[str | int, ...], where: str) -> tuple[str, ...]:
-    if isinstance(told, int):
-        return tuple(f"T{k}" for k in range(told))
-    names = tuple(name for name in told if isinstance(name, str))
-    if len(names) == len(told):
+def _name_elements(given: int | tuple[str | int, ...], where: str) -> tuple[str, ...]:
+    if isinstance(given, int):
+        return tuple(f"T{k}" for k in range(given))
+    names = tuple(name for name in given if isinstance(name, str))
+    if len(names) == len(given):
         return names
-    rows, columns = (*told, 0)[:2] if len(told) == 2 and not names else (0, 0)
+    rows, columns = (*given, 0)[:2] if len(given) == 2 and not names else (0, 0)
     if not (isinstance(rows, int) and isinstance(columns, int) and 1 <= rows <= 26):
         raise ConfigError(
             f"{where}: elements: names, or how many, or rows (26 at most) and columns"
@@ -303,20 +303,20 @@ def _elements(told: int | tuple[str | int, ...], where: str) -> tuple[str, ...]:
 
 
 def as_bytes(text: str, where: str) -> bytes:
-    """What a message says: hexadecimal, or ``text:`` and characters."""
+    """Return the bytes of a message, written in hexadecimal or as ``text:...``."""
     if text.startswith("text:"):
         return text.removeprefix("text:").encode()
-    return _bytes(text, where)
+    return _parse_hex(text, where)
 
 
-def _pattern(text: str, where: str) -> bytes:
+def _compile_pattern(text: str, where: str) -> bytes:
     if text.startswith("text:"):
         return re.escape(as_bytes(text, where))
     words = text.replace("..", " .. ").split()
-    return b"".join(b"." if w == ".." else re.escape(_bytes(w, where)) for w in words)
+    return b"".join(b"." if w == ".." else re.escape(_parse_hex(w, where)) for w in words)
 
 
-def _bytes(text: str, where: str) -> bytes:
+def _parse_hex(text: str, where: str) -> bytes:
     try:
         return bytes.fromhex(text)
     except ValueError:

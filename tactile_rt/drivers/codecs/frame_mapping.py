@@ -1,4 +1,4 @@
-"""What a binary frame of a serial sensor is, from a TOML file like docs/codecs/binary_frame.toml.
+"""Description of a binary frame of a serial sensor, as in docs/codecs/binary_frame.toml.
 
 Offsets count from the frame's first byte, 0. Bytes are written in hexadecimal, ``AA 07``.
 """
@@ -28,7 +28,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Checksum(_Table, frozen=True, kw_only=True):
-    """``[checksum]``
+    """``[checksum]``: the checksum of a frame.
 
     Attributes:
         at: Offset of the checksum; -1 for the last bytes before `ends`.
@@ -43,23 +43,21 @@ class Checksum(_Table, frozen=True, kw_only=True):
 
 
 class Values(_Table, frozen=True, kw_only=True):
-    """``[[values]]``: numbers of one type, one after the other: all channels of an element, then
-    those of the next.
+    """``[[values]]``: adjacent numbers of one type, all channels of one element after another.
 
     Attributes:
-        channels: Names of the channels; ``-`` for numbers that are not delivered, of which
-            `possible` and `valid` are looked at.
-        elements: Names of the elements; a whole number n for ``T0`` to ``Tn-1``, two for the rows
+        channels: Names of the channels; ``-`` for numbers that are not delivered, but checked
+            against `possible` and `valid`.
+        elements: Names of the elements; an integer n for ``T0`` to ``Tn-1``, two for the rows
             (``A``, ``B``, ...) and columns (``A0``, ``A1``, ...) of a matrix.
-        unit: Unit of a one times `scale`; empty for the unit that the channels' names say.
-        scale: What a one stands for in `unit`, of all channels or of each in turn.
+        unit: Unit of `scale`; empty for the SI unit of channels with usual names.
+        scale: Value of a one in `unit`, for all channels or for each in turn.
         stride: Bytes from one element to the next, if other numbers lie between; 0 for none. (By
             channel: from one channel to the next.)
-        possible: The least and the largest number that the device can send, as they are in the
-            frame; what else stands there is no measurement, nor the frame one, where it has no
-            beginning.
-        smallest: The smallest number besides 0 that the device can send, whatever its sign.
-        valid: Numbers between which the element is valid, as they are in the frame.
+        possible: Least and largest raw number that the device can send; any other number is no
+            measurement, and without a `sync` its bytes are no frame.
+        smallest: Smallest magnitude other than 0 of a raw number that the device can send.
+        valid: Least and largest raw number for which the element is valid.
         by: Whether all channels of an ``element`` come together, or all elements of a ``channel``.
         order: Byte order of the numbers; empty for that of the file.
     """
@@ -80,7 +78,7 @@ class Values(_Table, frozen=True, kw_only=True):
 
 
 class FrameCounter(_Table, frozen=True, kw_only=True):
-    """``[count]``: the number of the sample, which wraps at its width.
+    """``[count]``: the sample counter, which wraps at its width.
 
     Attributes:
         order: Byte order of the number; empty for that of the file.
@@ -92,7 +90,7 @@ class FrameCounter(_Table, frozen=True, kw_only=True):
 
 
 class FrameClock(FrameCounter, frozen=True, kw_only=True):
-    """``[time]``: when the sample was taken, by the device's clock.
+    """``[time]``: the time of the sample by the device's clock.
 
     Attributes:
         tick_us: Length of a tick, us.
@@ -102,12 +100,11 @@ class FrameClock(FrameCounter, frozen=True, kw_only=True):
 
 
 class FrameStatus(FrameCounter, frozen=True, kw_only=True):
-    """``[status]``
+    """``[status]``: the status bits of the device.
 
     Attributes:
-        bits: What each bit means when it is set, by its number.
-        invalid: Numbers of the bits that say that the values are none; an emulated device sets the
-            first.
+        bits: Meaning of each bit when set, by its number.
+        invalid: Numbers of the bits that mark values as invalid; an emulated device sets the first.
         harmless: Numbers of the bits that are no fault of the device.
     """
 
@@ -117,13 +114,13 @@ class FrameStatus(FrameCounter, frozen=True, kw_only=True):
 
 
 class Message(_Table, frozen=True, kw_only=True):
-    """``[[start]]``, ``[[stop]]``: what the host sends, in order.
+    """``[[start]]``, ``[[stop]]``: the messages that the host sends, in order.
 
     Attributes:
         send: Bytes to send, or ``text:...`` for characters; empty to wait only.
-        expect: What the answer contains; empty if none is awaited.
+        expect: Bytes in the answer; empty to wait for no answer.
         wait_s: Longest time that the answer may take, s.
-        pause_s: Time to wait before the next, s.
+        pause_s: Time to wait before the next message, s.
     """
 
     send: str
@@ -133,21 +130,21 @@ class Message(_Table, frozen=True, kw_only=True):
 
 
 class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The file, key by key.
+    """The mapping file of a frame, key by key.
 
     Attributes:
         length: Length of a frame, bytes.
-        sync: The bytes with which each frame begins; empty for frames that only end alike.
-        usually: Bytes with which a frame mostly begins, where a sync of one or two bytes is no
-            evidence that damaged bytes were a frame.
+        sync: The bytes with which each frame begins; empty for frames with a fixed ending only.
+        usually: Bytes with which most frames begin, if a sync of one or two bytes is no evidence
+            that damaged bytes were a frame.
         baud: Speed of the line, bit/s.
-        usb: Whether the device is attached by USB itself, so that the speed means nothing.
+        usb: Whether the device itself is on USB, so that its baud rate has no effect.
         parity: Parity of the line: ``N``, ``E`` or ``O``.
-        order: Byte order of all numbers that do not say their own.
-        ends: The bytes with which each frame ends; empty if they are not always the same.
-        between: What else the device sends between frames, answers for example, in hexadecimal
-            where ``..`` stands for any byte, or ``text:...``.
-        poll: What the host sends for each sample; empty if the device sends by itself.
+        order: Byte order of all numbers without an order of their own.
+        ends: The bytes with which each frame ends; empty if they vary.
+        between: Other messages that the device sends between frames, such as answers, in
+            hexadecimal where ``..`` stands for any byte, or ``text:...``.
+        poll: Message that the host sends for each sample; empty if the device sends by itself.
     """
 
     length: Annotated[int, msgspec.Meta(ge=2, le=LONGEST)]

@@ -1,24 +1,24 @@
-"""What codecs share: checksums, frames in a stream of bytes, samples that come in several frames.
+"""Tools of the codecs: checksums, finders of frames in a stream, samples from several frames.
 
-A wire delivers bytes cut anywhere, some of them damaged, some missing, some noise. What is needed:
+A wire delivers bytes cut anywhere, some of them damaged, some missing, some noise. Requirements:
 - whole frames, whatever the cuts: the result never depends on where a packet ends;
-- how many frames were damaged between two good ones, since a damaged sample and one that was never
+- the number of damaged frames between two good ones, since a damaged sample and one that was never
   sent are different losses (see `accounting`), and noise is neither;
 - bounded memory and no waiting for a length that is itself damaged.
 
-`ByteBuffer` is the plain tool for a codec that decides for itself: bytes, and the next place where
-a frame may begin. `FrameFinder` does all of it for frames of one length. `Rounds` is the other way
-up: frames (of a CAN bus, which checks them) into the samples of which each carries a part.
+`ByteBuffer` is for a codec with its own search: it holds bytes and finds the next place where a
+frame may begin. `FrameFinder` does all of this for frames of one length. `Rounds` assembles samples
+from the frames of a CAN bus (which checks them), each of which carries a part of a sample.
 
-How `FrameFinder` counts damage. It goes from one beginning to the next; one whose frame fails its
-check is passed over by one byte, so that a beginning inside a damaged frame costs nothing. The
-bytes so passed over are a gap, and its length tells what was lost in it: every length of bytes with
-nearly the right beginning was one damaged frame, and a shorter rest with the right one was a frame
-cut short; what else there is was never part of a frame. The rest may have come first or last, so
-both ways are tried, and the one that explains more counts. Before the first good frame only whole
-lengths count, for one joins a running stream in the middle of a frame. An answer or a boot message
-in a gap means that the device was interrupted: what that cut short is no damage. A gap that goes on
-and on is settled every 64 lengths, so that noise cannot pile up.
+Damage count of `FrameFinder`. It goes from one beginning to the next; if the frame there fails its
+check, it skips one byte only, so that a beginning inside a damaged frame costs nothing. The skipped
+bytes are a gap, and the length of the gap shows its losses: each frame length of bytes with nearly
+the right beginning was a damaged frame, and a shorter rest with the right beginning was a frame cut
+short; all other bytes were never part of a frame. The rest may have come first or last, so both are
+tried, and the one that explains more counts. Before the first good frame only whole lengths count,
+since a host joins a running stream within a frame. An answer or a boot message in a gap means that
+the device was interrupted: a frame cut short by it is no damage. A long gap is evaluated every 64
+lengths, so that noise cannot pile up.
 """
 
 import binascii
@@ -30,8 +30,8 @@ from typing import Final, Generic, TypeVar
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.codec import CanCodec, CanFrame, SampleBatch, Samples, WireStats
 
-GAP: Final = 64  # frames: what is remembered of bytes that are none
-FILL: Final = 7  # bytes at most that fill a part, of a CAN frame's 8
+GAP: Final = 64  # longest gap, in frames, before it is evaluated
+FILL: Final = 7  # most bytes of padding in a CAN frame of 8
 NEAR: Final = 2  # wrong bits in a beginning: of 16 bits, noise has so few once in 500 times
 
 T = TypeVar("T")
@@ -52,19 +52,19 @@ _MODBUS: Final = _modbus_table()
 
 
 def crc16_xmodem(data: bytes | bytearray | memoryview) -> int:
-    """CRC-16/XMODEM: polynomial 0x1021, initial value 0 ("123456789" gives 0x31C3)."""
+    """Return the CRC-16/XMODEM: polynomial 0x1021, initial value 0 ("123456789": 0x31C3)."""
     return binascii.crc_hqx(data, 0)
 
 
 def crc16_x25(data: bytes | bytearray) -> int:
-    """CRC-16/X-25: polynomial 0x1021 reflected ("123456789" gives 0x906E)."""
-    # Python has only the CRC that takes bits from the other end: turn each byte, then the result.
+    """Return the CRC-16/X-25: polynomial 0x1021 reflected ("123456789": 0x906E)."""
+    # Python has only the unreflected CRC: reverse the bits of each byte, then of the result.
     crc = binascii.crc_hqx(data.translate(_REVERSED), 0xFFFF)
     return (_REVERSED[crc & 0xFF] << 8 | _REVERSED[crc >> 8]) ^ 0xFFFF
 
 
 def crc16_modbus(data: bytes | bytearray | memoryview) -> int:
-    """CRC-16/MODBUS: polynomial 0x8005 reflected, initial value 0xFFFF ("123456789": 0x4B37)."""
+    """Return the CRC-16/MODBUS: 0x8005 reflected, initial value 0xFFFF ("123456789": 0x4B37)."""
     crc = 0xFFFF
     for b in data:
         crc = crc >> 8 ^ _MODBUS[(crc ^ b) & 0xFF]
@@ -76,8 +76,8 @@ def seal_modbus(message: bytes) -> bytes:
     return message + crc16_modbus(message).to_bytes(2, "little")
 
 
-def _begun(data: bytearray, sync: bytes, at: int = 0) -> int:
-    """How many of the last bytes, none before a place, may become `sync`."""
+def _find_partial(data: bytearray, sync: bytes, at: int = 0) -> int:
+    """Return how many last bytes, from `at` on, may be the beginning of `sync`."""
     for n in range(min(len(sync) - 1, len(data) - at), 0, -1):
         if data.endswith(sync[:n]):
             return n
@@ -85,39 +85,39 @@ def _begun(data: bytearray, sync: bytes, at: int = 0) -> int:
 
 
 class ByteBuffer:
-    """Bytes that have come and are not yet taken."""
+    """Received bytes that are not yet decoded."""
 
     def __init__(self) -> None:
         self.data = bytearray()
 
     def skip_to(self, sync: bytes) -> int:
-        """Drop all before the first `sync` (or what may become one); return how many bytes."""
+        """Drop the bytes before the first `sync`, or its possible beginning; return how many."""
         at = self.data.find(sync)
         if at < 0:
-            at = len(self.data) - _begun(self.data, sync)
+            at = len(self.data) - _find_partial(self.data, sync)
         del self.data[:at]
         return at
 
     def take(self, n: int) -> bytes:
-        """Take the first n bytes."""
+        """Remove and return the first n bytes."""
         taken = bytes(self.data[:n])
         del self.data[:n]
         return taken
 
 
 class FrameFinder:
-    """Finds frames that have a beginning, a length and a check, and counts the damage between them.
+    """Finds frames with a beginning, a length and a check; counts the damaged ones between.
 
-    How damage is counted is told at the head of this module.
+    This module's docstring describes the count.
 
     Args:
         size: Length of a frame, bytes.
-        good: Tells of `size` bytes that begin with `sync` whether they are an intact frame.
+        good: Returns whether `size` bytes that begin with `sync` are an intact frame.
+        between: Messages that the device may send between frames.
         parts: Whether frames come in parts of which one can be missing (a CAN bus): such a frame is
-            incomplete, not corrupt, zeros may fill its last part, and the bytes beside frames are
-            not counted.
-        head: How a frame usually begins, if that is more than `sync`, since a short beginning is no
-            evidence.
+            incomplete, not corrupt, zeros may fill its last part, and bytes between frames are not
+            counted.
+        head: Usual beginning of a frame, if longer than `sync`, since a short one is no evidence.
     """
 
     def __init__(
@@ -136,11 +136,10 @@ class FrameFinder:
         self._synchronised, self._damaged = False, 0
 
     def find(self, packet: bytes) -> tuple[list[bytes], list[int]]:
-        """Take what has arrived, cut anywhere.
+        """Return the intact frames that received bytes complete, cut anywhere.
 
         Returns:
-            The intact frames that it completes, and for each how many were damaged since the one
-            before.
+            The frames, and for each the number of damaged ones since the previous frame.
         """
         data, at = self._data, 0
         data += packet
@@ -149,7 +148,7 @@ class FrameFinder:
         while True:
             start = data.find(self._sync, at)
             if start < 0:
-                start = len(data) - _begun(data, self._sync, at)
+                start = len(data) - _find_partial(data, self._sync, at)
             self._skip(data[at:start])
             at = start
             if len(data) - at < self._size:
@@ -170,7 +169,7 @@ class FrameFinder:
         return frames, damaged
 
     def forget(self) -> None:
-        """Begin anew, as after a reconnection."""
+        """Discard all state, as after a reconnection."""
         self._data.clear()
         self._gap.clear()
         self._synchronised, self._damaged = False, 0
@@ -184,23 +183,23 @@ class FrameFinder:
         while len(self._gap) >= GAP * self._size:
             rest = self._gap[GAP * self._size :]
             del self._gap[GAP * self._size :]
-            self._count()
+            self._evaluate_gap()
             self._gap = rest
 
     def _close_gap(self) -> int:
         if self._gap:
-            self._count()
+            self._evaluate_gap()
             self._gap.clear()
         self._synchronised = True
         damaged, self._damaged = self._damaged, 0
         return damaged
 
-    def _count(self) -> None:
+    def _evaluate_gap(self) -> None:
         gap, joined = self._gap, self._synchronised
         for message in self._between.finditer(bytes(gap)):
             gap, joined = self._gap[message.end() :], False
         if joined:
-            lost = self._damaged_in(gap)
+            lost = self._count_damaged(gap)
         else:
             at = gap.find(self._sync)
             lost = 0 if at < 0 else (len(gap) - at) // self._size
@@ -211,35 +210,35 @@ class FrameFinder:
         self._stats.corrupt += lost
         self._damaged += lost
 
-    def _damaged_in(self, gap: bytearray) -> int:
-        """Frames that were damaged or cut short, rather than bytes that never were of a frame."""
+    def _count_damaged(self, gap: bytearray) -> int:
+        """Return how many frames were damaged or cut short in a gap."""
         size, n = self._size, len(self._head)
         rest = len(gap) % size
         most = 0
-        for first, at in ((0, len(gap) - rest), (rest, 0)):  # the rest came last, or first
+        for first, at in ((0, len(gap) - rest), (rest, 0)):  # the rest is last, or first
             whole = range(first, first + len(gap) - rest, size)
-            begun = rest > 0 and self._begins(gap[at : at + min(n, rest)])
-            most = max(most, begun + sum(self._near(gap[k : k + n]) for k in whole))
+            part = rest > 0 and self._may_begin_frame(gap[at : at + min(n, rest)])
+            most = max(most, part + sum(self._is_near_head(gap[k : k + n]) for k in whole))
         if rest and len(gap) > size:  # several may have been cut short
-            several = sum(self._begins(gap[k : k + n]) for k in range(len(gap)))
+            several = sum(self._may_begin_frame(gap[k : k + n]) for k in range(len(gap)))
             most = max(most, min(several, -(-len(gap) // size)))
         return most
 
-    def _begins(self, some: bytearray) -> bool:
-        return self._sync.startswith(some[: len(self._sync)]) and self._near(some)
+    def _may_begin_frame(self, some: bytearray) -> bool:
+        return self._sync.startswith(some[: len(self._sync)]) and self._is_near_head(some)
 
-    def _near(self, some: bytearray) -> bool:
-        """Whether these bytes are how a frame begins but for a few bits."""
+    def _is_near_head(self, some: bytearray) -> bool:
+        """Return whether these bytes differ from a frame's beginning by at most `NEAR` bits."""
         usual = self._head[: len(some)]
         wrong = int.from_bytes(some, "big") ^ int.from_bytes(usual, "big")
         return wrong.bit_count() <= NEAR
 
 
 class Rounds(Generic[T]):
-    """Puts parts together: a device sends 0 to n - 1 in ascending order, then begins again.
+    """Assembler of samples from parts 0 to n - 1, sent in ascending order, repeatedly.
 
-    A round ends with part n - 1, or when a part comes that is not after the one before. Nothing
-    tells that a round was lost whole, or that two halves of two rounds were.
+    A round ends with part n - 1, or when a part comes that is not after the previous one. The loss
+    of a whole round, or of the adjacent halves of two rounds, cannot be detected.
     """
 
     def __init__(self, parts: int) -> None:
@@ -247,17 +246,17 @@ class Rounds(Generic[T]):
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew; what is left of a round that we entered in the middle is no loss."""
+        """Discard all state; the first round may lack its beginning without counting as lost."""
         self._parts: list[T | None] = [None] * self._n
         self._last = -1
         self._entered = False
         self._newest: tuple[int, T] | None = None
 
     def add(self, index: int, part: T) -> list[list[T | None]]:
-        """Take a part; return the rounds that it ends (none, one or two), None for parts not come.
+        """Add a part; return the rounds that it ends, with None for missing parts.
 
         Args:
-            index: Which part has come, from 0 to n - 1.
+            index: Number of the part, from 0 to n - 1.
         """
         # CAN may deliver a frame twice when its end is disturbed
         if self._n > 1 and self._newest == (index, part):
@@ -265,25 +264,25 @@ class Rounds(Generic[T]):
         self._newest = (index, part)
         ended: list[list[T | None]] = []
         if index <= self._last:
-            ended += self._end()
+            ended += self._end_round()
         self._parts[index] = part
         self._last = index
         if index == self._n - 1:
-            ended += self._end()
+            ended += self._end_round()
         return ended
 
     def end(self) -> list[list[T | None]]:
-        """End the round that has begun, if one has."""
-        return self._end() if self._last >= 0 else []
+        """Return the unfinished round, if any, as ended."""
+        return self._end_round() if self._last >= 0 else []
 
-    def _end(self) -> list[list[T | None]]:
+    def _end_round(self) -> list[list[T | None]]:
         parts, self._parts, self._last = self._parts, [None] * self._n, -1
         entered, self._entered = self._entered, True
         return [parts] if entered or parts[0] is not None else []
 
 
 class CodecOfParts(CanCodec):
-    """A device on CAN of which each frame carries a part of a sample, see `Rounds`."""
+    """Codec of a CAN device whose frames carry parts of samples, see `Rounds`."""
 
     def __init__(self, spec: ArraySpec, parts: int) -> None:
         super().__init__(spec)
@@ -291,12 +290,12 @@ class CodecOfParts(CanCodec):
         self._rounds: Rounds[bytes] = Rounds(parts)
 
     @abstractmethod
-    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
-        """Which part a frame carries, and its least length; None if it is not this device's."""
+    def _identify_part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+        """Return (part that a frame carries, its least length); None for other devices' frames."""
 
     @abstractmethod
-    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
-        """Add the sample of a round."""
+    def _add_sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+        """Add the sample of a round to the batch."""
 
     def forget(self) -> None:
         self._rounds.forget()
@@ -304,7 +303,7 @@ class CodecOfParts(CanCodec):
     def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
         batch, stats = SampleBatch(), self.stats
         for identifier, data, extended, _, remote in packet:
-            found = None if extended or remote else self._part(identifier, data)
+            found = None if extended or remote else self._identify_part(identifier, data)
             if found is None:
                 stats.skipped += 1
             elif len(data) < found[1]:
@@ -313,5 +312,5 @@ class CodecOfParts(CanCodec):
                 stats.intact += 1
                 for parts in self._rounds.add(found[0], data):
                     stats.incomplete += None in parts
-                    self._sample(batch, parts)
+                    self._add_sample(batch, parts)
         return batch.take(self._shape, t_ns)

@@ -1,8 +1,8 @@
 """Robotiq FT 150 and FT 300 on RS-485 (or its USB adapter), streaming.
 
-The device is a Modbus RTU slave until its register 410 is set to 0x0200: then it sends, unasked and
-deaf to Modbus, the frame of ``frames/ft300.toml``, which says where we have it from. A run of 50
-bytes FF jams the line and makes it a slave again.
+The device is a Modbus RTU slave until its register 410 is set to 0x0200: then it ignores Modbus and
+streams the frame of ``frames/ft300.toml``, which has the sources. A run of 50 bytes FF jams the
+line and makes it a slave again.
 """
 
 import struct
@@ -18,7 +18,7 @@ from tactile_rt.drivers.codecs.framing import seal_modbus
 READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE = REQUESTS = (3, 4, 6, 16)  # Modbus functions
 ERROR, NO_SUCH_ADDRESS = 0x80, 2
 OUTPUT, STREAM = 410, 0x0200  # the register that selects the output, and its value
-LOADS, GRAVITY, SERIAL, YEAR = 180, 190, 510, 514  # other registers that it has
+LOADS, GRAVITY, SERIAL, YEAR = 180, 190, 510, 514  # its other registers
 SERIAL_NUMBER: Final = "FTS-0001"  # of an emulated one
 JAM: Final = 50  # bytes FF that end the stream
 LONGEST: Final = 64  # bytes of a request, or of a jam
@@ -40,9 +40,9 @@ class Ft300Options:
 
 
 class Ft300(DescribedFrame):
-    """One six-axis sensor: forces and moments, N and N m, 100 times a second.
+    """Codec of one six-axis sensor: forces (N) and moments (N m), 100 times a second.
 
-    An FTDI adapter left at its latency of 16 ms hands them over in bunches, 62.5 times a second;
+    An FTDI adapter with its default latency of 16 ms delivers them in batches, 62.5 times a second;
     `tactile-rt doctor` shows how to set it to 1 ms.
     """
 
@@ -59,7 +59,7 @@ class Ft300(DescribedFrame):
         self._request = seal_modbus(select + b"\2" + STREAM.to_bytes(2, "big"))
         self._echo = seal_modbus(select)
         frame = shipped_frame("ft300")
-        jam, request = frame.start  # it may be streaming, and then takes no request
+        jam, request = frame.start  # a streaming device accepts no request
         request = replace(request, send=self._request.hex(), expect=self._echo.hex())
         super().__init__(
             replace(frame, start=(jam, request), between=(self._request.hex(),)), "ft300"
@@ -68,25 +68,25 @@ class Ft300(DescribedFrame):
     # the device's side
 
     def respond(self, packet: bytes) -> bytes:
-        self._heard += packet
-        if (jam := self._heard.rfind(b"\xff" * JAM)) >= 0:
-            self.streaming, self._heard = False, self._heard[jam + JAM :]
+        self._host_bytes += packet
+        if (jam := self._host_bytes.rfind(b"\xff" * JAM)) >= 0:
+            self.streaming, self._host_bytes = False, self._host_bytes[jam + JAM :]
         answer, at = b"", 0
-        while not self.streaming and at < len(self._heard):
-            length = _length(self._heard[at:], self._slave)
-            request = self._heard[at : at + length]
+        while not self.streaming and at < len(self._host_bytes):
+            length = _request_length(self._host_bytes[at:], self._slave)
+            request = self._host_bytes[at : at + length]
             if 0 < length <= len(request) and seal_modbus(request[:-2]) == request:
-                answer += seal_modbus(request[:1] + self._obey(request[1:-2]))
-                self._heard, at = self._heard[at + length :], 0
+                answer += seal_modbus(request[:1] + self._execute(request[1:-2]))
+                self._host_bytes, at = self._host_bytes[at + length :], 0
             elif length > len(request):
                 break  # the rest is still to come
             else:
                 at += 1
-        self._heard = self._heard[-LONGEST:]
+        self._host_bytes = self._host_bytes[-LONGEST:]
         return answer
 
-    def _obey(self, request: bytes) -> bytes:
-        """What a Modbus slave answers to a function, without address and checksum."""
+    def _execute(self, request: bytes) -> bytes:
+        """Execute a Modbus function; return the answer without address and checksum."""
         kind, first, n = request[0], *struct.unpack(">HH", request[1:5])
         if kind in (READ_HOLDING, READ_INPUT):
             registers = self._registers()
@@ -111,8 +111,8 @@ class Ft300(DescribedFrame):
         return words | dict(serial) | {OUTPUT: STREAM * self.streaming, YEAR: 2020}
 
 
-def _length(heard: bytes, slave: int) -> int:
-    """Length of the request that begins here; 0: none does, more than there is: not yet known."""
+def _request_length(heard: bytes, slave: int) -> int:
+    """Return the length of a request; 0 if invalid, more than all bytes while unknown."""
     if heard[0] != slave or (len(heard) > 1 and heard[1] not in REQUESTS):
         return 0
     if len(heard) < 2 or (heard[1] == WRITE and len(heard) < 7):

@@ -1,6 +1,6 @@
 """Strain-gauge whiskers on HX711 converters, two bridges each, read by an Arduino.
 
-Frames (``frames/hx711_whisker.toml``) are told apart by six bytes that end no possible reading.
+Frames (``frames/hx711_whisker.toml``) end with six bytes that occur in no possible reading.
 """
 
 import re
@@ -15,9 +15,9 @@ from tactile_rt.drivers.codecs.ascii_mapping import Element
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import Message
 
-MOST: Final = 9  # whiskers that the board has pins for
+MOST: Final = 9  # whiskers that fit the board's pins
 BYTES: Final = 8  # of a whisker
-_COUNT: Final = re.compile(rb"N=([1-9])[\r\n]|[SE]")
+_COMMAND: Final = re.compile(rb"N=([1-9])[\r\n]|[SE]")
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class Hx711WhiskerOptions:
     """Options of the strain-gauge whiskers.
 
     Attributes:
-        whiskers: Number of whiskers that are connected, 1 to 9.
-        reset: Whether opening the port resets the board, as Arduinos do: the board then waits to be
-            told the number of whiskers. A board that is not reset (a bridge, ``dtr=false``) may be
+        whiskers: Number of connected whiskers, 1 to 9.
+        reset: Whether opening the port resets the board, as Arduinos do: the board then waits for
+            the number of whiskers. A board that is not reset (a bridge, ``dtr=false``) may be
             running already.
         indicator: Whether to raise the board's recording pin while connected.
         rate_hz: Sample rate of the converters, 80 or 10 Hz, which their RATE pin selects.
@@ -44,7 +44,7 @@ class Hx711WhiskerOptions:
 
 
 class Hx711Whisker(DescribedFrame):
-    """Up to nine whiskers, the voltages of their two bridges; loads are a matter of calibration.
+    """Codec of up to nine whiskers: voltages of two bridges each; loads need a calibration.
 
     Source: github.com/biao-geng-me/whisker_sensor, hx711_array/hx711_array.ino (frame, handshake,
     scale), hx711_array/arduino_reader.py (reset on opening). That a converter at its limit is
@@ -66,12 +66,12 @@ class Hx711Whisker(DescribedFrame):
 
     def __init__(self, options: Hx711WhiskerOptions) -> None:
         frame, n = shipped_frame("hx711_whisker"), options.whiskers
-        wait, tell = frame.start
-        tell = replace(tell, send=f"text:N={n}\n")
-        start = (wait, tell) if options.reset else (Message(send=tell.send),)
+        wait, number = frame.start
+        number = replace(number, send=f"text:N={n}\n")
+        start = (wait, number) if options.reset else (Message(send=number.send),)
         if options.indicator:
             start = (*start, Message(send="text:S"))
-        # where the whiskers stand and which way a bridge bends is up to who builds the array
+        # the positions of the whiskers and the directions of the bridges depend on the array
         elements = {f"W{i}": Element(grid=(0, i)) for i in range(n)}
         values = (replace(frame.values[0], elements=tuple(elements)),)
         super().__init__(
@@ -85,13 +85,13 @@ class Hx711Whisker(DescribedFrame):
         self.recording = False
 
     def respond(self, packet: bytes) -> bytes:
-        heard, answer = self._heard + packet, b""
+        commands, answer = self._host_bytes + packet, b""
         last = 0
-        for found in _COUNT.finditer(heard):
+        for found in _COMMAND.finditer(commands):
             last = found.end()
             if found[1] is None:
                 self.recording = found[0] == b"S"
-            else:  # a real board listens once after a reset; an emulated one cannot see those
+            else:  # a real board accepts this once per reset; an emulated one sees no resets
                 self.streaming, answer = True, answer + b"OK\r\n"
-        self._heard = heard[last:][-3:]
+        self._host_bytes = commands[last:][-3:]
         return answer

@@ -1,4 +1,4 @@
-"""The iCub's capacitive skin on CAN: triangles of twelve taxels, sixteen to a board."""
+"""Capacitive skin of the iCub on CAN: triangles of twelve taxels, sixteen per board."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from tactile_rt.drivers.codecs.framing import CodecOfParts
 
 TAXELS: Final = 12  # of a triangle
 TRIANGLES: Final = 16  # of a board, at most
-HEAD, TAIL = 0x40, 0xC0  # first byte of a triangle's two frames; bit 7 tells them apart
+HEAD, TAIL = 0x40, 0xC0  # first byte of a triangle's two frames, which differ in bit 7
 IN_HEAD: Final = 7  # taxels
 CLASS: Final = {"new": 0x400, "old": 0x300}  # of identifiers, by firmware
 CONFIGURE_ID: Final = 0x200  # | board
 SET_BOARD, SET_TRIANGLES, SET_TX_MODE, OLD_SETUP, OLD_SETUP_2 = 0x4D, 0x50, 0x07, 0x4C, 0x4E
-OFFSET: Final = 0x2200  # of the converters: the makers' default
+OFFSET: Final = 0x2200  # of the converters: the maker's default
 NOT_READ: Final = 0x0003  # error bits of a whole triangle; the upper twelve are of its taxels
 
 
@@ -28,10 +28,9 @@ class IcubSkinOptions:
 
     Attributes:
         board: Address of the board, from 0 to 15.
-        triangles: The triangles that are connected, as a list of numbers and ranges, e.g.
-            ``0-6,9``.
+        triangles: The connected triangles, as a list of numbers and ranges, e.g. ``0-6,9``.
         firmware: Generation of the board's firmware: ``new`` (configured by messages 4D and 50,
-            sends when told to) or ``old`` (4C and 4E, sends at once).
+            sends after a command) or ``old`` (4C and 4E, sends at once).
         period_ms: Time between samples, 1 to 255 ms.
     """
 
@@ -50,7 +49,7 @@ class IcubSkinOptions:
         self.numbers()
 
     def numbers(self) -> tuple[int, ...]:
-        """The triangles' numbers, ascending."""
+        """Return the numbers of the triangles, ascending."""
         found: set[int] = set()
         for item in self.triangles.split(","):
             first, dash, last = item.strip().partition("-")
@@ -65,11 +64,11 @@ class IcubSkinOptions:
 
 
 class IcubSkin(CodecOfParts):
-    """A frame with the first seven taxels of a triangle, one with the other five and its errors.
+    """Codec of a skin board, with two frames per triangle.
 
-    Values are the board's counts from 0 to 255, which fall as a taxel is pressed; newtons need a
-    calibration. Taxels of which the frame did not come, or that the board calls stuck, are invalid;
-    so is a whole triangle that the board could not read.
+    The first has seven taxels, the second the other five and the errors. Values are the board's
+    counts from 0 to 255, which fall as a taxel is pressed; newtons need a calibration. A taxel is
+    invalid if its frame did not come, the board reports it stuck, or could not read its triangle.
 
     Source: github.com/robotology/icub-main (class CanBusSkin and SkinDiagnostics.h) and the skin
     board's firmware, which sends the triangles in ascending order.
@@ -99,18 +98,18 @@ class IcubSkin(CodecOfParts):
         self._numbers = options.numbers()
         self._parts = {n: 2 * i for i, n in enumerate(self._numbers)}
         cells = {f"t{n}.{k}": (n, k) for n in self._numbers for k in range(TAXELS)}
-        # where the taxels are depends on the robot's part that the board sits in: left at zero
+        # the taxels' positions depend on the robot's part that holds the board: they are zero
         name, rate_hz = f"icub-skin-{options.board}", 1e3 / options.period_ms
         spec = ArraySpec.at_origin(name, rate_hz, {"c": "1"}, "board", cells)
         super().__init__(spec, parts=2 * len(self._numbers))
         self.streaming = options.firmware == "old"
 
-    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+    def _identify_part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
         part = self._parts.get(identifier - self._first)
         tail = bool(data and data[0] & 0x80)
         return None if part is None else (part + tail, 6 if tail else 8)
 
-    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+    def _add_sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
         counts = bytearray()
         valid: list[bool] = []
         status = 0
@@ -133,25 +132,25 @@ class IcubSkin(CodecOfParts):
             if command != Command.START:
                 return ()
             mask = sum(1 << n for n in self._numbers)
-            # the makers' defaults but for the mask of triangles
+            # the maker's defaults except for the mask of triangles
             return (
-                self._send(OLD_SETUP, 1, 1, 1, 0, 0x20, 0, 0),
-                self._send(OLD_SETUP_2, 2, 0x22, 0xF0, 0, *mask.to_bytes(2, "little"), 0x0A),
+                self._configure(OLD_SETUP, 1, 1, 1, 0, 0x20, 0, 0),
+                self._configure(OLD_SETUP_2, 2, 0x22, 0xF0, 0, *mask.to_bytes(2, "little"), 0x0A),
             )
         if command == Command.STOP:
-            return (self._send(SET_TX_MODE, 1),)
+            return (self._configure(SET_TX_MODE, 1),)
         if command == Command.START:
             offset = OFFSET.to_bytes(2, "little")
             return (
                 # skin type 0: triangles with temperature compensation; counts at rest: 245
-                self._send(SET_BOARD, 0, options.period_ms, 245),
-                self._send(SET_TRIANGLES, 0, TRIANGLES - 1, 2, 0, *offset),
-                *(self._send(SET_TRIANGLES, n, n, 2, 1, *offset) for n in self._numbers),
-                self._send(SET_TX_MODE, 0),
+                self._configure(SET_BOARD, 0, options.period_ms, 245),
+                self._configure(SET_TRIANGLES, 0, TRIANGLES - 1, 2, 0, *offset),
+                *(self._configure(SET_TRIANGLES, n, n, 2, 1, *offset) for n in self._numbers),
+                self._configure(SET_TX_MODE, 0),
             )
         return ()
 
-    def _send(self, *data: int) -> Step[Sequence[CanFrame]]:
+    def _configure(self, *data: int) -> Step[Sequence[CanFrame]]:
         return Step((CanFrame(CONFIGURE_ID | self._options.board, bytes(data)),), pause_s=0.01)
 
     def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:

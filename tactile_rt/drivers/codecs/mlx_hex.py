@@ -1,7 +1,7 @@
 """A whisker on a magnet above a MLX90393, read by a RP2040 that prints hexadecimal digits.
 
-A line is ``SSXXXXYYYYZZZZ - HZ``: the chip's status byte, the field's components as the chip gives
-them, big-endian, and how many lines a second the board thinks that it prints.
+A line is ``SSXXXXYYYYZZZZ - HZ``: the chip's status byte, the raw field components, big-endian,
+and the board's estimate of its line rate.
 """
 
 import re
@@ -29,7 +29,7 @@ SENSITIVITY: Final = {
 # (counts on the wire for no field, least and most), by RES; two's complement up to RES = 1
 ZERO: Final = {0: 0, 1: 0, 2: 0x8000, 3: 0x4000}
 TESLA: Final = 1e-6
-BURST: Final = 0x82  # status while all is well: burst mode, six bytes follow
+BURST: Final = 0x82  # status without error: burst mode, six bytes follow
 ERROR: Final = 0x10
 
 LONGEST: Final = 64
@@ -39,12 +39,12 @@ _BOOT: Final = re.compile(rb"[0-9A-Fa-f]{2}|")  # status after exit, reset and s
 
 @dataclass(frozen=True)
 class MlxHexOptions:
-    """Options of the MLX90393 whisker: how its chip is set, which the board does not say.
+    """Options of the MLX90393 whisker: settings of its chip, which the board does not report.
 
     Attributes:
         gain: The chip's setting GAIN_SEL, 0 to 7.
         resolution: The chip's setting RES, 0 to 3, the same for all axes.
-        hallconf: The chip's setting HALLCONF: 12, as the chip comes, or 0.
+        hallconf: The chip's setting HALLCONF: 12, the chip's default, or 0.
         rate_hz: Rate at which the board prints lines, Hz.
     """
 
@@ -63,7 +63,7 @@ class MlxHexOptions:
 
 
 class MlxHex(SerialCodec):
-    """One magnet whisker: three components of the field at its chip.
+    """Codec of one magnet whisker: three components of the field at its chip.
 
     Source: github.com/JakeSwin/rp_whisker_sensor, src/main.rs (what is printed; the chip is reset
     and left at its defaults); MLX90393 datasheet (status byte, sensitivities, zero by RES).
@@ -71,7 +71,7 @@ class MlxHex(SerialCodec):
 
     Options = MlxHexOptions
     usb = True
-    baud = 115200  # nominal: it speaks over USB
+    baud = 115200  # nominal: the board is on USB
     status_bits = {  # noqa: RUF012
         2: "the chip was reset",
         3: "a bit of the chip's memory was corrected",
@@ -91,7 +91,7 @@ class MlxHex(SerialCodec):
         self._tail = f" - {options.rate_hz:.0f}\n"
         self._data = bytearray()
         self._joined = self._overlong = False
-        self._gap = 0  # bytes of lines that are none, since the last that was one
+        self._gap = 0  # bytes of damaged lines since the last intact one
 
     # the host's side
 
@@ -100,7 +100,7 @@ class MlxHex(SerialCodec):
         *lines, self._data = self._data.split(b"\n")
         batch, digits = SampleBatch(), bytearray()
         for line in lines:
-            self._line(line.removesuffix(b"\r"), batch, digits)
+            self._read_line(line.removesuffix(b"\r"), batch, digits)
         if len(self._data) > LONGEST:
             self._gap += len(self._data)
             self.stats.skipped += len(self._data)
@@ -131,7 +131,7 @@ class MlxHex(SerialCodec):
             for row, ok in zip(raw, good.tolist(), strict=True)
         ]
 
-    def _line(self, line: bytearray, batch: SampleBatch, digits: bytearray) -> None:
+    def _read_line(self, line: bytearray, batch: SampleBatch, digits: bytearray) -> None:
         overlong, self._overlong = self._overlong, False
         found = None if overlong or len(line) > LONGEST else _LINE.fullmatch(line)
         if found is None:
@@ -139,7 +139,7 @@ class MlxHex(SerialCodec):
             if not _BOOT.fullmatch(line) or overlong:
                 self._gap += len(line) + 1
             return
-        # a line in two pieces is one that is lost, two without the end between them are two
+        # a line in two pieces is one lost line, two joined without a line end are two
         lost = -(-self._gap // (len(line) + 1)) if self._joined else 0
         self._gap, self._joined = 0, True
         self.stats.corrupt += lost

@@ -3,10 +3,9 @@
 It is specified in docs/reference/native-protocol.md.
 
 A frame is a header of 20 bytes with its own CRC-16/XMODEM, a payload, and a CRC-32 of both, all
-little-endian. The header's checksum means that a length is believed only if it is true, so a false
-synchronisation in damaged bytes costs no waiting; the last one covers the header too, so that a
-header and the payload of another frame (where exactly a frame's length was lost between) do not
-pass for a sample.
+little-endian. The header's checksum protects the length, so a false synchronisation in damaged
+bytes costs no waiting. The last checksum covers the header, too, so that a header and the payload
+of another frame (if exactly a frame's length was lost in between) do not pass for a sample.
 """
 
 import struct
@@ -31,9 +30,9 @@ VERSION: Final = 1
 SYNC: Final = b"TR"
 HEADER: Final = struct.Struct("<2sBBHHIIBBH")  # sync .. header CRC
 CRC: Final = struct.Struct("<I")
-AROUND: Final = HEADER.size + CRC.size  # bytes of a frame beside its payload
+AROUND: Final = HEADER.size + CRC.size  # bytes of a frame without its payload
 SAMPLE_KIND: Final = VERSION << 4 | MessageType.SAMPLE
-LONGEST: Final = 65_535  # of a payload: the length field's range
+LONGEST: Final = 65_535  # payload, bytes: the range of the length field
 WHISKING: Final = struct.Struct("<3f")  # frequency in Hz, amplitude and offset in rad
 
 _TYPES: Final[dict[int, np.dtype[Any]]] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
@@ -49,7 +48,7 @@ def frame(
     time_us: int = 0,
     shape: tuple[int, int] = (0, 0),
 ) -> bytes:
-    """One frame of the serial form."""
+    """Return a frame of the serial form."""
     head = HEADER.pack(
         SYNC, VERSION << 4 | kind, format, len(payload), status, seq & 0xFFFFFFFF,
         time_us & 0xFFFFFFFF, *shape, 0,
@@ -59,11 +58,11 @@ def frame(
 
 
 class NativeSerial(SerialCodec):
-    """Our reference firmware's protocol: counted, timed, described and checked."""
+    """Codec of the reference firmware, with a counter, time, self-description and checksums."""
 
     Options = NativeOptions
     usb = True
-    baud = 2_000_000  # nominal: most boards speak it over USB, which has no baud rate
+    baud = 2_000_000  # nominal: most boards use USB, which has no baud rate
     count_bits = 32
     tick_ns = 1000.0
     status_bits = common.STATUS
@@ -75,12 +74,12 @@ class NativeSerial(SerialCodec):
         super().__init__(None)
         self._options, self._format = options, common.FORMATS[options.format]
         self.serial_number = options.serial_number
-        self._described: DeviceDescription | None = None
-        self._rest = b""  # of a frame that is not complete
+        self._known_device: DeviceDescription | None = None
+        self._rest = b""  # beginning of an incomplete frame
         self._synchronised = True
         self._damaged = 0  # samples, since the last intact one
-        self._lost = self._framed = 0  # bytes skipped since then, and frames known by their header
-        self._usual = -1  # length of a frame
+        self._lost = self._framed = 0  # bytes skipped since then, and damaged frames with a header
+        self._usual = -1  # length of the last frame
         self._flags, self._valid = b"", np.empty((0, 0), np.bool_)  # of the last packet
         self.streaming = False
         self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
@@ -89,13 +88,12 @@ class NativeSerial(SerialCodec):
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
-        if len(packet) == self._usual and (one := self._one(packet, t_ns)) is not None:
+        if len(packet) == self._usual and (one := self._decode_usual(packet, t_ns)) is not None:
             return one
-        return self._all(packet, t_ns)
+        return self._decode_any(packet, t_ns)
 
-    def _one(self, packet: bytes, t_ns: int) -> Samples | None:
-        """The sample of a packet that is one frame like the one before, if nothing is wrong with
-        it: a short way to what `_all` would say."""
+    def _decode_usual(self, packet: bytes, t_ns: int) -> Samples | None:
+        """Return the sample of one intact usual frame, else None: faster than `_decode_any`."""
         head = HEADER.unpack_from(packet)
         sync, kind, form, length, status, count, ticks, elements, channels, check = head
         if (
@@ -110,23 +108,23 @@ class NativeSerial(SerialCodec):
         flat = np.frombuffer(
             packet, "<f4", elements * channels, len(packet) - CRC.size - 4 * elements * channels
         )
-        if not np.vdot(flat, flat) < np.inf:  # no number, or too large for this look
+        if not np.vdot(flat, flat) < np.inf:  # NaN, infinite, or too large for this fast check
             return None
         self.stats.intact += 1
         self._synchronised = True
-        valid = self._valid_of(packet[HEADER.size : HEADER.size + -(-elements // 8)], 1)
+        valid = self._unpack_flags(packet[HEADER.size : HEADER.size + -(-elements // 8)], 1)
         values = flat.reshape(1, elements, channels).copy()
         row = np.array((t_ns, 0, count, ticks, status), np.int64)
         return Samples(values, valid, row[:1], row[1:2], row[2:3], row[3:4], row[4:])
 
-    def _all(self, packet: bytes, t_ns: int) -> Samples | None:
+    def _decode_any(self, packet: bytes, t_ns: int) -> Samples | None:
         rows: list[tuple[int, ...]] = []
         parts: list[NDArray[Any]] = []
         flags = b""
         for kind, head, payload in self._frames(packet):
             if kind == MessageType.SAMPLE:
                 if self.spec is None:
-                    continue  # nothing can be said of it yet
+                    continue  # its shape is not known yet
                 shape = head[7:9]
                 if shape != self.spec.shape:
                     self._refuse()
@@ -145,16 +143,16 @@ class NativeSerial(SerialCodec):
                     self._refuse()
                     continue
                 if self.spec is not None and found.spec.shape != self.spec.shape:
-                    del rows[:], parts[:]  # of what it was before: another device
+                    del rows[:], parts[:]  # they are of another device
                     flags = b""
-                self._described, self.spec = found, found.spec
+                self._known_device, self.spec = found, found.spec
                 self.serial_number = found.serial_number
         if not rows:
             return None
         self._usual = AROUND + head[3]
         values = np.concatenate(parts)
-        valid = self._valid_of(flags, len(rows))
-        # what is not finite is no measurement, whatever the device says
+        valid = self._unpack_flags(flags, len(rows))
+        # a value that is not finite is no measurement, whatever the device's flags claim
         finite = np.isfinite(values)
         if 0 in finite.tobytes():
             valid &= finite.all(axis=2)
@@ -165,11 +163,11 @@ class NativeSerial(SerialCodec):
             reply = SYNC + bytes((VERSION << 4 | MessageType.DESCRIPTION,))
             ask = Step(frame(MessageType.DESCRIBE), reply, what="its description")
             start = Step(frame(MessageType.START))
-            return (start,) if self.spec and not self._described else (ask, start)
+            return (start,) if self.spec and not self._known_device else (ask, start)
         return (Step(frame(MessageType.STOP)),) if command == Command.STOP else ()
 
     def whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> Step[bytes]:
-        """The command that sets an active array's whisking."""
+        """Return the command that sets an active array's whisking."""
         return Step(
             frame(MessageType.WHISK, WHISKING.pack(frequency_hz, amplitude_rad, offset_rad))
         )
@@ -204,9 +202,9 @@ class NativeSerial(SerialCodec):
         for kind, _, payload in self._frames(packet):
             error = 0
             if kind in MessageType.FROM_DEVICE:
-                continue  # an echo of our own; answering answers would never end
+                continue  # an echo of our own; answering it would never end
             if kind == MessageType.DESCRIBE:
-                self._described = None  # its serial number may be another
+                self._known_device = None  # its serial number may have changed
                 answer += frame(MessageType.DESCRIPTION, self._description().to_json())
                 continue
             if kind in (MessageType.START, MessageType.STOP):
@@ -225,13 +223,13 @@ class NativeSerial(SerialCodec):
     # both
 
     def _description(self) -> DeviceDescription:
-        if self._described is None:
+        if self._known_device is None:
             assert self.spec is not None
-            self._described = DeviceDescription.of(self.spec, self._options, self.serial_number)
-        return self._described
+            self._known_device = DeviceDescription.of(self.spec, self._options, self.serial_number)
+        return self._known_device
 
-    def _valid_of(self, flags: bytes, n: int) -> NDArray[np.bool_]:
-        """(n, element) from the validity bits of n samples, which hardly ever change."""
+    def _unpack_flags(self, flags: bytes, n: int) -> NDArray[np.bool_]:
+        """Return (n, element) validity from the bits of n samples, which hardly ever change."""
         if flags != self._flags:
             assert self.spec is not None
             bits = np.frombuffer(flags, np.uint8).reshape(n, -1)
@@ -241,15 +239,15 @@ class NativeSerial(SerialCodec):
         return self._valid.copy()
 
     def _frames(self, packet: bytes) -> Iterator[tuple[int, tuple[Any, ...], bytes]]:
-        """The intact frames that this packet completes: (type, header, payload)."""
+        """Yield (type, header, payload) of the intact frames that this packet completes."""
         data = self._rest + packet if self._rest else packet
-        at = 0  # all before it is done with
+        at = 0  # first byte that is not yet decoded
         while True:
             begin = data.find(SYNC, at)
-            if begin < 0:  # at the end there may be half of one
+            if begin < 0:  # the last byte may be half of it
                 begin = len(data) - data.endswith(SYNC[:1], at)
             if begin > at:
-                self._lose_sync(begin - at)  # where a frame should have begun
+                self._lose_sync(begin - at)
                 at = begin
             if len(data) - at < HEADER.size:
                 break
@@ -269,11 +267,11 @@ class NativeSerial(SerialCodec):
                 at += 1
                 continue
             if self._lost:
-                self._settle(end + CRC.size - at)
+                self._count_lost(end + CRC.size - at)
             at = end + CRC.size
             self._synchronised = True
             kind = head[1] & 15
-            if head[1] >> 4 != VERSION or (kind == MessageType.SAMPLE and not _fits(head)):
+            if head[1] >> 4 != VERSION or (kind == MessageType.SAMPLE and not _length_fits(head)):
                 self._refuse()
                 continue
             self.stats.intact += 1
@@ -281,16 +279,16 @@ class NativeSerial(SerialCodec):
         self._rest = data[at:]
 
     def _lose_sync(self, n: int) -> None:
-        """Skip n bytes; count one damaged frame, however many pieces pass for a beginning."""
+        """Skip n bytes; count one damaged frame for all bytes up to the next."""
         self.stats.skipped += n
         self._lost += n
         self.stats.corrupt += self._synchronised
         self._synchronised = False
 
-    def _settle(self, length: int) -> None:
-        """How many samples what was skipped has cost: as many as its headers, or its length, say.
+    def _count_lost(self, length: int) -> None:
+        """Estimate the damaged samples in the skipped bytes by their headers and their length.
 
-        A burst of noise between frames costs none, two damaged frames in a row cost two.
+        A burst of noise between frames costs none, two successive damaged frames cost two.
         """
         self._damaged += max(self._framed, round(self._lost / length))
         self._lost = self._framed = 0
@@ -300,8 +298,8 @@ class NativeSerial(SerialCodec):
         self._damaged += 1
 
 
-def _fits(head: tuple[Any, ...]) -> bool:
-    """Whether a sample's length is that of its elements and channels."""
+def _length_fits(head: tuple[Any, ...]) -> bool:
+    """Return whether a sample's length fits its number of elements and channels."""
     form, length, elements, channels = head[2], head[3], head[7], head[8]
     if form not in _TYPES or not elements or not channels:
         return False

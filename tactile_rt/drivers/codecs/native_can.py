@@ -7,12 +7,12 @@
     base + 3  device   part of a sample: low byte of its sequence u8, index u8, payload
     base + 4  device   part of the description: type u8 (2), index u16, payload
 
-all little-endian. A sample is its header, then its parts with indices from 0; put together they are
+all little-endian. A sample is its header, then its parts with indices from 0. Joined, the parts are
 the payload of the serial form (one bit of validity per element, then the values) and the
-CRC-16/XMODEM of header and payload: CAN has a CRC, what lies between a bus and a program often has
+CRC-16/XMODEM of header and payload: CAN has a CRC, but the path from the bus to a program often has
 none. The description is its length u16, the JSON of the serial form, and the CRC-32 of that; it
-ends with an ACK. Commands come first in arbitration, so that a device that fills the bus can still
-be stopped.
+ends with an ACK. Commands win arbitration, so that a device that fills the bus can still be
+stopped.
 """
 
 import struct
@@ -38,24 +38,24 @@ from tactile_rt.drivers.codecs import native_common as common
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType, NativeOptions
 
-COMMAND, ACK, HEADER, PART, DESCRIPTION = range(5)  # identifiers from the base
-WHISKING: Final = struct.Struct("<BHhh")  # type, mHz, 0.1 mrad, 0.1 mrad: one frame, so one change
+COMMAND, ACK, HEADER, PART, DESCRIPTION = range(5)  # identifiers, relative to the base
+WHISKING: Final = struct.Struct("<BHhh")  # type, mHz, 0.1 mrad twice: one frame, so one change
 LENGTHS: Final = (8, 12, 16, 20, 24, 32, 48, 64)  # of CAN FD frames, above 7
 HEAD: Final = struct.Struct("<HIBB")  # sequence, us, status, flags
 FLOAT32, LONG = 1, 2  # flags: the values' type; parts of 62 bytes, not 6
 FLAGS: Final = {_f | (~_f & 15) << 4 for _f in range((FLOAT32 | LONG) + 1)}
 CHECK: Final = 2  # bytes of CRC
-MOST_PARTS: Final = 256  # what one byte of index counts
+MOST_PARTS: Final = 256  # since the index is one byte
 PIECE: Final = struct.Struct("<BH")  # type and index, before each part of the description
 
 
 @dataclass(frozen=True)
 class NativeCanOptions(NativeOptions):
-    """Options of the native protocol over CAN, besides those of the serial one.
+    """Options of the native protocol over CAN, in addition to those of the serial one.
 
     Attributes:
         base: The first of the device's five identifiers, of 11 bits.
-        fd: Whether commands, and what an emulated device sends, are CAN FD frames. A host takes
+        fd: Whether commands, and the frames of an emulated device, are CAN FD. A host accepts
             samples in both.
     """
 
@@ -73,11 +73,11 @@ class NativeCanOptions(NativeOptions):
 
 
 class NativeCan(CanCodec):
-    """Our reference firmware's protocol over CAN: counted, timed, described.
+    """Codec of the reference firmware over CAN, with a counter, time and self-description.
 
     A device queues its frames first-in-first-out, not by identifier. A sample ends when all parts
-    have come, or else with the next sample's first frame; then the elements of which a part was
-    lost are invalid, and nothing checks the others but CAN. A sample whose header, or all but its
+    have come, or else with the next sample's first frame; then the elements with a lost part are
+    invalid, and only CAN's checksum covers the others. A sample whose header, or all but its
     header, was lost is not delivered: its number is missing.
     """
 
@@ -105,22 +105,22 @@ class NativeCan(CanCodec):
         super().__init__(None)
         self._options, self._base, self._fd = options, options.base, options.fd
         self.serial_number = options.serial_number
-        self._described: DeviceDescription | None = None
-        self._sample = SampleParts(self.stats)
-        self._text = DescriptionParts()
+        self._device_description: DeviceDescription | None = None
+        self._assembler = SampleParts(self.stats)
+        self._description_parts = DescriptionParts()
         self.streaming = False
         self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
         self.may_whisk: Callable[[float, float, float], bool] = lambda *asked: True
 
     def forget(self) -> None:
-        self._sample.forget()
-        self._text = DescriptionParts()
+        self._assembler.forget()
+        self._description_parts = DescriptionParts()
 
     # the host's side
 
     def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
         batch = SampleBatch()
-        first, stats, sample = self._base, self.stats, self._sample
+        first, stats, sample = self._base, self.stats, self._assembler
         described = self._description()
         for identifier, data, extended, _, remote in packet:
             which = identifier - first
@@ -131,7 +131,7 @@ class NativeCan(CanCodec):
             elif which == HEADER:
                 sample.header(batch, data, described)
             elif which == DESCRIPTION:
-                self._describe(data)
+                self._add_description(data)
                 described = self._description()
             elif data[:1] == bytes((MessageType.ACK,)):
                 stats.intact += 1
@@ -139,44 +139,44 @@ class NativeCan(CanCodec):
                 stats.skipped += 1
         return batch.take(self.spec.shape, t_ns) if self.spec else None
 
-    def _describe(self, data: bytes) -> None:
+    def _add_description(self, data: bytes) -> None:
         if len(data) < 4 or data[0] != MessageType.DESCRIPTION:
-            self._sample.refuse()
+            self._assembler.refuse()
             return
         self.stats.intact += 1
-        found = self._text.add(data)
+        found = self._description_parts.add(data)
         if not isinstance(found, DeviceDescription):
             if found is False:
-                self._sample.refuse()
+                self._assembler.refuse()
             return
-        # among samples another array would change their shape half-way
-        if self.spec and found.spec.shape != self.spec.shape and not self._sample.fresh:
-            self._sample.refuse()
+        # within a stream of samples, another array would change their shape
+        if self.spec and found.spec.shape != self.spec.shape and not self._assembler.fresh:
+            self._assembler.refuse()
         else:
-            self._described, self.spec = found, found.spec
+            self._device_description, self.spec = found, found.spec
             self.serial_number = found.serial_number
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         if command == Command.START:
-            ask = self._command(MessageType.DESCRIBE, "its description", 2.0)
-            start = self._command(MessageType.START, "the answer to START", 1.0)
-            return (start,) if self.spec and not self._described else (ask, start)
+            ask = self._make_command(MessageType.DESCRIBE, "its description", 2.0)
+            start = self._make_command(MessageType.START, "the answer to START", 1.0)
+            return (start,) if self.spec and not self._device_description else (ask, start)
         if command == Command.STOP:
-            return (Step((self._frame(COMMAND, bytes((MessageType.STOP,))),)),)
+            return (Step((self._make_frame(COMMAND, bytes((MessageType.STOP,))),)),)
         return ()
 
-    def _command(self, kind: int, what: str, timeout_s: float) -> Step[Sequence[CanFrame]]:
-        frame = self._frame(COMMAND, bytes((kind,)))
+    def _make_command(self, kind: int, what: str, timeout_s: float) -> Step[Sequence[CanFrame]]:
+        frame = self._make_frame(COMMAND, bytes((kind,)))
         return Step((frame,), self._base + ACK, timeout_s, what=what)
 
     def whisk(
         self, frequency_hz: float, amplitude_rad: float, offset_rad: float
     ) -> Step[Sequence[CanFrame]]:
-        """The command that sets an active array's whisking (to 65 Hz and 3.2 rad)."""
-        wanted = np.array([frequency_hz * 1e3, amplitude_rad * 1e4, offset_rad * 1e4])
-        counts = np.clip(np.rint(np.nan_to_num(wanted)), (0, -32767, -32767), (65535, 32767, 32767))
+        """Return the command that sets an active array's whisking (to 65 Hz and 3.2 rad)."""
+        motion = np.array([frequency_hz * 1e3, amplitude_rad * 1e4, offset_rad * 1e4])
+        counts = np.clip(np.rint(np.nan_to_num(motion)), (0, -32767, -32767), (65535, 32767, 32767))
         data = WHISKING.pack(MessageType.WHISK, *counts.astype(int).tolist())
-        return Step((self._frame(COMMAND, data),))
+        return Step((self._make_frame(COMMAND, data),))
 
     # the device's side
 
@@ -197,7 +197,7 @@ class NativeCan(CanCodec):
                     f"a sample may have: use {'int16' if self._fd else 'fd'}"
                 )
             packets.append(
-                [self._frame(HEADER, head), *(self._frame(PART, data) for data in parts)]
+                [self._make_frame(HEADER, head), *(self._make_frame(PART, data) for data in parts)]
             )
         return packets
 
@@ -208,19 +208,19 @@ class NativeCan(CanCodec):
             if not mine or not frame.data or frame.data[0] in MessageType.FROM_DEVICE:
                 continue
             kind = frame.data[0]
-            error = self._obey(kind, frame.data, answer)
-            answer.append(self._frame(ACK, bytes((MessageType.ACK, kind, error))))
+            error = self._execute(kind, frame.data, answer)
+            answer.append(self._make_frame(ACK, bytes((MessageType.ACK, kind, error))))
         return answer
 
-    def _obey(self, kind: int, data: bytes, answer: list[CanFrame]) -> int:
-        """Do what the host says, adding to the answer; the error number of the ACK."""
+    def _execute(self, kind: int, data: bytes, answer: list[CanFrame]) -> int:
+        """Execute a command, extend the answer, and return the error number for the ACK."""
         if kind == MessageType.DESCRIBE:
             described = self._description()
             if described is None:
                 return common.IMPOSSIBLE
             size = 64 if self._fd else 8
             pieces = cut_description(MessageType.DESCRIPTION, described.to_json(), size)
-            answer += [self._frame(DESCRIPTION, piece) for piece in pieces]
+            answer += [self._make_frame(DESCRIPTION, piece) for piece in pieces]
         elif kind in (MessageType.START, MessageType.STOP):
             self.streaming = kind == MessageType.START
         elif kind == MessageType.WHISK and len(data) >= WHISKING.size:
@@ -235,19 +235,19 @@ class NativeCan(CanCodec):
 
     # both
 
-    def _frame(self, which: int, data: bytes) -> CanFrame:
+    def _make_frame(self, which: int, data: bytes) -> CanFrame:
         if self._fd and len(data) > 8:
             data = data.ljust(next(n for n in LENGTHS if n >= len(data)), b"\0")
         return CanFrame(self._base + which, data, fd=self._fd)
 
     def _description(self) -> DeviceDescription | None:
-        if self._described is None and self.spec is not None:
+        if self._device_description is None and self.spec is not None:
             return DeviceDescription.of(self.spec, self._options, self.serial_number)
-        return self._described
+        return self._device_description
 
 
 def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
-    """The data of the frames after the header; None if there would be too many."""
+    """Return the data of the frames after the header; None if they are too many."""
     size = 62 if head[7] & LONG else 6
     body += crc16_xmodem(head + body).to_bytes(CHECK, "little")
     if len(body) > MOST_PARTS * size:
@@ -257,7 +257,7 @@ def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
 
 
 class SampleParts:
-    """Samples out of headers and parts, of the newest sample only."""
+    """Assembler of samples from headers and parts; it holds the newest sample only."""
 
     def __init__(self, stats: WireStats) -> None:
         self._stats = stats
@@ -265,10 +265,10 @@ class SampleParts:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Discard all state, as after a reconnection."""
         self.fresh = True  # no sample yet
         self._low = -1  # low byte of the newest sample's sequence; -1: none yet
-        self._head: bytes | None = None  # of the sample that parts are missing of
+        self._head: bytes | None = None  # header of the incomplete sample
         self._parts: list[bytes | None] = []
         self._missing = 0  # parts
         self._size = self._payload = self._last = 0  # bytes: of a part, of all, of the last part
@@ -279,17 +279,17 @@ class SampleParts:
         self._damaged += 1
 
     def header(self, batch: SampleBatch, data: bytes, described: DeviceDescription | None) -> None:
-        """Take a header; what came before it has ended."""
+        """Take a header, and close the sample before it."""
         if len(data) != HEAD.size or data[7] not in FLAGS:
             self.refuse()
             return
         self._stats.intact += 1
         if described is None:
-            return  # nothing can be said of it yet
+            return  # its layout is not known yet
         if data == self._head and self._missing == len(self._parts):
             return  # CAN may deliver a frame twice when its end is disturbed
         self._close(batch)
-        self._described = described
+        self._device_description = described
         elements, channels = described.spec.shape
         itemsize = 4 if data[7] & FLOAT32 else 2
         self._payload = -(-elements // 8) + elements * channels * itemsize + CHECK
@@ -300,7 +300,7 @@ class SampleParts:
         self._last = self._payload - self._size * (parts - 1)
 
     def part(self, batch: SampleBatch, data: bytes, described: DeviceDescription | None) -> None:
-        """Take a part; deliver the sample that it completes."""
+        """Take a part, and deliver the sample that it completes."""
         if len(data) < 3:
             self.refuse()
             return
@@ -308,7 +308,7 @@ class SampleParts:
         if self._head is None or low != self._low:
             self._stats.intact += 1
             if low != self._low and described is not None:
-                self._without_header(batch, low)
+                self._begin_without_header(batch, low)
             return
         parts = self._parts
         last = len(parts) - 1
@@ -327,15 +327,15 @@ class SampleParts:
             self._head = None
             self.refuse()
 
-    def _without_header(self, batch: SampleBatch, low: int) -> None:
-        """A part of a sample whose header was lost: the one before it has ended."""
+    def _begin_without_header(self, batch: SampleBatch, low: int) -> None:
+        """Close the open sample at a part of a sample whose header was lost."""
         self._close(batch)
-        if self._low >= 0:  # else it began before we listened
+        if self._low >= 0:  # else it began before the host joined
             self._stats.incomplete += 1
         self._low = low
 
     def _close(self, batch: SampleBatch) -> None:
-        """Deliver the open sample, whole or not."""
+        """Deliver the open sample, complete or not."""
         head, self._head = self._head, None
         if head is None:
             return
@@ -343,7 +343,7 @@ class SampleParts:
             self._stats.incomplete += 1
             if self._missing == len(self._parts):
                 return
-        shape = self._described.spec.shape
+        shape = self._device_description.spec.shape
         bits, end = -(-shape[0] // 8), self._payload - CHECK
         blank = bytes(self._size)
         body = b"".join([blank if p is None else p for p in self._parts])[: self._payload]
@@ -357,7 +357,7 @@ class SampleParts:
         kind = np.dtype("<f4" if flags & FLOAT32 else "<i2")
         values = np.frombuffer(body[:end], kind, offset=bits).reshape(shape)
         if not flags & FLOAT32:
-            scaled = values * np.asarray(self._described.scale)
+            scaled = values * np.asarray(self._device_description.scale)
             values = scaled.astype(np.float32)
         if self._missing:
             came = np.repeat([p is not None for p in self._parts], self._size)[:end]
@@ -375,23 +375,23 @@ class SampleParts:
 
 
 class DescriptionParts:
-    """A description out of its parts, which come in order."""
+    """Assembler of a description from its parts, which come in order."""
 
     def __init__(self) -> None:
         self._text = bytearray()
         self._next = -1  # index; -1: none before the first
 
     def add(self, data: bytes) -> DeviceDescription | bool | None:
-        """Take a part.
+        """Add a part; return the description that it completes.
 
         Returns:
-            The description that it completes; False if it is not one; None if it goes on.
+            The description; False if it is invalid; None if parts are missing.
         """
         index = int.from_bytes(data[1:3], "little")
         if index == 0:
             self._text, self._next = bytearray(), 0
         if index != self._next:
-            return None  # one was lost; who wants the description asks again
+            return None  # a part was lost; the host requests the description again
         self._text += data[PIECE.size :]
         self._next += 1
         length = int.from_bytes(self._text[:2], "little") + 6
@@ -405,7 +405,7 @@ class DescriptionParts:
 
 
 def cut_description(kind: int, text: bytes, size: int) -> list[bytes]:
-    """The data of the frames that carry a description."""
+    """Return the data of the frames that carry a description."""
     whole = len(text).to_bytes(2, "little") + text + zlib.crc32(text).to_bytes(4, "little")
     starts = range(0, len(whole), size - PIECE.size)
     return [PIECE.pack(kind, i) + whole[at : at + size - PIECE.size] for i, at in enumerate(starts)]

@@ -1,4 +1,4 @@
-"""What the native protocol says on every line: see docs/reference/native-protocol.md."""
+"""Common part of the native protocol on all wires, see docs/reference/native-protocol.md."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,31 +10,31 @@ import numpy as np
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import ArraySpec, Chunk
 
-# What an ACK says went wrong: a type or length that the device does not know; a thing it cannot do.
+# Errors in an ACK: a type or length unknown to the device; a command that it cannot execute.
 UNKNOWN: Final = 1
 IMPOSSIBLE: Final = 2
 
 FORMATS: Final = {"float32": 0, "int16": 1}
 LARGEST: Final = 1e30  # scale: any count times it is a float32
-# Bits of the status; 4 to 7 are ours to give a meaning later, 8 to 15 the device's own (serial).
+# Bits of the status; 4 to 7 are reserved for this protocol, 8 to 15 for the device (serial).
 STATUS: Final = {
     0: "a channel is at the end of its range",
     1: "a sensor fails",
     2: "the device lost samples before this one",
     3: "the whisking drive fails",
 }
-HARMLESS: Final = frozenset((0, 2))  # no faults: a firm touch, and what the counter shows
+HARMLESS: Final = frozenset((0, 2))  # no faults: a firm touch; losses that the counter shows
 
 
 class MessageType:
     """Types of frames."""
 
     SAMPLE = 0
-    DESCRIBE = 1  # host: what are you?
+    DESCRIBE = 1  # host: request for a description
     DESCRIPTION = 2  # device: JSON, see `DeviceDescription`
     START = 3
     STOP = 4
-    WHISK = 5  # host: move the whiskers like this
+    WHISK = 5  # host: frequency, amplitude and offset of the whiskers' motion
     ACK = 6  # device: payload is the type acknowledged and 0, UNKNOWN or IMPOSSIBLE
 
     FROM_DEVICE = (SAMPLE, DESCRIPTION, ACK)
@@ -45,12 +45,10 @@ class NativeOptions:
     """Options of the native protocol.
 
     Attributes:
-        format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
-            both.
-        range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
-            can tell.
-        range_si: The largest reading of channels of other units that it can tell; of rad it is pi.
-        serial_number: The serial number that an emulated device tells; empty for none.
+        format: Number format of an emulated device, ``float32`` or ``int16``; a host accepts both.
+        range_n, range_nm: Full scale of an emulated device's int16 forces (N) and moments (N m).
+        range_si: Full scale of its channels of other units, SI; that of rad is pi.
+        serial_number: Serial number that an emulated device reports; empty for none.
     """
 
     format: str = "float32"
@@ -68,11 +66,11 @@ class NativeOptions:
 
 @dataclass(frozen=True)
 class DeviceDescription:
-    """What a native device says of itself.
+    """Self-description of a native device.
 
     Attributes:
         scale: SI units per count of int16, by channel.
-        serial_number: Tells it from all others of its kind; empty for none.
+        serial_number: Number unique among devices of this kind; empty for none.
     """
 
     spec: ArraySpec
@@ -83,21 +81,21 @@ class DeviceDescription:
     def of(
         cls, spec: ArraySpec, options: NativeOptions | None = None, serial_number: str = ""
     ) -> "DeviceDescription":
-        """A description with scales for the largest readings of a device's options."""
+        """Return a description whose scales fit the full scales of a device's options."""
         options = options or NativeOptions()
         full = {"N": options.range_n, "N m": options.range_nm, "rad": float(np.pi)}
         scale = tuple(full.get(unit, options.range_si) / 32767 for unit in spec.units)
         return cls(spec, scale, serial_number)
 
     def to_json(self) -> bytes:
-        """The payload of a DESCRIPTION."""
+        """Return the payload of a DESCRIPTION."""
         spec = msgspec.Raw(self.spec.to_json().encode())
         further = {"serial": self.serial_number} if self.serial_number else {}
         return msgspec.json.encode({"spec": spec, "scale": self.scale, **further})
 
     @classmethod
     def from_json(cls, text: bytes) -> "DeviceDescription | None":
-        """Read a payload; None if it is not one."""
+        """Read the payload of a DESCRIPTION; return None if it is invalid."""
         try:
             fields = msgspec.json.decode(text, type=dict[str, msgspec.Raw])
             spec = ArraySpec.from_json(bytes(fields["spec"]).decode())
@@ -112,7 +110,7 @@ class DeviceDescription:
 def encode_samples(
     chunk: Chunk, described: DeviceDescription, form: str
 ) -> Iterator[tuple[int, int, bytes]]:
-    """Yield of each sample its number, time in us, and payload: bits of validity, then values."""
+    """Yield (number, time in us, payload) of each sample: validity bits, then values."""
     rows = zip(chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True)
     for seq, t_ns, values, valid in rows:
         if form == "float32":
@@ -120,5 +118,5 @@ def encode_samples(
         else:
             counts = np.rint(np.nan_to_num(values.astype(np.float64) / described.scale))
             body = np.clip(counts, -32767, 32767).astype("<i2").tobytes()
-            valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
+            valid = valid & np.isfinite(values).all(axis=1)  # a count cannot be NaN
         yield seq, t_ns // 1000, np.packbits(valid, bitorder="little").tobytes() + body

@@ -44,7 +44,7 @@ FILTERS: Final = {0.0: 0, 500.0: 1, 150.0: 2, 50.0: 3, 15.0: 4, 5.0: 5, 1.5: 6} 
 ZERO: Final = 255
 
 FAILURE, SEVERAL = 11, 3  # bits of the status
-FAULTS: Final = 0xFFF0  # errors and overloads; below them the number of the sensor that has them
+FAULTS: Final = 0xFFF0  # errors and overloads; the lower bits are the number of the faulty sensor
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class OptoForceOptions:
     """Options of the OptoForce protocol.
 
     Attributes:
-        model: What is connected: ``3d``, ``4x3d`` (four sensors on one board) or ``6d``.
-        rate_hz: Sample rate that the device is set to: 1000, 333, 100, 30 or 10 Hz.
+        model: Connected model: ``3d``, ``4x3d`` (four sensors on one board) or ``6d``.
+        rate_hz: Sample rate to set: 1000, 333, 100, 30 or 10 Hz.
         filter_hz: Cut-off of the device's low-pass filter: 500, 150, 50, 15, 5 or 1.5 Hz; 0 for
             none.
-        zero: Whether the device takes its present load for zero when it is started.
+        zero: Whether the device takes its load at the start as zero.
         counts: The counts per N (and per N m) of the sensor's sensitivity report, by channel and
-            separated by commas, for all sensors or for each in turn. Empty: the values are counts.
+            separated by commas, for all sensors or for each in turn. If empty, values are counts.
     """
 
     model: str = "3d"
@@ -70,12 +70,12 @@ class OptoForceOptions:
     def __post_init__(self) -> None:
         for name, known in (("model", SHAPES), ("rate_hz", SPEEDS), ("filter_hz", FILTERS)):
             if getattr(self, name) not in known:
-                told = ", ".join(f"{k:g}" if isinstance(k, float) else f"{k}" for k in known)
-                raise ConfigError(f"{name} must be one of {told}, not {getattr(self, name)}")
+                each = ", ".join(f"{k:g}" if isinstance(k, float) else f"{k}" for k in known)
+                raise ConfigError(f"{name} must be one of {each}, not {getattr(self, name)}")
         self.scale()
 
     def scale(self) -> NDArray[np.float64]:
-        """(element, channel) SI units per count."""
+        """Return (element, channel) SI units per count, or ones without `counts`."""
         shape = SHAPES[self.model]
         if not self.counts:
             return np.ones(shape)
@@ -85,19 +85,19 @@ class OptoForceOptions:
             raise ConfigError(f"counts must be numbers, not {self.counts!r}") from None
         if counts.size not in (shape[1], shape[0] * shape[1]):
             raise ConfigError(f"counts must be {shape[1]} numbers for a {self.model}, by channel")
-        if not ((counts >= 1e-6) & (counts <= 1e9)).all():  # a zero, a sign or nonsense
+        if not ((counts >= 1e-6) & (counts <= 1e9)).all():  # zero, negative or implausible
             raise ConfigError(f"counts must be positive numbers, not {self.counts!r}")
         return np.broadcast_to(1 / counts.reshape(-1, shape[1]), shape)
 
 
 class _Messages:
-    """What the device says, on either wire."""
+    """Messages of the device, common to both wires."""
 
     def __init__(self, options: OptoForceOptions, stats: WireStats, parts: bool) -> None:
         elements, channels = SHAPES[options.model]
         axes = list(SIX_AXES)[:channels]
         units = {axis: SIX_AXES[axis] if options.counts else "1" for axis in axes}
-        sensors = {f"S{i + 1}": (0, i) for i in range(elements)}  # mounted by their user
+        sensors = {f"S{i + 1}": (0, i) for i in range(elements)}  # the user mounts them
         rate_hz = float(options.rate_hz)
         self.spec = ArraySpec.at_origin("optoforce", rate_hz, units, elements=sensors)
         self._scale = options.scale()
@@ -112,18 +112,18 @@ class _Messages:
             ]
         )
         size = self._layout.itemsize
-        self.finder = FrameFinder(self._head, size, _intact, ANSWERS, stats, parts)
-        self._heard = b""
+        self.finder = FrameFinder(self._head, size, _is_intact, ANSWERS, stats, parts)
+        self._host_bytes = b""
 
     def decode(self, found: list[bytes], damaged: list[int], t_ns: int) -> Samples | None:
-        """What the finder found, as samples."""
+        """Convert the messages that the finder found to samples; None without messages."""
         if not found:
             return None
         messages = np.frombuffer(b"".join(found), self._layout)
         status = messages["status"].astype(np.int64)
         return Samples(
             (messages["load"] * self._scale).astype(np.float32),
-            _usable(status, len(self._scale)),
+            _find_valid(status, len(self._scale)),
             np.full(len(found), t_ns, np.int64),
             np.array(damaged, np.int64),
             count=messages["count"].astype(np.int64),
@@ -140,26 +140,25 @@ class _Messages:
         bad = (~valid).sum(axis=1)
         first = np.argmin(valid, axis=1) + 1
         messages["status"] = np.where(bad > 0, 1 << FAILURE | first, 0) | (bad > 1) << SEVERAL
-        return [_summed(message.tobytes()[:-2]) for message in messages]
+        return [_seal(message.tobytes()[:-2]) for message in messages]
 
     def respond(self, packet: bytes) -> tuple[bytes, int | None]:
-        """The answer, and at which rate the device streams now, Hz (0: it does not; None: as
-        before)."""
-        self._heard += packet
+        """Return (answer, new streaming rate in Hz; 0 if it stops, None if unchanged)."""
+        self._host_bytes += packet
         answer, rate, done = b"", None, 0
-        for settings in SETTINGS.finditer(self._heard):
+        for settings in SETTINGS.finditer(self._host_bytes):
             done = settings.end()
             speed, filter_, _ = settings[0][4:7]
-            good = _intact(settings[0]) and speed in (0, *SPEEDS.values()) and filter_ <= 6
+            good = _is_intact(settings[0]) and speed in (0, *SPEEDS.values()) and filter_ <= 6
             if good:
                 rate = next((hz for hz, code in SPEEDS.items() if code == speed), 0)
-            answer += _summed(ANSWER + bytes((not good,)))
-        self._heard = self._heard[max(done, len(self._heard) - 8) :]
+            answer += _seal(ANSWER + bytes((not good,)))
+        self._host_bytes = self._host_bytes[max(done, len(self._host_bytes) - 8) :]
         return answer, rate
 
 
 class OptoForceSerial(SerialCodec):
-    """An OptoForce DAQ on USB."""
+    """Codec of an OptoForce DAQ on USB."""
 
     Options = OptoForceOptions
     usb = True
@@ -201,8 +200,8 @@ class OptoForceSerial(SerialCodec):
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         if command == Command.START:
-            return (Step(_settings(self._options), _summed(ANSWER + b"\0"), what="its settings"),)
-        return (Step(_settings(self._options, stop=True)),) if command == Command.STOP else ()
+            return (Step(_configure(self._options), _seal(ANSWER + b"\0"), what="its settings"),)
+        return (Step(_configure(self._options, stop=True)),) if command == Command.STOP else ()
 
     def forget(self) -> None:
         self._messages.finder.forget()
@@ -219,11 +218,11 @@ class OptoForceSerial(SerialCodec):
 
 @dataclass(frozen=True)
 class OptoForceCanOptions(OptoForceOptions):
-    """Options of the OptoForce protocol on a CAN bus, besides those of the serial one.
+    """Options of the OptoForce protocol on a CAN bus, in addition to the serial ones.
 
     Attributes:
         device_id: CAN identifier of the frames that the device sends.
-        host_id: CAN identifier of the frames that the device takes.
+        host_id: CAN identifier of the frames that the device accepts.
     """
 
     device_id: int = 0x100
@@ -237,7 +236,7 @@ class OptoForceCanOptions(OptoForceOptions):
 
 
 class OptoForceCan(CanCodec):
-    """An OptoForce DAQ on a CAN bus."""
+    """Codec of an OptoForce DAQ on a CAN bus."""
 
     Options = OptoForceCanOptions
     count_bits = 16
@@ -269,10 +268,10 @@ class OptoForceCan(CanCodec):
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         if command == Command.START:
-            settings = self._frames(self._host_id, _settings(self._options), fill=True)
+            settings = self._split(self._host_id, _configure(self._options), fill=True)
             return (Step(settings, self._id, what="its settings"),)
         if command == Command.STOP:
-            settings = self._frames(self._host_id, _settings(self._options, stop=True), fill=True)
+            settings = self._split(self._host_id, _configure(self._options, stop=True), fill=True)
             return (Step(settings),)
         return ()
 
@@ -280,38 +279,39 @@ class OptoForceCan(CanCodec):
         self._messages.finder.forget()
 
     def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
-        return [self._frames(self._id, message) for message in self._messages.encode(chunk)]
+        return [self._split(self._id, message) for message in self._messages.encode(chunk)]
 
     def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
-        heard = b"".join(f.data for f in packet if f.id == self._host_id and not f.extended)
-        answer, rate = self._messages.respond(heard)
+        received = b"".join(f.data for f in packet if f.id == self._host_id and not f.extended)
+        answer, rate = self._messages.respond(received)
         if rate is not None:
             self.streaming, self.commanded_hz = rate > 0, rate or None
-        return self._frames(self._id, answer)
+        return self._split(self._id, answer)
 
     @staticmethod
-    def _frames(id: int, message: bytes, fill: bool = False) -> list[CanFrame]:
-        if fill:  # the board wants whole frames
+    def _split(id: int, message: bytes, fill: bool = False) -> list[CanFrame]:
+        if fill:  # the board requires whole frames
             message += bytes(-len(message) % 8)
         return [CanFrame(id, message[at : at + 8]) for at in range(0, len(message), 8)]
 
 
-def _summed(message: bytes) -> bytes:
+def _seal(message: bytes) -> bytes:
     return message + (sum(message) & 0xFFFF).to_bytes(2, "big")
 
 
-def _intact(message: bytes) -> bool:
+def _is_intact(message: bytes) -> bool:
     return sum(message[:-2]) == int.from_bytes(message[-2:], "big")
 
 
-def _settings(options: OptoForceOptions, stop: bool = False) -> bytes:
+def _configure(options: OptoForceOptions, stop: bool = False) -> bytes:
+    """Return the message that configures the device, or stops it."""
     speed = 0 if stop else SPEEDS[options.rate_hz]
     zero = ZERO if options.zero and not stop else 0
-    return _summed(CONFIGURE + bytes((speed, FILTERS[options.filter_hz], zero)))
+    return _seal(CONFIGURE + bytes((speed, FILTERS[options.filter_hz], zero)))
 
 
-def _usable(status: NDArray[np.int64], elements: int) -> NDArray[np.bool_]:
-    """(n, element): without the sensors that a status finds fault with."""
+def _find_valid(status: NDArray[np.int64], elements: int) -> NDArray[np.bool_]:
+    """Return (n, element) validity: False for the sensors that the status marks as faulty."""
     sensor, several = status & 7, status >> SEVERAL & 1
     one = (several == 0) & (sensor >= 1) & (sensor <= elements)
     at_fault = ~one[:, None] | (np.arange(1, elements + 1) == sensor[:, None])

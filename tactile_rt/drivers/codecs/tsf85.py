@@ -1,10 +1,10 @@
 """Robotiq TSF-85 (CoRo tactile sensor): two fingertips of 4 x 7 taxels, over USB.
 
-A packet is 9A, a CRC that neither side computes, a command, the length of what follows (one byte),
-and signals one after the other: a byte with the type in its high half, the finger in bits 2-3 and
-an index in bits 0-1, then big-endian values. Its own length fits no whole set of signals, so a set
-comes in several packets, in no promised order. The host's 58 makes the device send a set every so
-many ms; 0 stops it.
+A packet is 9A, a CRC that neither side computes, a command, the length of the rest (one byte), and
+signals in sequence: a byte with the type in its high half, the finger in bits 2-3 and an index in
+bits 0-1, then big-endian values. A packet is too short for a whole set of signals, so a set comes
+in several packets, in no guaranteed order. The host's command 58 sets the period in ms at which the
+device sends sets; 0 stops it.
 
 Sources: facts of the public drivers that go back to Robotiq's tactile sensor interface
 (UsbCommands, UsbSensorType and the scales of the motion sensor, +-2 g and +-250 deg/s).
@@ -24,9 +24,9 @@ from tactile_rt.drivers.codec import Command, SampleBatch, Samples, SerialCodec,
 from tactile_rt.drivers.codecs.framing import ByteBuffer
 
 START: Final = b"\x9a"
-READ, SEND, SEND_WHEN_NEW = 0x61, 0x58, 0x59  # commands; packets carry the one they answer
+READ, SEND, SEND_WHEN_NEW = 0x61, 0x58, 0x59  # commands; packets repeat the one they answer
 STATIC, DYNAMIC, ACCELERATION, TURNING, FIELD, TEMPERATURE, TIME = range(1, 8)  # types
-VALUES: Final = {  # of each type, as they come
+VALUES: Final = {  # of each type, as sent
     STATIC: np.dtype((">u2", 28)),
     DYNAMIC: np.dtype((">i2", 1)),
     ACCELERATION: np.dtype((">i2", 3)),
@@ -48,10 +48,10 @@ class Tsf85Options:
 
     Attributes:
         signals: The signals that become samples: ``taxels`` (28 of each finger) or ``fingers``
-            (each one's dynamic taxel and motion sensor).
-        fingers: Number of fingertips that are plugged in, 1 or 2.
+            (the dynamic taxel and motion sensor of each).
+        fingers: Number of connected fingertips, 1 or 2.
         period_ms: Time between samples, 1 to 255 ms.
-        times: Whether the firmware sends its time. Older ones do not: with them no sample comes
+        times: Whether the firmware sends its time. Older firmware does not, and gives no samples
             unless this is false.
     """
 
@@ -70,13 +70,13 @@ class Tsf85Options:
 
 
 class Tsf85(SerialCodec):
-    """Pressure counts of the taxels; or dynamic counts, acceleration and turning of the fingers.
+    """Codec of the taxels' pressure counts, or of the fingers' motion.
 
-    The taxels' counts have no published scale (unit 1). A sample is complete when each signal that
-    it is made of has come. The first one after START shows in which order they come; a signal out
-    of that order is of the next sample already: a packet was lost, and the fingers that miss a
-    signal are invalid. A host that joins a running stream may put the order's beginning elsewhere
-    in the round, and so a finger one period late.
+    Motion is dynamic counts, acceleration and angular velocity. The taxels' counts have no
+    published scale (unit 1). A sample is complete when all of its signals have come. The first
+    sample after START shows their order; a signal out of that order belongs to the next sample: a
+    packet was lost, and the fingers with a missing signal are invalid. If a host joins a running
+    stream, the order may begin elsewhere in the round, and a finger be one period late.
     """
 
     Options = Tsf85Options
@@ -93,16 +93,16 @@ class Tsf85(SerialCodec):
         return [{"fingers": "1"}, {"times": "false"}, {"fingers": "1", "times": "false"}]
 
     def __init__(self, options: Tsf85Options) -> None:
-        super().__init__(_spec(options))
+        super().__init__(_make_spec(options))
         taxels = options.signals == "taxels"
         kinds = (STATIC,) if taxels else (DYNAMIC, ACCELERATION, TURNING)
-        self._wanted = [(kind, finger) for finger in range(options.fingers) for kind in kinds]
-        self._needed = list(self._wanted)
+        self._signals_used = [(kind, finger) for finger in range(options.fingers) for kind in kinds]
+        self._signals_needed = list(self._signals_used)
         self._options = options
         if options.times:
             self.tick_ns = 1e6
-            self._needed.append((TIME, 0))
-        self._buffer, self._heard = ByteBuffer(), ByteBuffer()
+            self._signals_needed.append((TIME, 0))
+        self._buffer, self._host_bytes = ByteBuffer(), ByteBuffer()
         self.streaming = False
         self._damaged = 0
         self.forget()
@@ -110,14 +110,14 @@ class Tsf85(SerialCodec):
     def forget(self) -> None:
         self._buffer.data.clear()
         self._synchronised = False
-        self._set: dict[tuple[int, int], bytes] = {}  # signals of a sample not yet complete
-        self._order: list[tuple[int, int]] = []  # in which they come; empty: not yet known
+        self._set: dict[tuple[int, int], bytes] = {}  # signals of the incomplete sample
+        self._order: list[tuple[int, int]] = []  # of the signals in a sample; empty: unknown
 
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
         batch = SampleBatch()
-        for command, signals in self._packets(self._buffer, packet):
+        for command, signals in self._read_packets(self._buffer, packet):
             if command in (READ, SEND, SEND_WHEN_NEW):
                 for signal, data in signals:
                     self._take(batch, signal, data)
@@ -125,7 +125,7 @@ class Tsf85(SerialCodec):
         return batch.take(self.spec.shape, t_ns)
 
     def _take(self, batch: SampleBatch, signal: tuple[int, int], data: bytes) -> None:
-        if signal not in self._needed:
+        if signal not in self._signals_needed:
             return
         if self._ends_sample(signal):
             self.stats.incomplete += 1
@@ -133,13 +133,13 @@ class Tsf85(SerialCodec):
                 self._deliver(batch)
             self._set.clear()
         self._set[signal] = data
-        if len(self._set) == len(self._needed):
+        if len(self._set) == len(self._signals_needed):
             self._order = list(self._set)
             self._deliver(batch)
             self._set.clear()
 
     def _ends_sample(self, signal: tuple[int, int]) -> bool:
-        """Whether the sample so far must do without what it misses."""
+        """Return whether a signal belongs to the next sample, so that this one ends."""
         if not self._set or not self._order:
             return signal in self._set
         return self._order.index(signal) <= self._order.index(next(reversed(self._set)))
@@ -148,7 +148,7 @@ class Tsf85(SerialCodec):
         assert self.spec is not None
         got: list[NDArray[np.float64]] = []
         valid: list[bool] = []
-        for kind, finger in self._wanted:
+        for kind, finger in self._signals_used:
             data = self._set.get((kind, finger))
             dtype = VALUES[kind]
             values = np.zeros(dtype.shape) if data is None else np.frombuffer(data, dtype.base)
@@ -169,9 +169,9 @@ class Tsf85(SerialCodec):
             batch.ticks.append(ticks % 2**self.tick_bits)
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
-        stop = Step(_packet(SEND, b"\0"), pause_s=SETTLE_S)
+        stop = Step(_make_packet(SEND, b"\0"), pause_s=SETTLE_S)
         if command == Command.START:
-            return stop, Step(_packet(SEND, bytes((self._options.period_ms,))))
+            return stop, Step(_make_packet(SEND, bytes((self._options.period_ms,))))
         return (stop,) if command == Command.STOP else ()
 
     # the device's side
@@ -191,29 +191,29 @@ class Tsf85(SerialCodec):
         for taxels, moving, t_ns in zip(fingers, still, chunk.t_ns.tolist(), strict=True):
             wire, rest = b"", b""
             for finger, row in enumerate(taxels):
-                wire += _packet(SEND, _signal(STATIC, finger, row))
-                rest += _signal(DYNAMIC, finger, moving[finger][:2])
-                rest += _signal(ACCELERATION, finger, moving[finger][2:8])
-                rest += _signal(TURNING, finger, moving[finger][8:])
+                wire += _make_packet(SEND, _pack(STATIC, finger, row))
+                rest += _pack(DYNAMIC, finger, moving[finger][:2])
+                rest += _pack(ACCELERATION, finger, moving[finger][2:8])
+                rest += _pack(TURNING, finger, moving[finger][8:])
                 if self._options.times:
-                    rest += _signal(TIME, finger, (round(t_ns / 1e6) % 2**64).to_bytes(8, "big"))
-            packets.append(wire + _packet(SEND, rest))
+                    rest += _pack(TIME, finger, (round(t_ns / 1e6) % 2**64).to_bytes(8, "big"))
+            packets.append(wire + _make_packet(SEND, rest))
         return packets
 
     def respond(self, packet: bytes) -> bytes:
-        heard = self._heard
-        heard.data += packet
+        host = self._host_bytes
+        host.data += packet
         while True:
-            heard.skip_to(START)
-            if len(heard.data) < 4:
+            host.skip_to(START)
+            if len(host.data) < 4:
                 return b""
-            command, length = heard.data[2], heard.data[3]
+            command, length = host.data[2], host.data[3]
             if (command, length) not in ((SEND, 1), (SEND_WHEN_NEW, 1), (READ, 0)):
-                heard.take(1)
+                host.take(1)
                 continue
-            if len(heard.data) < 4 + length:
+            if len(host.data) < 4 + length:
                 return b""
-            data = heard.take(4 + length)[4:]
+            data = host.take(4 + length)[4:]
             if command == READ:
                 self.polled += 1
             else:
@@ -222,10 +222,10 @@ class Tsf85(SerialCodec):
 
     # both
 
-    def _packets(
+    def _read_packets(
         self, buffer: ByteBuffer, packet: bytes
     ) -> Iterator[tuple[int, list[tuple[tuple[int, int], bytes]]]]:
-        """The packets of sound structure that this completes: (command, signals)."""
+        """Yield (command, signals) of the valid packets that these bytes complete."""
         buffer.data += packet
         while True:
             skipped = buffer.skip_to(START)
@@ -237,18 +237,18 @@ class Tsf85(SerialCodec):
             if command in (READ, SEND, SEND_WHEN_NEW) and length:
                 if len(buffer.data) < 4 + length:
                     return
-                signals = _signals(bytes(buffer.data[4 : 4 + length]))
+                signals = _split_signals(bytes(buffer.data[4 : 4 + length]))
             if signals is None:
                 self._lose(len(buffer.take(1)))
                 continue
             buffer.take(4 + length)
             self._synchronised = True
             self.stats.intact += 1
-            yield command, signals  # what follows is lost after it, if it is
+            yield command, signals  # before any damage that follows is counted
 
     def _lose(self, n: int) -> None:
         self.stats.skipped += n
-        if n and not self._order:  # what came before may not be of the same sample
+        if n and not self._order:  # the signals before may be of another sample
             self._set.clear()
         if n and self._synchronised:
             self.stats.corrupt += 1
@@ -256,10 +256,10 @@ class Tsf85(SerialCodec):
             self._synchronised = False
 
 
-def _spec(options: Tsf85Options) -> ArraySpec:
+def _make_spec(options: Tsf85Options) -> ArraySpec:
     fingers = range(options.fingers)
     if options.signals == "taxels":
-        # side by side on the grid, an empty column between; where they are depends on the gripper
+        # side by side on the grid, an empty column between; the gripper determines the positions
         cells = {
             f"f{f}t{COLUMNS * r + c}": (r, f * (COLUMNS + 1) + c)
             for f, r, c in product(fingers, range(ROWS), range(COLUMNS))
@@ -272,16 +272,16 @@ def _spec(options: Tsf85Options) -> ArraySpec:
     return ArraySpec.at_origin("tsf85", 1000.0 / options.period_ms, channels, "fingers", cells)
 
 
-def _packet(command: int, data: bytes) -> bytes:
+def _make_packet(command: int, data: bytes) -> bytes:
     return START + bytes((0, command, len(data))) + data
 
 
-def _signal(kind: int, finger: int, data: bytes) -> bytes:
+def _pack(kind: int, finger: int, data: bytes) -> bytes:
     return bytes((kind << 4 | finger << 2,)) + data
 
 
-def _signals(data: bytes) -> list[tuple[tuple[int, int], bytes]] | None:
-    """((type, finger), values) of each signal; None: they do not end where the packet does."""
+def _split_signals(data: bytes) -> list[tuple[tuple[int, int], bytes]] | None:
+    """Return ((type, finger), values) of each signal; None if they do not fill the packet."""
     found = []
     at = 0
     while at < len(data):
@@ -291,7 +291,7 @@ def _signals(data: bytes) -> list[tuple[tuple[int, int], bytes]] | None:
         size = VALUES[kind].itemsize
         if at + 1 + size > len(data):
             return None
-        if index == 0:  # one of each is known of
+        if index == 0:  # only signals with index 0 are known
             found.append(((kind, finger), data[at + 1 : at + 1 + size]))
         at += 1 + size
     return found

@@ -1,4 +1,4 @@
-"""XELA uSkin patches on CAN: 4 x 4 taxels of three axes, a frame per taxel."""
+"""XELA uSkin patches on CAN: 4 x 4 three-axis taxels, a frame per taxel."""
 
 import struct
 from collections.abc import Collection, Sequence
@@ -43,11 +43,11 @@ class XelaOptions:
 
 
 class Xela(CodecOfParts):
-    """uSPa44: each taxel in a frame of its own, byte 0 not known, then x, y, z as u16 big-endian.
+    """uSkin uSPa44: one frame per taxel, with x, y, z as u16 big-endian.
 
-    Values are the device's counts: the newtons per count differ from patch to patch and go into a
-    calibration. Taxels of which no frame came are invalid. The frames of a sample come in the order
-    of their identifiers, which is also their order in arbitration.
+    Byte 0 of a frame has an unknown meaning. Values are the device's counts: the newtons per count
+    differ from patch to patch and belong in a calibration. Taxels without a frame are invalid. The
+    frames of a sample come in the order of their identifiers, which is also that of arbitration.
 
     Source: the public driver of the O2AS team (github.com/o2as/ur-o2as, o2as_xela_sensor), which
     reads one board.
@@ -70,7 +70,7 @@ class Xela(CodecOfParts):
 
     def __init__(self, options: XelaOptions) -> None:
         self._first, self._board = options.first_id, options.board
-        # the distance of the taxels is not in the public driver: positions are left at zero
+        # the public driver does not give the distance of the taxels: positions are zero
         super().__init__(
             ArraySpec.at_origin(
                 "uSPa44", options.rate_hz, dict.fromkeys("xyz", "1"), "patch",
@@ -80,17 +80,17 @@ class Xela(CodecOfParts):
         )  # fmt: skip
         self.streaming = False
 
-    def _part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
+    def _identify_part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
         taxel = identifier - self._first
         return (taxel, 1 + XYZ.size) if 0 <= taxel < TAXELS else None
 
-    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
+    def _add_sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
         raw = b"".join([p[1 : 1 + XYZ.size] if p else bytes(XYZ.size) for p in parts])
         batch.values.append(np.frombuffer(raw, ">u2"))
         batch.valid.append([p is not None for p in parts])
 
     def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if command == Command.START:  # how to stop it is not public: it stops without power
+        if command == Command.START:  # the stop command is not public: it stops without power
             return (Step((CanFrame(CONTROL_ID | self._board, START),)),)
         return ()
 
@@ -101,9 +101,9 @@ class Xela(CodecOfParts):
             [
                 CanFrame(self._first + i, b"\0" + sample[i].tobytes())
                 for i in range(TAXELS)
-                if there[i]
+                if good[i]
             ]
-            for sample, there in zip(counts, valid, strict=True)
+            for sample, good in zip(counts, valid, strict=True)
         ]
 
     def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:

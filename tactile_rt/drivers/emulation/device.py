@@ -1,4 +1,4 @@
-"""A device that is not there, with its line: plug it in, open its URL, pull it out.
+"""An emulated device with its line: plug it in, open its URL, pull it out.
 
 with EmulatedSerial(source, "native") as device, open_source(device.url) as driver:
     chunk = driver.read(timeout=1.0)
@@ -26,10 +26,10 @@ SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
 
 
 class EmulatedDevice(Emulator):
-    """An emulated device on a line that exists; a context manager, plugged in while entered."""
+    """An emulated device on a real line; a context manager, plugged in while entered."""
 
     wire: ClassVar[str]
-    paced: ClassVar[bool] = True  # whether, in real time, its line has a speed
+    paced: ClassVar[bool] = True  # whether its line has a speed in real time
 
     def __init__(
         self,
@@ -43,45 +43,45 @@ class EmulatedDevice(Emulator):
         **emulator: Any,
     ) -> None:
         self._name, self._options = name, options
-        like = getattr(source, "like", None)  # a made-up array has the device's array, and loads
+        like = getattr(source, "like", None)  # a synthetic source takes on the device's array
         if like is not None and codec.spec is not None:
             source = like(codec.spec)
         super().__init__(codec, source, endpoint, faults, **emulator)
 
     @property
     def port(self) -> str:
-        """What a program opens: a serial port's path, or INTERFACE:CHANNEL."""
+        """Name that a program opens: a serial port's path, or INTERFACE:CHANNEL."""
         return self.address.partition(":")[2].removeprefix("//")
 
     @property
     def url(self) -> str:
-        """What `open_source` opens: the line, the codec and its options."""
-        # a + is a + in our URLs, not the space that web forms make of it
-        told = {k: v for k, v in self._options.items() if k not in SPEEDS or v != "0"}
-        query = urlencode({"codec": self._name, **told}, quote_via=quote)
+        """URL for `open_source`: the line, the codec and its options."""
+        # a + stays a + in our URLs, other than in web forms, where it is a space
+        options = {k: v for k, v in self._options.items() if k not in SPEEDS or v != "0"}
+        query = urlencode({"codec": self._name, **options}, quote_via=quote)
         return f"{quote(self.address, safe=':/')}?{query}"
 
 
-def _made(
+def _make_codec_and_speed(
     wire: str, name: str, options: dict[str, str], speed: str
 ) -> tuple[Codec[Any], int | None]:
-    """The codec, and the line's speed where the options tell one."""
+    """Return (codec, the line's speed in bit/s, None if not an option)."""
     fields = dict(options)
-    told = None
+    rate = None
     if speed in fields and speed not in codec_class(wire, name).Options.__dataclass_fields__:
         text = fields.pop(speed)
         if not text.isdecimal():
             raise ConfigError(f"{speed} must be a whole number, bit/s, not {text!r}")
-        told = int(text)
-    return make_codec(wire, name, fields), told
+        rate = int(text)
+    return make_codec(wire, name, fields), rate
 
 
 class EmulatedSerial(EmulatedDevice):
     """A device on a serial port: a pty, which any program can open. Unix only.
 
-    In real time what it sends takes the time that it takes at the line's speed, what does not fit
-    is not sent, and a host with another baud rate hears nonsense. A device that is attached by USB
-    has no such speed, unless an option ``baud`` tells one; with ``baud=0`` none has.
+    In real time, sending takes as long as at the line's speed, a packet that does not fit is not
+    sent, and a host with another baud rate receives nonsense. A device on USB has no such speed,
+    unless an option ``baud`` sets one; ``baud=0`` removes it.
 
     Args:
         link: A symbolic link to the port, so that the port has the same name when it is plugged
@@ -103,7 +103,7 @@ class EmulatedSerial(EmulatedDevice):
         **further: Any,
     ) -> None:
         fields = dict(options or {})
-        spoken, baud = _made("serial", codec, fields, "baud")
+        spoken, baud = _make_codec_and_speed("serial", codec, fields, "baud")
         assert isinstance(spoken, SerialCodec)
         if baud is None:
             baud = spoken.baud if self.paced and pace == "realtime" and not spoken.usb else 0
@@ -112,14 +112,14 @@ class EmulatedSerial(EmulatedDevice):
 
 
 class EmulatedCan(EmulatedDevice):
-    """A device on a CAN bus: behind an slcan adapter on a pty, or on a bus of python-can.
+    """A device behind an slcan adapter on a pty, or on a bus of python-can.
 
-    In real time frames behind an slcan adapter take the time that they take on a bus of the bit
-    rate that the host chose; with an option ``bitrate=0`` they take none.
+    In real time, frames behind an slcan adapter take as long as on a bus of the bit rate that the
+    host chose; with an option ``bitrate=0`` they take no time.
 
     Args:
         bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None: slcan.
-        fd: Whether to open that bus for CAN FD; None: if the codec's own option says so.
+        fd: Whether to open that bus for CAN FD; None: by the codec's own option.
 
     The other arguments are those of `EmulatedSerial`.
     """
@@ -139,7 +139,7 @@ class EmulatedCan(EmulatedDevice):
         **further: Any,
     ) -> None:
         fields = dict(options or {})
-        spoken, bitrate = _made("can", codec, fields, "bitrate")
+        spoken, bitrate = _make_codec_and_speed("can", codec, fields, "bitrate")
         if fd is None:
             fd = fields.get("fd", "").lower() in ("1", "true")
         if bitrate is None:

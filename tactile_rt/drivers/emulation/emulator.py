@@ -1,4 +1,4 @@
-"""An emulated device: any source's samples, spoken by any codec, over a real line.
+"""Emulator of a device: sends any source's samples, encoded by any codec, over a real line.
 
 source --> [fit] --> device's counter and clock --> Codec.encode --> [faults] --> endpoint
                                  host's commands --> Codec.respond --> endpoint
@@ -19,38 +19,38 @@ from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedul
 from tactile_rt.drivers.emulation.transmitter import EmulatedClock, RateConverter, Transmitter, fit
 
 PACES = ("realtime", "fast")
-SETTLE_S: Final = 0.2  # unasked none is sent: who opens a port throws away what was there before
-SLICE_S: Final = 0.05  # how soon a wait notices that the emulator is closed
-YIELD_S: Final = 1e-5  # a source that never waits would keep the host's commands waiting
-PIECE: Final = 16  # samples encoded at a time when nobody waits for the clock
-AHEAD_BYTES: Final = 65_536  # what is queued at most when the host sets the pace
+SETTLE_S: Final = 0.2  # without unrequested samples: a host that opens a port discards old input
+SLICE_S: Final = 0.05  # longest time until a wait notices that the emulator is closed
+YIELD_S: Final = 1e-5  # so that a source that never waits does not delay the host's commands
+PIECE: Final = 16  # samples encoded at a time if not paced by the clock
+AHEAD_BYTES: Final = 65_536  # longest queue when the host sets the pace
 
 
 class Emulator:
-    """A device that measures what a source delivers. A context manager; runs in two threads.
+    """A device whose measurements come from a source. A context manager; runs in two threads.
 
-    The source is first read when a host is there and, if the codec needs that, has asked for
-    samples; one that is not live and paced ``fast`` then waits for its host for ever after, and
-    loses nothing. Samples that the source delivers while the device is not to send are not
-    numbered. A polled device sends the newest sample. The source stays the caller's to close.
+    The source is first read when a host is connected and, if the codec requires it, has requested
+    samples. With a source that is not live and pace ``fast``, the emulator always waits for its
+    host and loses nothing. Samples that the source delivers while the device is stopped are not
+    numbered. A polled device sends the newest sample. The caller closes the source.
 
     Args:
         codec: The codec that the device speaks. Without a `spec` it takes that of the source; else
-            see `fit`. It also remembers what hosts have commanded.
-        faults: What goes wrong; the schedule is used up.
-        log: What was done to each sample: a record of each (17 bytes) if asked for, else counts
-            only.
+            see `fit`. It also stores the hosts' commands.
+        faults: The schedule of faults, which is used up.
+        log: Whether to record the fate of each sample (17 bytes each); if not, only counts are
+            kept.
         pace: ``realtime`` sends samples when they are due (a live source has its own pace);
-            ``fast`` as soon as the host takes them. In real time a device sends at its own rate, or
-            at that which the host has commanded, whatever the source's.
-        seconds: How long the source's stream is, if known, else where to stop; s of the source's
+            ``fast`` as soon as the host takes them. In real time a device sends at its own rate or
+            at the rate that the host has commanded, whatever the source's.
+        seconds: Length of the source's stream, if known, else when to stop; s of the source's
             time. The schedule keeps the end quiet. Not needed for a source that is not live.
         start_count: First value of the device's counter, e.g. just before it wraps.
         start_tick: First value of the device's clock, in ticks.
-        drift_ppm: How much faster than true the device's clock runs, parts per million.
+        drift_ppm: Excess speed of the device's clock, parts per million.
 
     Raises:
-        ConfigError: codec and endpoint are of different wires, or a fault cannot happen there.
+        ConfigError: codec and endpoint are of different wires, or a fault is impossible there.
     """
 
     def __init__(
@@ -77,24 +77,24 @@ class Emulator:
             codec.spec = source.spec
         self.codec, self.source, self.endpoint = codec, source, endpoint
         if hasattr(codec, "may_whisk") and hasattr(source, "may_whisk"):
-            codec.may_whisk = source.may_whisk  # what it cannot do is not acknowledged
+            codec.may_whisk = source.may_whisk  # impossible commands are not acknowledged
         self.log = DeviceLog(log)
         self._fit = fit(source.spec, codec.spec)
         self._rate = RateConverter(source.spec.rate_hz, codec) if pace == "realtime" else None
         self._seconds = seconds
         self._ahead_ns = QUIET_S * NS_PER_S if faults and not source.live else 0.0
-        self._waits = pace == "fast" and not source.live  # the host sets the pace
-        self._unasked = codec.streaming  # when switched on
+        self._host_paces = pace == "fast" and not source.live
+        self._streams_at_power_on = codec.streaming
         tick_ns = codec.tick_ns or 1.0
         wrap_ns = round(2**codec.tick_bits * tick_ns)
         clock = EmulatedClock(round(start_tick * tick_ns), drift_ppm, wrap_ns)
-        self._out = Transmitter(codec, endpoint, faults, self.log, clock, start_count)
+        self._sender = Transmitter(codec, endpoint, faults, self.log, clock, start_count)
         self._first_ns: int | None = None  # of the source's time
-        self._began_ns = 0  # host time then
+        self._began_ns = 0  # host time of the first sample
         self._newest: Chunk | None = None
         self._whisking: Any = None
         self._state = threading.Condition(threading.RLock())
-        self._heard_at: float | None = None
+        self._connected_at: float | None = None
         self._stopping = self._done = False
         self._failure: BaseException | None = None
         self._threads: list[threading.Thread] = []
@@ -103,16 +103,16 @@ class Emulator:
 
     @property
     def address(self) -> str:
-        """What a host opens: the beginning of a source's URL."""
+        """Beginning of the URL that a host opens."""
         return self.endpoint.address
 
     @property
     def done(self) -> bool:
-        """Whether the source has ended and all that can be sent has been handed on."""
+        """Whether the source has ended and all packets that can be sent are sent."""
         return self._done and (not self.endpoint.backlog or not self.endpoint.heard)
 
     def start(self) -> None:
-        """Appear and begin."""
+        """Plug the device in and start its threads."""
         self.endpoint.plug()
         for work in (self._listen, self._measure):
             thread = threading.Thread(target=work, name=f"emulator-{work.__name__[1:]}")
@@ -120,10 +120,10 @@ class Emulator:
             self._threads.append(thread)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is `done`; whether it is.
+        """Wait until it is `done`; return whether it is.
 
         Raises:
-            TactileError: the source broke.
+            TactileError: the source failed.
         """
         end = None if timeout is None else time.monotonic() + timeout
         while not self.done and self._failure is None:
@@ -132,14 +132,14 @@ class Emulator:
                 return False
             with self._state:
                 if self._done:
-                    left = min(left, 0.005)  # the backlog tells nobody when it is gone
+                    left = min(left, 0.005)  # the end of the backlog gives no notification
                 self._state.wait(left)
         if self._failure is not None:
             raise self._failure
         return True
 
     def close(self) -> None:
-        """Disappear; safe to call twice."""
+        """Stop the threads and remove the device; it may be called twice."""
         with self._state:
             self._stopping = True
             self._state.notify_all()
@@ -157,24 +157,24 @@ class Emulator:
         self.close()
 
     def unplug(self) -> None:
-        """Pull it out: what is on its way is lost, and what it measures meanwhile is unheard."""
+        """Pull the device out; unsent packets and later samples are lost."""
         with self._state:
             self.endpoint.pull()
-            self._heard_at = None
+            self._connected_at = None
 
     def replug(self, restart: bool = False) -> None:
-        """Plug it in again, under the same link.
+        """Plug the device in again, under the same link.
 
         Args:
-            restart: Whether the device had no power meanwhile: then it counts from 0, and waits to
-                be started.
+            restart: Whether the device had lost power: it then counts from 0, and is in its state
+                at power-on.
         """
         with self._state:
             self.endpoint.plug()
             if restart:
-                self._out.restart()
+                self._sender.restart()
                 self.codec.forget()
-                self.codec.streaming, self.codec.polled = self._unasked, 0
+                self.codec.streaming, self.codec.polled = self._streams_at_power_on, 0
         self.endpoint.wake()
 
     # the host's commands
@@ -185,23 +185,23 @@ class Emulator:
                 packet = self.endpoint.receive(SLICE_S)
                 with self._state:
                     heard = self.endpoint.heard
-                    if heard != (self._heard_at is not None):
-                        self._heard_at = time.monotonic() if heard else None
+                    if heard != (self._connected_at is not None):
+                        self._connected_at = time.monotonic() if heard else None
                         if heard and self.codec.greeting:
                             self.endpoint.send(self.codec.greeting, answer=True)
                     elif not packet:
                         continue
                     if packet:
-                        self._obey(packet)
+                        self._execute(packet)
                     self._state.notify_all()
-        except BaseException as error:  # whoever waits for the device shall know
+        except BaseException as error:  # `wait` raises it
             self._failure = error
 
-    def _obey(self, packet: Any) -> None:
+    def _execute(self, packet: Any) -> None:
         answer = self.codec.respond(packet)
         if answer:
             self.endpoint.send(answer, answer=True)
-        if not self._waits and not self.codec.streaming and self._newest is not None:
+        if not self._host_paces and not self.codec.streaming and self._newest is not None:
             self._answer_polls(self._newest)
 
     # the samples
@@ -209,20 +209,20 @@ class Emulator:
     def _measure(self) -> None:
         try:
             if self._wait_for_host():
-                for chunk in self._chunks():
+                for chunk in self._read_chunks():
                     sampled = chunk if self._rate is None else self._rate.at_rate(chunk)
                     if sampled is not None:
-                        self._play(self._fit(sampled))
+                        self._send_when_due(self._fit(sampled))
             with self._state:
-                self._out.finish()
+                self._sender.finish()
         except BaseException as error:
             self._failure = error
         with self._state:
             self._done = True
             self._state.notify_all()
 
-    def _chunks(self) -> Iterator[Chunk]:
-        """The source's chunks, some held back so that the end is known before it comes."""
+    def _read_chunks(self) -> Iterator[Chunk]:
+        """Yield the source's chunks, late enough that the end is known in advance."""
         ahead: list[Chunk] = []
         while not self._stopping:
             self._pass_on_whisking()
@@ -230,16 +230,16 @@ class Emulator:
                 chunk = self.source.read(SLICE_S)
             except EndOfStream:
                 if ahead:
-                    self._out.end_ns = min(self._out.end_ns, int(ahead[-1].t_ns[-1]))
+                    self._sender.end_ns = min(self._sender.end_ns, int(ahead[-1].t_ns[-1]))
                 break
             if chunk is None:
                 continue
             if self._first_ns is None:
                 self._first_ns, self._began_ns = int(chunk.t_ns[0]), time.monotonic_ns()
-                self._out.begin(self._first_ns)
+                self._sender.begin(self._first_ns)
                 if self._seconds is not None:
-                    self._out.end_ns = self._first_ns + self._seconds * NS_PER_S
-            n = int(np.searchsorted(chunk.t_ns, self._out.end_ns))
+                    self._sender.end_ns = self._first_ns + self._seconds * NS_PER_S
+            n = int(np.searchsorted(chunk.t_ns, self._sender.end_ns))
             if n:
                 ahead.append(chunk.select(slice(n)))
             while ahead and ahead[-1].t_ns[-1] - ahead[0].t_ns[-1] >= self._ahead_ns:
@@ -252,27 +252,27 @@ class Emulator:
             if not self._stopping:
                 yield chunk
 
-    def _play(self, chunk: Chunk) -> None:
+    def _send_when_due(self, chunk: Chunk) -> None:
         """Send a chunk's samples as they fall due."""
         at = 0
         while at < len(chunk) and not self._stopping:
-            if self._waits:
+            if self._host_paces:
                 time.sleep(YIELD_S)
-                with self._state:  # else a STOP could come between
+                with self._state:  # so that no STOP comes between the wait and the sending
                     if not self._wait_for_host():
                         return
                     stop = at + (PIECE if self.codec.streaming else 1)
-                    self._offer(chunk.select(slice(at, stop)))
+                    self._send_or_keep(chunk.select(slice(at, stop)))
             else:
                 if self.source.live:
                     time.sleep(YIELD_S)
                     stop = at + PIECE
                 else:
-                    stop = self._due(chunk, at)
-                self._offer(chunk.select(slice(at, stop)))
+                    stop = self._wait_until_due(chunk, at)
+                self._send_or_keep(chunk.select(slice(at, stop)))
             at = min(stop, len(chunk))
 
-    def _due(self, chunk: Chunk, at: int) -> int:
+    def _wait_until_due(self, chunk: Chunk, at: int) -> int:
         """Wait until sample `at` is due; return the first one that is not."""
         assert self._first_ns is not None
         while True:
@@ -283,46 +283,46 @@ class Emulator:
             time.sleep(min(wait_s, SLICE_S))
 
     def _wait_for_host(self) -> bool:
-        """Wait until a host wants samples and there is room for them; False: we are closing."""
+        """Wait until a host requests samples and has room; return False when closing."""
         with self._state:
             while not self._stopping:
-                measures = self.codec.measures and not self._waits
-                wanted = self.codec.streaming or self.codec.polled > 0 or measures
+                measures = self.codec.measures and not self._host_paces
+                active = self.codec.streaming or self.codec.polled > 0 or measures
                 left = SLICE_S
-                if self._heard_at is not None and self.endpoint.heard and wanted:
-                    settled = self._heard_at + (SETTLE_S if self._unasked else 0.0)
+                if self._connected_at is not None and self.endpoint.heard and active:
+                    settled = self._connected_at + (SETTLE_S if self._streams_at_power_on else 0.0)
                     left = min(left, settled - time.monotonic())
                     if left <= 0:
                         if self.endpoint.backlog < AHEAD_BYTES:
                             return True
                         left = 0.001
-                elif self._out.away:  # only more samples bring it back
+                elif self._sender.away:  # it is plugged in again only as samples pass
                     return True
                 self._state.wait(left)
         return False
 
-    def _offer(self, piece: Chunk) -> None:
+    def _send_or_keep(self, piece: Chunk) -> None:
         with self._state:
             if self.codec.streaming:
-                self._out.send(piece)
+                self._sender.send(piece)
             else:
                 self._newest = self.codec.newest = piece.select(slice(-1, None))
-                if self._out.away:  # nobody can ask, and only time brings it back
-                    self._out.look(int(self._newest.t_ns[0]))
+                if self._sender.away:  # no host can poll; the passing of time plugs it in again
+                    self._sender.look(int(self._newest.t_ns[0]))
                 self._answer_polls(self._newest)
 
     def _answer_polls(self, sample: Chunk) -> None:
         while self.codec.polled > 0 and not self._stopping:
             self.codec.polled -= 1
-            self._out.send(sample)
-            if self._waits:
+            self._sender.send(sample)
+            if self._host_paces:
                 return
 
     def _pass_on_whisking(self) -> None:
-        """What a host commands the device to do, a simulated array does."""
-        wanted = getattr(self.codec, "whisking", None)
-        if wanted is not None and wanted != self._whisking:
-            self._whisking = wanted
+        """Pass a host's whisking command on to a simulated array."""
+        command = getattr(self.codec, "whisking", None)
+        if command is not None and command != self._whisking:
+            self._whisking = command
             move = getattr(self.source, "set_whisking", None)
             if move is not None:
-                move(*wanted)
+                move(*command)

@@ -1,6 +1,6 @@
 """The device's end of a line, for an emulator: a pty, an slcan adapter on a pty, a CAN bus.
 
-None of them ever waits for a reader: what does not fit is refused whole.
+None of them ever waits for a reader: a packet that does not fit is refused as a whole.
 """
 
 import abc
@@ -17,11 +17,11 @@ from tactile_rt.drivers.emulation.pseudo_terminal import Pty, Wire, bytes_s, fra
 from tactile_rt.drivers.links import CanLink
 from tactile_rt.drivers.slcan import SlcanAdapter
 
-UART_BYTES = 4096  # what a device holds that the line has not yet carried
+UART_BYTES = 4096  # capacity of a device's queue for its line
 FIFO_BYTES = 1 << 20  # a second of 1 kHz x 850 B: a busy host machine is no fault of the device
-LOOK_S = 0.005  # how often a bus that is not there is looked at
-WAIT_S = 0.05  # how soon a wait on a bus notices that the device is closed
-SEND_S = 0.05  # what a bus may take to take a frame
+LOOK_S = 0.005  # interval at which an absent bus is checked
+WAIT_S = 0.05  # longest time until a wait on a bus notices that the device is closed
+SEND_S = 0.05  # longest time that a bus may take to accept a frame
 BUS_ERROR = 0x80  # slcan's status flag
 
 
@@ -29,7 +29,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
     """The device's end of a line.
 
     Attributes:
-        address: What a host opens, the beginning of a source's URL; known once plugged in.
+        address: Beginning of the URL that a host opens; known once plugged in.
     """
 
     wire: ClassVar[str]
@@ -42,33 +42,33 @@ class Endpoint(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def plug(self) -> None:
-        """Appear."""
+        """Connect the device to its line."""
 
     @abc.abstractmethod
     def pull(self) -> None:
-        """Disappear, with all that has not been read."""
+        """Disconnect the device; unread data is lost."""
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> Packet:
-        """What the host has sent, or an empty packet when nothing came in time; in one thread."""
+        """Return a packet from the host, empty if none came in time; for one thread."""
 
     @abc.abstractmethod
     def send(self, packet: Packet, answer: bool = False) -> bool:
-        """Send, at once or as the host reads; False: nobody hears, or there is no room.
+        """Send a packet, or queue it; return False without a host or room.
 
         Args:
-            answer: Whether this answers a command: there is always room for that.
+            answer: Whether it answers a command: an answer always has room.
         """
 
     @abc.abstractmethod
     def disturb(self, amount: int, draw: random.Random) -> None:
-        """Send what means nothing: so many random bytes, or frames that nobody knows."""
+        """Send this many random bytes, on CAN in frames with unknown identifiers."""
 
     def error(self, frames: int) -> None:
-        """Send so many CAN error frames."""
+        """Send this many CAN error frames."""
 
     def gather(self, seconds: float) -> None:
-        """Hand on what has come every so often only, s; 0: at once."""
+        """Set the time for which an adapter gathers data, s; 0: none."""
 
     @property
     def backlog(self) -> int:
@@ -79,12 +79,12 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """End a wait in `receive`."""
 
     def close(self) -> None:
-        """Disappear for good; safe to call twice."""
+        """Disconnect the device for good; it may be called twice."""
         self.pull()
 
 
 class _PtyEndpoint(Endpoint[Packet]):
-    """What a device on a pty has, whatever it speaks."""
+    """Common part of endpoints on a pty."""
 
     def __init__(
         self, link: str | Path | None, fifo_bytes: int, wire: Wire | None = None, baud: int = 0
@@ -116,10 +116,10 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
     """A serial port: a pty.
 
     Args:
-        link: A name under which the port appears, besides /dev/pts/N.
-        fifo_bytes: How many bytes the port holds for a host that does not read.
-        baud: Speed of the line, bit/s: what is sent takes its time, and a host with another one
-            hears nonsense; 0 for a line without a speed, as USB is.
+        link: Another name of the port, in addition to /dev/pts/N.
+        fifo_bytes: Number of bytes that the port queues for a host that does not read.
+        baud: Speed of the line, bit/s, which delays the data; a host with another speed receives
+            nonsense. 0 for a line without a speed, such as USB.
     """
 
     wire = "serial"
@@ -149,12 +149,12 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
 
 
 class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
-    """A device on a CAN bus with an slcan adapter on a pty: frames come once the channel is open.
+    """A device on a CAN bus behind an slcan adapter on a pty.
 
     Args:
-        bitrate: Speed of the bus, bit/s; a host that chooses another one hears nothing. None
+        bitrate: Speed of the bus, bit/s; a host that chooses another speed receives nothing. None
             accepts any.
-        paced: Whether frames take the time that they take on a bus of the host's bit rate.
+        paced: Whether frames take as long as on a bus of the host's bit rate.
     """
 
     wire = "can"
@@ -175,7 +175,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
         return self.pty.heard and self.adapter.hears
 
     def plug(self) -> None:
-        self.adapter = SlcanAdapter(self._bitrate)  # it gets its power from the port
+        self.adapter = SlcanAdapter(self._bitrate)  # a new one, since the port powers it
         self.pty.plug()
         self.address = f"can:slcan:{self.pty.name}"
 
@@ -183,7 +183,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
         data = self.pty.read(timeout_s)
         if not data:
             return []
-        with self.pty.lock:  # nothing may come between a command and its answer
+        with self.pty.lock:  # no data may come between a command and its answer
             answer, frames = self.adapter.respond(data)
             self.pty.write(answer, answer=True)
         return frames
@@ -195,7 +195,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
             return bool(data) and self.pty.write(data, answer, takes_s)
 
     def disturb(self, amount: int, draw: random.Random) -> None:
-        # with an end of line: what follows is a line of its own
+        # with an end of line, so that the next frame is a line of its own
         if self.adapter.hears:
             self.pty.write(draw.randbytes(amount) + b"\r")
 
@@ -218,7 +218,7 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
 
     @property
     def heard(self) -> bool:
-        # a virtual bus knows who is on it; of another nobody can tell
+        # a virtual bus knows its participants; on others a host is assumed
         link = self._link
         return link is not None and (self._interface != "virtual" or len(link.bus.channel) > 1)
 
@@ -244,7 +244,7 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
         try:
             found = link.receive(min(timeout_s, WAIT_S))
         except SourceError:
-            time.sleep(LOOK_S)  # pulled out meanwhile, or the bus is off
+            time.sleep(LOOK_S)  # pulled out by now, or the bus is off
             return []
         return found[0] if found else []
 
@@ -258,7 +258,7 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
         return False
 
     def disturb(self, amount: int, draw: random.Random) -> None:
-        for _ in range(-(-amount // 8)):  # 29 bits: no device of ours has such an identifier
+        for _ in range(-(-amount // 8)):  # 29 bits: no codec here has such identifiers
             self.send([CanFrame(1 << 28 | draw.getrandbits(28), draw.randbytes(8), extended=True)])
 
     def error(self, frames: int) -> None:

@@ -1,4 +1,4 @@
-"""What goes wrong on the wire, on purpose: a schedule, what it does to a packet, and a record.
+"""Deliberate faults on the wire: their schedule, their effect on packets, and a record.
 
 The schedule comes from TOML and a seed:
 
@@ -12,9 +12,9 @@ The schedule comes from TOML and a seed:
     at_s = 5.0          # once
     duration_s = 0.5
 
-At most one fault hits any one sample, so that the losses a receiver counts can be compared with
-what was done, sample by sample. The first and the last half second are undisturbed, and nothing is
-lost beside a restart of the counter, where no receiver could count it.
+At most one fault hits a sample, so that the losses that a receiver counts can be compared with the
+record, sample by sample. The first and the last half second are undisturbed, and nothing is lost
+around a restart of the counter, where no receiver could count it.
 """
 
 import heapq
@@ -42,12 +42,12 @@ BESIDE_RESET_S = 0.05  # undisturbed on either side of a restart
 
 
 class Kind(NamedTuple):
-    """What a kind of fault takes: `amount` by default and in which unit; a duration or not."""
+    """Parameters of a kind of fault: default amount, its unit, and whether it lasts."""
 
     amount: float
     unit: str
     lasts: bool = False
-    whole: bool = True  # whether the amount is a whole number of at least one
+    whole: bool = True  # whether the amount must be an integer of at least one
 
 
 KINDS = {
@@ -68,19 +68,17 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of fault, and when.
+    """One kind of fault, with its time.
 
     Attributes:
         kind: Name of a kind in `KINDS`. With ``stall`` nothing is sent for a while, then all at
             once; with ``sequence_reset`` the device's counter and clock start again, as after a
             restart.
-        rate: Mean number of times per second that the fault happens, at random; 0 if `at_s` is
-            given.
-        at_s: Time at which the fault happens, once, in seconds of the stream; None if `rate` is
-            given.
+        rate: Mean number of faults per second, at random; 0 if `at_s` is given.
+        at_s: Time of the single fault, in seconds of the stream; None if `rate` is given.
         duration_s: Length of the fault, s, for ``stall``, ``unplug``, ``clock_drift`` and
-            ``gather`` (these two, 0: to the end).
-        amount: Size of the fault, in the unit that `KINDS` tells; None for the default of its kind.
+            ``gather`` (for the last two, 0: to the end).
+        amount: Size of the fault, in the unit given in `KINDS`; None for the default of its kind.
     """
 
     kind: str
@@ -123,29 +121,30 @@ class Fault:
 
 
 class FaultSchedule:
-    """Which fault hits which sample; the same seed and times give the same faults."""
+    """Schedule of faults by sample; the same seed and times give the same faults."""
 
     def __init__(self, faults: tuple[Fault, ...] | list[Fault], seed: int = 0) -> None:
         self.faults = tuple(faults)
         self.random = random.Random(f"{seed} damage")
         self._draws = [random.Random(f"{seed} {k}") for k in range(len(self.faults))]
-        self._due: list[tuple[float, int]] = []  # (when, which fault), heaps
+        self._due: list[tuple[float, int]] = []  # (time, index of the fault), heaps
         self._resets: list[tuple[float, int]] = []
         for k, fault in enumerate(self.faults):
             self._plan(k, QUIET_S if fault.at_s is None else fault.at_s)
-        self._now: Fault | None = None  # lasts
+        self._now: Fault | None = None  # the fault that lasts at present
         self._until_s = 0.0
         self._left = 0  # samples that it still hits
-        self._last_s = self._reset_s = -math.inf  # the last fault but resets; the last reset
+        self._last_s = self._reset_s = -math.inf  # the last fault except resets; the last reset
 
     def at(self, t_s: float, quiet: bool = False) -> Fault | None:
-        """What hits the sample at this time; to be called once per sample, in order of time.
+        """Return the fault that hits the sample at this time, or None.
 
-        A fault that lasts is returned for each sample that it hits. Faults that fall on one
-        sample come one after the other. ``clock_drift`` is returned once, when it begins.
+        It must be called once per sample, in order of time. A lasting fault is returned for each
+        sample that it hits. Faults due at one sample hit successive samples. ``clock_drift`` is
+        returned once, when it begins.
 
         Args:
-            quiet: Whether the stream is about to end, so that nothing happens any more.
+            quiet: Whether the stream is about to end, so that no more faults happen.
         """
         if quiet or t_s < QUIET_S:
             return None
@@ -156,7 +155,7 @@ class FaultSchedule:
         self._now = None
         if self._resets and self._resets[0][0] < t_s + BESIDE_RESET_S:
             if self._resets[0][0] > t_s or t_s < self._last_s + BESIDE_RESET_S:
-                return None  # a loss just before could not be told from the restart
+                return None  # a loss just before could not be distinguished from the restart
             self._reset_s = t_s
             return self._take(self._resets)
         if t_s < self._reset_s + BESIDE_RESET_S or not self._due or self._due[0][0] > t_s:
@@ -183,68 +182,68 @@ class FaultSchedule:
 
 
 class Fate(IntEnum):
-    """What became of a sample's packet at the device's end of the line."""
+    """Fate of a sample's packet at the device's end of the line."""
 
     SENT = 0  # whole, once; also after random bytes
     DUPLICATED = 1  # whole, more than once
-    CORRUPTED = 2  # with inverted bits; on CAN, without the frames that these were in
+    CORRUPTED = 2  # with inverted bits; on CAN, without the frames that had them
     TRUNCATED = 3  # without its end
     DROPPED = 4  # not sent
-    OVERFLOWED = 5  # not sent: there was no room, the host did not read
-    UNHEARD = 6  # not sent: nobody had the port open, or the device was pulled out
+    OVERFLOWED = 5  # not sent: the queue was full, since the host did not read
+    UNHEARD = 6  # not sent: the port was not open, or the device was pulled out
 
 
 class DeviceLog:
-    """What a device did with each of its samples."""
+    """Record of the fate of each of a device's samples."""
 
     def __init__(self, kept: bool = True) -> None:
         self.counts: Counter[Fate] = Counter()
         self.duplicated = 0
-        self._kept = kept
+        self._records_each = kept
         self._seq, self._t_ns, self._fate = array("q"), array("q"), bytearray()
 
     @property
     def sent(self) -> int:
-        """Samples that the device has numbered, whatever became of them."""
+        """Number of samples that the device has numbered, whatever their fate."""
         return sum(self.counts.values())
 
     @property
     def seq(self) -> NDArray[np.int64]:
-        """(n,) the device's counter, not wrapped; it begins anew where the device does."""
+        """The device's counter, (n,), not wrapped; it restarts with the device."""
         return np.array(self._seq, np.int64)
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
-        """(n,) the device's clock, not wrapped."""
+        """The device's clock, (n,), ns, not wrapped."""
         return np.array(self._t_ns, np.int64)
 
     @property
     def fate(self) -> NDArray[np.uint8]:
-        """(n,) `Fate` of each."""
+        """The `Fate` of each sample, (n,)."""
         return np.array(self._fate, np.uint8)
 
     def add(self, seq: int, t_ns: int, fate: Fate) -> int:
-        """Write down one sample; return where, for `change`."""
+        """Record one sample; return its index for `change`."""
         self.counts[fate] += 1
-        if self._kept:
+        if self._records_each:
             self._seq.append(seq)
             self._t_ns.append(t_ns)
             self._fate.append(fate)
         return len(self._fate) - 1
 
     def change(self, at: int, old: Fate, new: Fate) -> None:
-        """What was to be sent later became something else."""
+        """Change the fate of a recorded sample that was held back."""
         self.counts[old] -= 1
         self.counts[new] += 1
-        if self._kept:
+        if self._records_each:
             self._fate[at] = new
 
 
 def damaged(packet: Packet, fault: Fault, draw: random.Random) -> tuple[Packet, Fate]:
-    """What a bit flip or a truncation leaves of a packet, and what to call it.
+    """Apply a bit flip or a truncation; return the damaged packet and its fate.
 
-    CAN has a checksum of its own: a frame with a wrong bit does not arrive. Of a packet of bytes
-    at least one is left, of frames none may be.
+    CAN has a checksum of its own: a frame with a wrong bit does not arrive. At least one byte of a
+    packet remains; of frames, none may remain.
     """
     amount = int(fault.size)
     if fault.kind == "truncate":
@@ -267,7 +266,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_faults(path: Path | str) -> FaultSchedule:
-    """Read a schedule; see the head of this module."""
+    """Read a schedule from a TOML file; see this module's docstring."""
     path = Path(path)
     file: _File = convert(read_toml(path), _File)
     if not file.fault:

@@ -1,7 +1,7 @@
 """A pseudo-terminal as a device's port: raw, named, never blocking, and it can be pulled out.
 
-What is written is heard when a line of its speed would have carried it. Sources: the frame of a
-UART (a start bit, eight bits, the lowest first, a parity bit if there is one, a stop bit); ISO
+Data arrives at the host when a line of the device's speed would have carried it. Sources: the frame
+of a UART (a start bit, eight bits, the lowest first, an optional parity bit, a stop bit); ISO
 11898-1 for the bits of a CAN frame, without stuff bits, as in docs/reference/native-protocol.md.
 """
 
@@ -25,18 +25,18 @@ from typing import Final
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 
-STANDARD, EXTENDED = 47, 67  # bits of a frame beside its data, the gap to the next one included
+STANDARD, EXTENDED = 47, 67  # bits of a frame without its data, with the gap to the next
 FD_SLOW, FD_SLOW_EXTENDED = 30, 49  # of CAN FD, at the speed of the arbitration
 FD_FAST, FD_FAST_LONG = 31, 36  # at that of the data: up to 16 bytes, and more
 LONG: Final = 16
 
 
 class Wire:
-    """A line on which one thing follows the other.
+    """Timing of a line that carries one packet after another.
 
     Attributes:
-        gather_s: Time for which an adapter gathers what has come before it hands it on, s: 1 ms by
-            USB, 16 ms by FTDI's as they are delivered.
+        gather_s: Time for which an adapter gathers input before it passes it on, s: 1 ms for USB,
+            16 ms for FTDI adapters by default.
     """
 
     def __init__(self) -> None:
@@ -44,10 +44,10 @@ class Wire:
         self._free_at = -math.inf
 
     def heard_at(self, takes_s: float, now: float) -> float:
-        """When something is at the other end that is sent now and takes so long.
+        """Return the arrival time, s, of data sent now that takes `takes_s` to send.
 
         Args:
-            now: the present, s, on a clock that never goes back.
+            now: present time, s, on a monotonic clock.
         """
         self._free_at = max(self._free_at, now) + takes_s
         if self.gather_s:
@@ -56,12 +56,12 @@ class Wire:
 
 
 def bytes_s(n: int, baud: int, parity: str = "N") -> float:
-    """The time that bytes take on a serial line, s."""
+    """Return the time that bytes take on a serial line, s."""
     return n * (10 if parity == "N" else 11) / baud
 
 
 def frames_s(frames: Sequence[CanFrame], bitrate: int, data_bitrate: int | None = None) -> float:
-    """The time that frames take on a CAN bus, s."""
+    """Return the time that frames take on a CAN bus, s."""
     slow = fast = 0
     for frame in frames:
         n = 0 if frame.remote else len(frame.data)
@@ -74,13 +74,13 @@ def frames_s(frames: Sequence[CanFrame], bitrate: int, data_bitrate: int | None 
 
 
 def misheard(data: bytes, spoken: int, heard: int) -> bytes:
-    """What a receiver makes of bytes that follow each other at another speed than its own.
+    """Return the bytes that a receiver with a wrong baud rate decodes.
 
-    It looks at the line in the middle of its own bits, from the edge of each start bit on.
+    It samples the line in the middle of its own bits, from the edge of each start bit on.
 
     Args:
-        spoken: the speed at which it is sent, bit/s.
-        heard: the speed that the receiver is set to, bit/s.
+        spoken: speed of the sender, bit/s.
+        heard: speed of the receiver, bit/s.
     """
     line = [bit for byte in data for bit in (0, *(byte >> k & 1 for k in range(8)), 1)]
     line += [1] * 20
@@ -97,29 +97,29 @@ def misheard(data: bytes, spoken: int, heard: int) -> bytes:
     return bytes(found)
 
 
-LOOK_S = 0.005  # how often a port that nobody has open is looked at
+LOOK_S = 0.005  # interval at which a port that is not open is checked
 READ_BYTES = 65_536
 ANSWER_BYTES = 1 << 20
-PIECE_S: Final = 0.001  # of what takes long on the wire, so much comes at a time
+PIECE_S: Final = 0.001  # length of the pieces in which a long packet arrives
 TCGETS2, SPEED_AT = (
     0x802C542A,
     40,
-)  # Linux: the settings of a terminal, where its speed stands there
+)  # Linux: request for a terminal's settings, offset of the speed in them
 
 
 class Pty:
-    """A pseudo-terminal, raw and without echo; `read` in one thread, all else in any.
+    """A pseudo-terminal, raw and without echo; `read` is for one thread, all else for any.
 
-    What is written is queued up to a limit and goes out as the host reads, in `read`. What the
-    host has not read when it closes the port is gone, as with a real port.
+    Written data is queued up to a limit; `read` passes it on as the host reads. Data that the host
+    has not read when it closes the port is lost, as with a real port.
 
     Args:
         link: A symbolic link that comes and goes with the terminal; None for none.
-        fifo_bytes: How many bytes are held for a host that does not read, beyond the kernel's 18
-            kB; or, on a wire, for what it has not yet carried.
-        wire: The line's speed; None: whatever is written is there at once.
-        baud: Speed at which bytes are sent, bit/s: a host with another one hears nonsense; 0: any
-            hears it.
+        fifo_bytes: Capacity of the queue for a host that does not read, in addition to the kernel's
+            18 kB; with a wire, for data that it has not yet carried.
+        wire: The line's timing; None: written data arrives at once.
+        baud: Speed at which bytes are sent, bit/s: a host with another speed receives nonsense; 0:
+            any host receives it.
     """
 
     def __init__(
@@ -136,18 +136,18 @@ class Pty:
         self.fifo_bytes = fifo_bytes
         self.lock = threading.RLock()
         self._master = -1
-        self._plugged = 0  # times; a descriptor's number may come again, this does not
-        self._fifo: deque[tuple[float, bytes]] = deque()  # when it is at the other end, and what
+        self._plugged = 0  # number of times: unique, while descriptors' numbers are reused
+        self._fifo: deque[tuple[float, bytes]] = deque()  # (time of arrival, data)
         self.queued = 0
         self._waking = (-1, -1)
 
     @property
     def name(self) -> str:
-        """What a host opens: the link, or the terminal itself."""
+        """Path that a host opens: the link, or the terminal itself."""
         return self.path if self.link is None else str(self.link.absolute())
 
     def plug(self) -> None:
-        """Appear.
+        """Create the terminal and its link.
 
         Raises:
             ConfigError: the link's name is taken, or it cannot be made.
@@ -159,7 +159,7 @@ class Pty:
             master, slave = pty.openpty()
             tty.setraw(slave)
             self.path = os.ttyname(slave)
-            os.close(slave)  # from now on a hang-up tells that nobody has it open
+            os.close(slave)  # from now on, a hang-up shows that no host has it open
             os.set_blocking(master, False)
             if self.link is not None:
                 try:
@@ -175,12 +175,12 @@ class Pty:
                 os.set_blocking(self._waking[1], False)
 
     def pull(self) -> None:
-        """Disappear; what was not read is lost."""
+        """Remove the terminal and its link; unread data is lost."""
         with self.lock:
             if self._master < 0:
                 return
             if self.link is not None and self.link.is_symlink():
-                if os.readlink(self.link) == self.path:  # else another device's by now
+                if os.readlink(self.link) == self.path:  # else it is another device's by now
                     self.link.unlink()
             os.close(self._master)
             self._master, self.heard = -1, False
@@ -189,7 +189,7 @@ class Pty:
             self.wake()
 
     def close(self) -> None:
-        """Disappear for good; safe to call twice."""
+        """Remove the terminal for good; it may be called twice."""
         with self.lock:
             self.pull()
             for end in self._waking:
@@ -198,7 +198,7 @@ class Pty:
             self._waking = (-1, -1)
 
     def write(self, data: bytes, answer: bool = False, takes_s: float = 0.0) -> bool:
-        """Queue all of these bytes, or none: nobody has it open, or there is no room.
+        """Queue all bytes; without a host or room, queue none and return False.
 
         Args:
             takes_s: The time that they take on the wire, s.
@@ -208,20 +208,20 @@ class Pty:
             if not self.heard or self.queued + len(data) > room:
                 return False
             if self._wire is not None:
-                self._delay(self._wire, data, takes_s)
+                self._queue_delayed(self._wire, data, takes_s)
                 return True
             if not self._fifo:
-                data = data[self._put(data) :]
+                data = data[self._write_now(data) :]
                 if not data:
                     return True
-                self.wake()  # the reader's thread shall now wait for room, too
+                self.wake()  # so that `read` waits for room, too
             self._fifo.append((0.0, data))
             self.queued += len(data)
             return True
 
-    def _delay(self, wire: Wire, data: bytes, takes_s: float) -> None:
+    def _queue_delayed(self, wire: Wire, data: bytes, takes_s: float) -> None:
         if not self._fifo:
-            self.wake()  # the reader's thread shall now wait for the wire, too
+            self.wake()  # so that `read` waits for the wire, too
         n = max(1, min(len(data), round(takes_s / PIECE_S)))
         edges = [k * len(data) // n for k in range(n + 1)]
         for first, last in itertools.pairwise(edges):
@@ -230,7 +230,7 @@ class Pty:
         self.queued += len(data)
 
     def gather(self, seconds: float) -> None:
-        """Let what is written wait for a multiple of so many seconds; 0: for nothing."""
+        """Delay written data to multiples of this time, s; 0: no delay."""
         with self.lock:
             if self._wire is None and seconds:
                 self._wire = Wire()
@@ -238,7 +238,7 @@ class Pty:
                 self._wire.gather_s = seconds
 
     def read(self, timeout_s: float) -> bytes:
-        """What the host has sent; meanwhile it gets what is queued."""
+        """Return data from the host, empty after the timeout; pass queued data to the host."""
         with self.lock:
             master, plugged, wake = self._master, self._plugged, self._waking[0]
             sleep_s = timeout_s if self.heard else min(timeout_s, LOOK_S)
@@ -253,7 +253,7 @@ class Pty:
         poll.register(wake, select.POLLIN)
         if master < 0:
             poll.poll(1e3 * timeout_s)
-        elif not heard:  # a hang-up would end the wait at once
+        elif not heard:  # polling `master` would return a hang-up at once
             poll.poll(1e3 * sleep_s)
         else:
             poll.register(master, mask)
@@ -266,7 +266,7 @@ class Pty:
                     pass
             if self._master < 0 or self._plugged != plugged:
                 return b""
-            return self._serve()
+            return self._exchange()
 
     def wake(self) -> None:
         """End a wait in `read`."""
@@ -275,9 +275,9 @@ class Pty:
                 try:
                     os.write(self._waking[1], b"\0")
                 except BlockingIOError:
-                    pass  # it is awake
+                    pass  # it is awake already
 
-    def _serve(self) -> bytes:
+    def _exchange(self) -> bytes:
         poll = select.poll()
         poll.register(self._master, select.POLLIN | select.POLLOUT)
         ((_, events),) = poll.poll(0) or [(0, 0)]
@@ -290,7 +290,7 @@ class Pty:
             now = time.monotonic()
             while self._fifo and self._fifo[0][0] <= now:
                 due, data = self._fifo.popleft()
-                done = self._put(data)
+                done = self._write_now(data)
                 self.queued -= done
                 if done < len(data):
                     self._fifo.appendleft((due, data[done:]))
@@ -302,18 +302,18 @@ class Pty:
         except OSError:
             return b""
 
-    def _put(self, data: bytes) -> int:
-        heard = _speed(self._master) if self._baud else 0
+    def _write_now(self, data: bytes) -> int:
+        heard = _read_speed(self._master) if self._baud else 0
         try:
             if heard and heard != self._baud:
                 os.write(self._master, misheard(data, self._baud, heard))
                 return len(data)
             return os.write(self._master, data)
-        except OSError:  # no room, or nobody there
+        except OSError:  # no room, or no host
             return 0
 
     def _hang_up(self) -> None:
-        """The host has gone: the next one shall not find what was meant for it."""
+        """Discard the data for a host that has closed the port."""
         self.heard = False
         self._fifo.clear()
         self.queued = 0
@@ -332,13 +332,13 @@ class Pty:
         if self.link is None or not (self.link.is_symlink() or self.link.exists()):
             return
         if self.link.is_symlink() and not self.link.exists():
-            self.link.unlink()  # left by a device that is no more
+            self.link.unlink()  # left by a device that no longer exists
             return
         raise ConfigError(f"{self.link} is there already: name another link, or remove it")
 
 
-def _speed(master: int) -> int:
-    """The speed that the host has set the terminal to, bit/s; 0 where that cannot be told."""
+def _read_speed(master: int) -> int:
+    """Return the speed to which the host has set the terminal, bit/s; 0 if unknown."""
     if not sys.platform.startswith("linux"):
         return 0
     try:

@@ -1,4 +1,4 @@
-"""An emulated device: how it fits, numbers, times and encodes samples, and what goes wrong."""
+"""Transmitter of an emulated device: fits, numbers, dates and encodes samples, with faults."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,14 +18,14 @@ from tactile_rt.drivers.emulation.faults import (
     damaged,
 )
 
-SAME = 1e-3  # relative: rates that differ by less are one
+SAME = 1e-3  # relative difference below which rates count as equal
 
 
 class Transmitter:
-    """Samples to packets to an endpoint, with faults on the way; in one thread at a time.
+    """Encodes and sends samples to an endpoint, with faults; one thread at a time.
 
     Attributes:
-        end_ns: Time at which the stream ends, on the source's clock, ns; nothing goes wrong just
+        end_ns: Time at which the stream ends, on the source's clock, ns; no fault happens just
             before.
     """
 
@@ -45,27 +45,27 @@ class Transmitter:
         self.end_ns: float = np.inf
         self._gathers_until_ns: float = np.inf
         self.away = False
-        self._held: list[tuple[int, Any, Fate]] = []  # while nothing gets through
+        self._stalled: list[tuple[int, Any, Fate]] = []  # packets held back during a stall
 
     def begin(self, t_ns: int) -> None:
-        """The first sample is of this time, on the source's clock."""
+        """Set the time of the first sample, on the source's clock."""
         self._first_ns = t_ns
         self._clock.begin(t_ns)
 
     def finish(self) -> None:
-        """Nothing follows: plug in, send what is held back."""
-        self._pull_out(False)
+        """End the stream: plug in, and send the packets held back."""
+        self._set_away(False)
         self._release()
 
     def restart(self, t_ns: int | None = None) -> None:
-        """Counter and clock begin anew, the clock at this moment of the source's."""
+        """Restart counter and clock at zero, the clock at this moment of the source's clock."""
         self._count = 0
         self._clock.restart(t_ns)
 
     def look(self, t_ns: int) -> None:
-        """Time passes without a sample to send: it may come back."""
-        hit = self._hit(t_ns)
-        self._pull_out(hit is not None and hit.kind == "unplug")
+        """Advance to a time without a sample, at which the plug may change."""
+        hit = self._apply_fault(t_ns)
+        self._set_away(hit is not None and hit.kind == "unplug")
 
     def send(self, piece: Chunk) -> None:
         """Number, time, encode and send these samples."""
@@ -78,7 +78,7 @@ class Transmitter:
         else:
             seq, t_ns = np.empty(n, np.int64), np.empty(n, np.int64)
             for i in range(n):
-                hits[i] = self._hit(int(piece.t_ns[i]))
+                hits[i] = self._apply_fault(int(piece.t_ns[i]))
                 seq[i] = self._count
                 t_ns[i] = self._clock.at(piece.t_ns[i : i + 1])[0]
                 self._count += 1
@@ -88,8 +88,8 @@ class Transmitter:
         ):
             self._emit(number, now, packet, hit)
 
-    def _hit(self, t_ns: int) -> Fault | None:
-        """What hits the sample of this time; clock and counter are changed at once."""
+    def _apply_fault(self, t_ns: int) -> Fault | None:
+        """Return the fault of this time, applied to clock, counter and adapter at once."""
         assert self._faults is not None
         elapsed_s = (t_ns - self._first_ns) / NS_PER_S
         quiet = t_ns > self.end_ns - QUIET_S * NS_PER_S
@@ -115,36 +115,36 @@ class Transmitter:
 
     def _emit(self, seq: int, t_ns: int, packet: Any, hit: Fault | None) -> None:
         kind = "" if hit is None else hit.kind
-        if kind != "stall" and self._held:
+        if kind != "stall" and self._stalled:
             self._release()
-        self._pull_out(kind == "unplug")
+        self._set_away(kind == "unplug")
         if hit is None:
-            self._log.add(seq, t_ns, self._put(packet, Fate.SENT))
+            self._log.add(seq, t_ns, self._send_packet(packet, Fate.SENT))
         elif kind in ("bit_flip", "truncate"):
             assert self._faults is not None
             packet, fate = damaged(packet, hit, self._faults.random)
-            self._log.add(seq, t_ns, self._put(packet, fate))
+            self._log.add(seq, t_ns, self._send_packet(packet, fate))
         elif kind == "duplicate":
-            fate = self._put(packet, Fate.SENT)
+            fate = self._send_packet(packet, Fate.SENT)
             for _ in range(int(hit.size) if fate == Fate.SENT else 0):
-                if self._put(packet, Fate.DUPLICATED) == Fate.DUPLICATED:
+                if self._send_packet(packet, Fate.DUPLICATED) == Fate.DUPLICATED:
                     fate = Fate.DUPLICATED
                     self._log.duplicated += 1
             self._log.add(seq, t_ns, fate)
         elif kind in ("drop", "unplug"):
             self._log.add(seq, t_ns, Fate.DROPPED if kind == "drop" else Fate.UNHEARD)
         elif kind == "stall":
-            self._held.append((self._log.add(seq, t_ns, Fate.SENT), packet, Fate.SENT))
+            self._stalled.append((self._log.add(seq, t_ns, Fate.SENT), packet, Fate.SENT))
         else:
             if kind == "burst":
                 assert self._faults is not None
                 self._endpoint.disturb(int(hit.size), self._faults.random)
             elif kind == "can_error":
                 self._endpoint.error(int(hit.size))
-            self._log.add(seq, t_ns, self._put(packet, Fate.SENT))
+            self._log.add(seq, t_ns, self._send_packet(packet, Fate.SENT))
 
-    def _pull_out(self, away: bool) -> None:
-        """What the schedule says of the plug."""
+    def _set_away(self, away: bool) -> None:
+        """Pull the device out or plug it in, as scheduled."""
         if away == self.away:
             return
         self.away = away
@@ -154,45 +154,45 @@ class Transmitter:
             self._endpoint.plug()
             self._endpoint.wake()
 
-    def _put(self, packet: Any, fate: Fate) -> Fate:
+    def _send_packet(self, packet: Any, fate: Fate) -> Fate:
         if self._endpoint.send(packet):
             return fate
         return Fate.OVERFLOWED if self._endpoint.heard else Fate.UNHEARD
 
     def _release(self) -> None:
-        """Send what a stall held back."""
-        for at, packet, fate in self._held:
-            became = self._put(packet, fate)
-            if became != fate:
-                self._log.change(at, fate, became)
-        self._held.clear()
+        """Send the packets that a stall held back."""
+        for at, packet, fate in self._stalled:
+            actual = self._send_packet(packet, fate)
+            if actual != fate:
+                self._log.change(at, fate, actual)
+        self._stalled.clear()
 
 
 class EmulatedClock:
-    """The device's clock: the source's time to device time, with drift, jumps and restarts.
+    """The device's clock, which converts source time to device time with drift and jumps.
 
     Args:
-        start_ns: Device time when the first sample is taken, ns.
-        drift_ppm: How much faster than true the clock runs, parts per million.
+        start_ns: Device time of the first sample, ns.
+        drift_ppm: Excess speed of the clock, parts per million.
         wrap_ns: Device time at which the clock wraps on the wire, ns.
     """
 
     def __init__(self, start_ns: int, drift_ppm: float, wrap_ns: int) -> None:
-        self._here, self._there = 0, start_ns  # the same moment on both clocks
+        self._source_ns, self._device_ns = 0, start_ns  # the same moment on both clocks
         self._base_ppm = self._ppm = drift_ppm
         self._wrap_ns = wrap_ns
         self._drift_ends: float = np.inf
 
     def begin(self, t_ns: int) -> None:
-        """The first sample is taken now."""
-        self._here = t_ns
+        """Set the source time of the first sample."""
+        self._source_ns = t_ns
 
     def at(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """(n,) device time, ns, not wrapped."""
-        passed = t_ns - self._here
+        """Return (n,) device times, ns, not wrapped."""
+        passed = t_ns - self._source_ns
         if self._ppm == 0.0:
-            return self._there + passed
-        return self._there + passed + np.round(passed * (self._ppm * 1e-6)).astype(np.int64)
+            return self._device_ns + passed
+        return self._device_ns + passed + np.round(passed * (self._ppm * 1e-6)).astype(np.int64)
 
     def look(self, t_ns: int) -> None:
         """End a drift that is over."""
@@ -201,31 +201,31 @@ class EmulatedClock:
             self._ppm, self._drift_ends = self._base_ppm, np.inf
 
     def drift(self, t_ns: int, ppm: float, duration_s: float) -> None:
-        """Run so much fast from now on; a duration of 0 is for ever."""
+        """Set the drift, ppm, from now on for this duration, s; 0: until the end."""
         self._anchor(t_ns)
         self._ppm = ppm
         self._drift_ends = t_ns + duration_s * NS_PER_S if duration_s else np.inf
 
     def jump(self, t_ns: int, by_ns: int) -> None:
-        """Leap now."""
+        """Step the clock now, by a positive or negative time."""
         self._anchor(t_ns)
-        self._there += by_ns
-        while self._there < 0:
-            self._there += self._wrap_ns  # on the wire that is the same
+        self._device_ns += by_ns
+        while self._device_ns < 0:
+            self._device_ns += self._wrap_ns  # which is the same on the wire
 
     def restart(self, t_ns: int | None) -> None:
-        """Begin anew at this moment of the source's; None: at the last one that is known."""
+        """Restart at zero at this source time; None: at the last known time."""
         if t_ns is not None:
-            self._here = t_ns
-        self._there = 0
+            self._source_ns = t_ns
+        self._device_ns = 0
 
     def _anchor(self, t_ns: int) -> None:
-        self._there = int(self.at(np.array([t_ns]))[0])
-        self._here = t_ns
+        self._device_ns = int(self.at(np.array([t_ns]))[0])
+        self._source_ns = t_ns
 
 
 class RateConverter:
-    """Samples a source at the rate at which the device does: the newest sample at each moment.
+    """Samples a source at the device's rate, with the newest sample at each moment.
 
     Args:
         source_hz: rate of the source, Hz.
@@ -238,7 +238,7 @@ class RateConverter:
         self._last: Chunk | None = None
 
     def at_rate(self, chunk: Chunk) -> Chunk | None:
-        """A chunk as the device samples it; None if none of its moments is in it."""
+        """Return a chunk at the device's rate; None if no sample is due in it."""
         spec = self._codec.spec
         assert spec is not None
         rate_hz = self._codec.commanded_hz or spec.rate_hz
@@ -256,7 +256,7 @@ class RateConverter:
         self._next_ns = float(at[-1] + period_ns)
         t_ns = np.round(at).astype(np.int64)
         before = self._last
-        if before is not None:  # the newest of the last chunk is still the newest
+        if before is not None:  # the last sample of the previous chunk may still be the newest
             chunk = Chunk(
                 np.append(before.seq[-1:], chunk.seq), np.append(before.t_ns[-1:], chunk.t_ns),
                 np.append(before.values[-1:], chunk.values, 0),
@@ -270,11 +270,11 @@ class RateConverter:
 
 
 def fit(source: ArraySpec, device: ArraySpec) -> Callable[[Chunk], Chunk]:
-    """Make a source's chunks those of a device's spec.
+    """Return a function that converts a source's chunks to a device's spec.
 
-    The device's elements are the source's first ones, in order; those beyond are invalid. Its
-    channels are those of the same name, or, if no name is the same, those in the same place;
-    others are 0. Values pass as they are, whatever the unit.
+    The device's elements are the first of the source, in order; further ones are invalid. Its
+    channels are those of the same name, or, if no name matches, those in the same place; others are
+    0. Values are not converted, whatever the unit.
     """
     if source.shape == device.shape and source.channels == device.channels:
         return lambda chunk: chunk
@@ -285,11 +285,11 @@ def fit(source: ArraySpec, device: ArraySpec) -> Callable[[Chunk], Chunk]:
     taken = [columns[i] for i in into]
     n = min(len(source.elements), len(device.elements))
 
-    def fitted(chunk: Chunk) -> Chunk:
+    def fit_chunk(chunk: Chunk) -> Chunk:
         values = np.zeros((len(chunk), *device.shape), np.float32)
         values[:, :n, into] = chunk.values[:, :n, taken]
         valid = np.zeros(values.shape[:2], np.bool_)
         valid[:, :n] = chunk.valid[:, :n]
         return Chunk(chunk.seq, chunk.t_ns, values, valid)
 
-    return fitted
+    return fit_chunk
