@@ -84,7 +84,9 @@ def read_named_npz(path: Path, selection: Selection | None = None) -> list[Neura
 def read_spike_tables(
     paths: Sequence[Path], selection: Selection | None = None
 ) -> list[NeuralSession]:
-    """Read a table of spikes and one of events; rates count from an event's start to its stop.
+    """Read sessions of a table of spikes and a table of events.
+
+    Rates count from an event's start to its stop.
 
     Raises:
         ConfigError: a column or a value that cannot be, by its row; sessions without any spike

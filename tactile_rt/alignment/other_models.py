@@ -92,7 +92,9 @@ def other_onnx_layers(path: Path, stimuli: StimuliInput, input_name: str = "") -
 
 
 def module_layers(reference: str, stimuli: StimuliInput) -> Layers:
-    """Run a torch module on the six stimuli and return the outputs of its modules with weights.
+    """Run a torch module on the six stimuli and return its layers.
+
+    A layer is the output of a module with weights of its own.
 
     Args:
         reference: ``module:function``; the function, without arguments, makes a module that takes
@@ -217,7 +219,7 @@ def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
 
 
 def _name_layer(weight: str, node: onnx.NodeProto, taken: Collection[str]) -> str:
-    """Name a layer by its weight, or by its node where an exporter made that name up."""
+    """Name a layer by its weight; by its node if an exporter made up that name."""
     name = weight if weight and not NUMBERED.fullmatch(weight) else node.name.rpartition("/")[0]
     name = re.sub(r"\.?(weight\w*|kernel|W)$", "", name.strip("/").replace("/", "."))
     name = f"encoder.{name or node.op_type.lower()}"
@@ -252,7 +254,7 @@ def _layers(
 
 
 def _by_step(value: NDArray[Any], samples: int) -> NDArray[Any]:
-    """(1, sample, unit...) or (sample, 1, unit...) -> (step, unit); else one step of all units."""
+    """Arrange a layer's output as (step, unit): by its axis of samples, else one step."""
     if value.ndim > 2 and value.shape[:2] in ((1, samples), (samples, 1)):
         return value.reshape(samples, -1)
     return value.reshape(1, -1)

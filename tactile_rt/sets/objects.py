@@ -146,9 +146,10 @@ def holds_out_sweeps(manifest: SweepManifest) -> bool:
 def _choose_sweeps(
     path: Path, manifest: SweepManifest, split: str, sweeps: int
 ) -> NDArray[np.bool_]:
-    """Choose (sweep,) of an object what belongs to a split: of training objects some are held out.
+    """Choose which sweeps of an object belong to a split, (sweep,).
 
-    Held out are the draws beyond the recipe's own, or as many as it says, drawn for each object.
+    Of training objects the draws beyond the recipe's own are held out, or as many as it says, drawn
+    for each object.
     """
     chosen = np.ones(sweeps, dtype=np.bool_)
     if split not in ("train", NEW_SWEEPS) or not holds_out_sweeps(manifest):

@@ -210,7 +210,7 @@ class Due:
 
 
 def repeat_messages(view: View) -> list[Message]:
-    """Make those that are sent again and again: the arrays that are open, and the state."""
+    """Make the messages that are sent repeatedly: the open arrays, and the state."""
     arrays = [m for m in map(message_of, view.streams().values()) if m is not None]
     return [*arrays, state_message(view.snapshot())]
 
