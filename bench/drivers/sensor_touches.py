@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.opening import make_codec
 
-__all__ = ["KINDS", "RESTS_S", "SENSORS", "TAUGHT", "Drawing", "draw_touches"]
-
 TAUGHT, TESTED, STRANGE = 10, 20, 10  # touches of a kind
 SPEED = 0.35  # of its logarithm, either way
 WAIT_S = 1.0, 1.5  # between touches

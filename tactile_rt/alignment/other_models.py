@@ -219,7 +219,7 @@ def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
 
 
 def _name_layer(weight: str, node: onnx.NodeProto, taken: Collection[str]) -> str:
-    """Name a layer by its weight; by its node if an exporter made up that name."""
+    """Name a layer by its weight, or by its node if that name is a number."""
     name = weight if weight and not NUMBERED.fullmatch(weight) else node.name.rpartition("/")[0]
     name = re.sub(r"\.?(weight\w*|kernel|W)$", "", name.strip("/").replace("/", "."))
     name = f"encoder.{name or node.op_type.lower()}"

@@ -10,8 +10,6 @@ import typer
 from tactile_rt import cli
 from tactile_rt.cli.app import app
 
-__all__ = ["commands", "options_of"]
-
 
 def commands() -> dict[str, Any]:
     """Each command by its words, as ``model show``."""

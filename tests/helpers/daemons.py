@@ -6,8 +6,6 @@ from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.loading import load_config
 
-__all__ = ["load_checked", "running_daemon"]
-
 
 def load_checked(folder, text):
     """Write robot.toml into a folder, load it and check it."""

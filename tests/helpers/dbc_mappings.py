@@ -1,7 +1,5 @@
 """Mappings of DBC files for codec can-dbc."""
 
-__all__ = ["map_signal"]
-
 
 def map_signal(dbc, channel, signal):
     """Return the TOML text that maps one signal, in N, to an array of one element."""

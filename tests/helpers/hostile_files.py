@@ -8,8 +8,6 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable
 
-__all__ = ["DBCS", "MCAPS", "MESHES"]
-
 GIB = 1 << 30
 
 # MCAP: a recording's beginning, as ours are written, and then what none has

@@ -9,8 +9,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from tests.helpers.tiny_model import write_model
 
-__all__ = ["BURNERS", "GREEDY", "SHAPED", "UNSOUND", "no_number", "write_burdened"]
-
 Burden = Callable[[list[onnx.NodeProto], list[onnx.TensorProto]], str]
 
 

@@ -6,8 +6,6 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.drivers.opening import make_codec
 
-__all__ = ["KINDS", "RATE_HZ", "felt", "touch", "wrench_spec"]
-
 KINDS = ("press", "slide", "double")
 RATE_HZ = 100.0
 NOISE = np.array([0.04] * 3 + [8e-4] * 3)

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-__all__ = ["Measured", "measured"]
-
 # A process inherits the peak of who started it: a small one starts the command.
 LAUNCHER = """
 import json, resource, subprocess, sys

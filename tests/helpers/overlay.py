@@ -13,8 +13,6 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Changed", "changes"]
-
 SHORT = 1 << 20  # bytes of a file that are compared; of longer ones the length is
 
 

@@ -7,8 +7,6 @@ from typing import Any
 import draccus
 from lerobot.robots.config import RobotConfig
 
-__all__ = ["TactileConfig"]
-
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 LONGEST = 100  # samples in an observation
 

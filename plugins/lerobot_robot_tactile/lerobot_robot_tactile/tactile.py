@@ -18,8 +18,6 @@ from tactile_rt.core.stream import Chunk, EndOfStream
 from tactile_rt.recording import StreamWriter
 from tactile_rt.sources.opening import open_source
 
-__all__ = ["Sensor", "Tactile"]
-
 POLL_S = 0.05
 FIRST_S = 10.0  # until a sensor's first sample
 PERIODS, LEAST_AGE_S = 3, 0.1  # the age limit where none is given
