@@ -197,7 +197,7 @@ class SourcePart(Part):
             return True
         if self._away:
             if not self._left:
-                self._turn("stopped", "while it waited for its device")
+                self._change_state("stopped", "while it waited for its device")
                 self._left = True  # what its thread still does is no longer told
                 self._tell_closed()
             return True
@@ -244,7 +244,7 @@ class SourcePart(Part):
         self._announced = True
         self._busy_ns = time.monotonic_ns()
         self._announce(stream)
-        self._up()
+        self._report_running()
         self._pause_ns = round(NS_PER_S * oldest_s(self.limits, stream.spec.rate_hz))
         take = partial(self._take, stream)
         with suppress(EndOfStream):
@@ -301,9 +301,9 @@ class SourcePart(Part):
                 self._announced = False
                 self._hub.post(Closed(self.config.name, time.monotonic_ns()))
 
-    def _turn(self, state: str, reason: str) -> None:
+    def _change_state(self, state: str, reason: str) -> None:
         if not self._left:  # else its end has been told
-            super()._turn(state, reason)
+            super()._change_state(state, reason)
 
     def _open(self) -> Source:
         self._opening = True
