@@ -124,7 +124,7 @@ class ContactDetector:
 
     @property
     def moves(self) -> bool:
-        """True if the baseline's samples wander, as those of a touch do and noise does not."""
+        """True if the baseline's samples wander, as in a touch but not in noise."""
         samples = np.array([sample for _, sample, _ in self._baseline])
         steps = np.square(np.diff(samples, axis=0)).mean(axis=0) / 2  # of white noise, the variance
         known = self._count == len(samples)
@@ -162,7 +162,7 @@ class ContactDetector:
             self._rest, self._slope = RestLevels(), Drift()
             # Samples before the onset are now known to be quiet, and join the baseline.
             self._grow_baseline(max(FIRST_GUARD_SAMPLES, int(self._suspicious_for[certain].max())))
-            self.doubted = len(self._pending) + 1  # with the first above its threshold
+            self.doubted = len(self._pending) + 1  # plus the first above its threshold
             self._pending.clear()
         elif self.contact:
             self._quiet_for = 0 if (excess > RELEASE).any() else self._quiet_for + 1

@@ -152,7 +152,7 @@ ESTIMATES = {"straight": straight, "resting": resting, "bent": bent}
 
 
 def _find_nearest(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats]:
-    """Find the least |M - r x F|^2 (n,) on segments (n, 3), and where along them (0 to 1)."""
+    """Find the least |M - r x F|^2 (n,) on segments, and where along them."""
     force, moment = loads[:, :3], loads[:, 3:]
     missing, gained = moment - np.cross(near, force), np.cross(far - near, force)
     squared = np.maximum((gained**2).sum(axis=1), np.finfo(float).tiny)

@@ -219,8 +219,8 @@ class Deadline:
         limit_s: greatest backlog, and greatest age of a step's newest sample, s.
         policy: how to treat a late decision. ``count``: return, mark and count it; ``report``:
             also log the first of an episode as a warning; ``skip``: count and withhold it, so that
-            a robot does not act on it. The network takes every step in any case: without it, later
-            decisions would be about another signal.
+            a robot does not act on it. The network takes every step in any case: with one left out,
+            later decisions would be about another signal.
         age: returns the present age, s, of the sample of a stream time (ns); None: not live.
 
     Attributes:

@@ -314,7 +314,7 @@ def rated_noise(card: ModelCard) -> NDArray[np.float32]:
 
 
 def sensor_of(card: ModelCard) -> SensorSpec | None:
-    """Return the sensor that a model was made for, or None if the card lacks it."""
+    """Return the sensor that a model was made for, or None if unknown."""
     try:
         return msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
     except (ConfigError, msgspec.ValidationError):

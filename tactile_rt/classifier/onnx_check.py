@@ -55,7 +55,7 @@ INT64 = 7
 
 
 class BadModel(Exception):
-    """The bytes are no model that may be opened; the message says why in one line."""
+    """The bytes are no model that may be opened; the message is one line."""
 
 
 @dataclass

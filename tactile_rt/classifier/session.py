@@ -20,7 +20,7 @@ POLL_S = 0.1  # how soon a reader thread notices that it should stop
 
 
 class Session:
-    """A classifier that runs on a source; iterates over chunks with their decisions.
+    """A classifier on a source; iterate over it for chunks with their decisions.
 
     Args:
         source: the source of samples; the session closes it.
