@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-ADMISSION = "tactile-rt admission"  # the thread that loads a model: do not end it within that
+ADMISSION = "tactile-rt admission"  # the thread that loads a model; must not be ended meanwhile
 CONFIG_VERSION = 1
 
 NAME = "name: letters, digits, - and _, 64 at most"
@@ -34,9 +34,9 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
     Attributes:
         array: A file that describes the source's array, as `tactile-rt describe` writes it, or an
             ``.onnx`` model, for the array that it was made for; empty: as the URL says.
-        stuck_at_s: Time without a change of any value that counts as a stuck-at fault, s; 0: it
-            follows from the noise that the model, the tare or the stream states, else no time does,
-            as a coarse sensor at rest does not change either.
+        stuck_at_s: Time without a change of any value that counts as a stuck-at fault, s; 0: from
+            the noise, if the model, the tare or the stream determines it; otherwise never, as a
+            coarse sensor at rest does not change either.
     """
 
     name: Name

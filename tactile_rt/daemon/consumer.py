@@ -47,8 +47,8 @@ class View(Protocol):
         """Return UTC less host monotonic time, now, ns."""
 
     def silent(self) -> Mapping[str, float]:
-        """Return the duration of the current turn of each critical thread, s. They are ``main``,
-        ``watch``, ``source.NAME``, ``model.NAME``; 0 for a thread that waits for work."""
+        """Return the duration of each critical thread's current turn, s. The threads are ``main``,
+        ``watch``, ``source.NAME`` and ``model.NAME``; 0 for a thread that waits for work."""
 
 
 class Consumer(abc.ABC):
@@ -109,7 +109,7 @@ class Consumer(abc.ABC):
 
 
 class ConsumerPart(Part):
-    """The part that runs a consumer in a thread of its own, fed from a mailbox."""
+    """The part that runs a consumer in its own thread, fed from a mailbox."""
 
     def __init__(
         self,

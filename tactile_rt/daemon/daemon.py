@@ -236,7 +236,7 @@ class Daemon:
         self._turns.take(name)
 
     def silent(self) -> Mapping[str, float]:
-        """Return the duration of the current turn of each critical thread, s."""
+        """Return the duration of each critical thread's current turn, s."""
         return {
             **({} if self._stopping else self._turns.silent()),
             **{p.name: p.silent_s for p in self._sources.copy().values()},

@@ -414,5 +414,5 @@ def parse_head(head: bytes) -> Request:
 
 
 def _encode_chunk(data: bytes) -> bytes:
-    """Encode a piece of a stream; an empty piece gives nothing, as it would end the stream."""
+    """Encode a piece of a stream. An empty piece gives nothing, as it would end the stream."""
     return b"%x\r\n%b\r\n" % (len(data), data) if data else b""

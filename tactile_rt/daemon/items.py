@@ -16,8 +16,7 @@ class Opened:
     """A source has been opened, or opened again; its samples and packets follow.
 
     Attributes:
-        stream: The opened source, for `health`, `stats` and its description; never read or close
-            it.
+        stream: The opened source, for `health`, `stats` and description; never read or close it.
         accepted: Whether it is the array that the source began with; models receive no other.
         prelude: The (packet, arrival in ns) pairs that a device sent while it was started, in which
             it describes itself. The same packets also come as `Packet` items.

@@ -27,8 +27,8 @@ class Ledger:
             self._lost = self._lost[0] + samples, time.monotonic_ns(), why
 
     def settle(self) -> list[tuple[RecordingWriter, int, int]]:
-        """Close the account of finished files; return those whose last sync failed, with the
-        samples and packets that it lost. The caller counts these."""
+        """Settle finished files; return those whose last sync failed, and what each lost. The
+        caller counts these samples and packets."""
         past, files = self._now
         done = tuple(file for file in files if file.done)
         failed = [(f, *f.disown(f.synced)) for f in done if f.failed is not None]

@@ -55,7 +55,7 @@ class Mailbox(BoundedQueue[Item]):
 
 class Hub:
     """The distribution of items to mailboxes; any thread may post. Posting takes only the locks of
-    mailboxes, but for `Opened` and `Closed`."""
+    mailboxes, except for `Opened` and `Closed`."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

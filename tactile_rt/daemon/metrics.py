@@ -76,7 +76,7 @@ class Metrics(Consumer):
     async def _answer(self, request: Request) -> Response:
         if request.method != "GET":
             raise Refused(405, "only GET", {"allow": "GET"})
-        # DNS rebinding: a foreign page's name may resolve to this address, for use in a browser.
+        # DNS rebinding: a foreign site may point its name at this address, and query from its page.
         if is_loopback(self._config.host) and not _is_own(request.headers.get("host", "localhost")):
             raise Refused(403, "this is served to its own computer, under localhost, only")
         if request.path == "/metrics":

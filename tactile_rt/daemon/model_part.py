@@ -49,7 +49,7 @@ class ModelPart(Part):
         self._opened: Opened | None = None
         self._classifier: Classifier | None = None
         self._refused: tuple[object, TactileError] | None = None
-        self._trial: tuple[tuple[int, ...], Trial | None] = (), None  # with the file's stamp
+        self._trial: tuple[tuple[int, ...], Trial | None] = (), None  # file's stamp and trial
         self._wanted: deque[ModelConfig] = deque()  # replacements that were requested
         self._next: Admission | None = None
         self._ready_at = 0.0
@@ -243,7 +243,7 @@ class ModelPart(Part):
         self._report(self.name, "admitted", f"{new.words}{late}")
 
     def _can_take_over(self, new: Classifier, came: bool, waited: float) -> bool:
-        """Return whether a new model may take over: without a touch, with a baseline."""
+        """Return whether a new model, with a baseline, may take over between touches."""
         old = self._classifier
         if old is None:
             return True

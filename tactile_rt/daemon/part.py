@@ -25,7 +25,7 @@ class Report(Protocol):
 
 
 class Part(abc.ABC):
-    """A part of the daemon: work in a thread of its own, restarted when it breaks."""
+    """A part of the daemon: work in its own thread, restarted when it breaks."""
 
     def __init__(self, name: str, report: Report, limits: LimitsConfig) -> None:
         self.name, self.limits = name, limits

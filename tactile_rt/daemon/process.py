@@ -49,8 +49,9 @@ class ExitCode(IntEnum):
 
 
 def note_signals() -> None:
-    """Note signals from now on, so that they end the process only through `run_daemon`, which obeys
-    earlier ones, too. This stays so, lest a signal ends the process while Python shuts down."""
+    """Note signals from now on, so that only `run_daemon` obeys them, earlier ones included.
+
+    This stays so to the end, lest a signal ends the process while Python shuts down."""
     for number in SIGNALS:
         signal.signal(number, lambda number, frame: _noted.put(number))
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # log rotators send it; see `Log`

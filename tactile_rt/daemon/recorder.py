@@ -50,7 +50,7 @@ from tactile_rt.recording.writer import RecordingWriter
 
 FLUSH_S = 0.4  # with the gathering, well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
-PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # after each failure; until it counts as mended
+PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # per failure, at most; for a file to be steady
 SLOW_S = 2.0  # beyond two sync periods, after which a medium is slow, not just briefly busy
 RING_BYTES = 64 << 20  # of each source, before a trigger
 EVER_NS = 1 << 62

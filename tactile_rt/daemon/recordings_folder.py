@@ -15,7 +15,7 @@ from tactile_rt.recording.writer import PART
 
 STALE_S = 3600.0  # a file that is being begun gets its name long before
 MB = 1e6
-EVERY_S, POINTS, LEAST_S = 5.0, 120, 60.0  # its rate is measured over ten minutes at most
+EVERY_S, POINTS, LEAST_S = 5.0, 120, 60.0  # the rate of filling, over ten minutes at most
 HOURS = (0.25, 0.5, 1, 2, 3, 6, 12, 24)
 
 

@@ -54,7 +54,7 @@ class _Lent:
 
 
 class Acquisition:
-    """The reading of lent sources, in a thread that runs while any source is lent."""
+    """The reader of lent sources, in a thread that runs while any source is lent."""
 
     def __init__(self) -> None:
         self._reader = Reader()
@@ -205,7 +205,7 @@ class SourcePart(Part):
 
     @property
     def _away(self) -> bool:
-        """True if it waits for a device that does not answer, or has not begun to send."""
+        """True if it waits for a device that does not answer or send yet."""
         device = self._device
         return self._opening or (
             device is not None and device.health.state in (State.CONNECTING, State.LOST)
@@ -295,7 +295,7 @@ class SourcePart(Part):
             self._post_closed()
 
     def _post_closed(self) -> None:
-        """Post `Closed` once, as another part may have opened that source later."""
+        """Post `Closed` only once: another part may have opened that source since."""
         with self._closing:
             if self._announced:
                 self._announced = False
@@ -354,7 +354,7 @@ class SourcePart(Part):
         self._report(self.name, f"device:{health.state}", _describe_changes(health, before), level)
 
     def _await_room(self) -> None:
-        """Wait for room in all mailboxes, before more is read of a waiting source."""
+        """Wait for room in all mailboxes, for a source that waits for its reader."""
         for box in self._hub.wanted(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))

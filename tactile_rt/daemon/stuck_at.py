@@ -4,10 +4,10 @@ A sensor whose noise is above its resolution cannot give the same values twice; 
 gives the same values for as long as it rests. So equal samples are a fault only if the noise is
 known, or if a limit of time is configured.
 
-Without a description of the noise, it is known from readings that differ from the one before in
-three cases of four, in the tare, at rest before a lesson or in each half minute of the stream.
-Noise above a step of the resolution does so. A quarter of it, once motors stop, still changes one
-reading of ten at any level.
+Without a description, noise is inferred if readings differ from the one before in three cases of
+four, in the tare, at rest before a lesson or in each half minute of the stream. Noise above a step
+of the resolution does so. A quarter of it, once motors stop, still changes one reading of ten at
+any level.
 """
 
 import math

@@ -9,7 +9,7 @@ from statistics import median
 
 from tactile_rt.daemon.states import Diagnostic
 
-EVERY_S, KEPT, FEWEST = 20.0, 90, 10  # for half an hour; in a third of it
+EVERY_S, KEPT, FEWEST = 20.0, 90, 10  # per value; for half an hour; in a third of it
 SOON_H = 24.0
 LATER, LATE_MS = 3.0, 5.0  # times the earlier delay, and least delay
 MB = 1e6

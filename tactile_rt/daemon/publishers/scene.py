@@ -129,7 +129,7 @@ class Scene:
 
 
 def force_columns(spec: ArraySpec) -> dict[int, int]:
-    """Return the channels of the forces that an array measures in N, by axis (0: x)."""
+    """Return the channels of an array's forces in N, by axis (0: x)."""
     return {
         axis: spec.channels.index(name)
         for axis, name in enumerate(FORCES)

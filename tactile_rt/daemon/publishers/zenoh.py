@@ -105,7 +105,7 @@ class ZenohPublisher(Sender):
 
     def _make_config(self) -> Any:
         options = self._options
-        settings: dict[str, Any] = {
+        own: dict[str, Any] = {
             "listen/endpoints": list(options.listen),
             "connect/endpoints": list(options.connect),
             "scouting/multicast/enabled": options.scouting,
@@ -115,18 +115,16 @@ class ZenohPublisher(Sender):
                 config = zenoh.Config.from_file(options.config_file)
                 # The file's settings stay, unless an option here differs from its default.
                 default = ZenohOptions()
-                settings = {
+                own = {
                     key: value
-                    for key, value in settings.items()
+                    for key, value in own.items()
                     if getattr(options, key.split("/")[0]) != getattr(default, key.split("/")[0])
                 }
             else:
                 config = zenoh.Config()
                 # A peer that is away is retried for ever, without blocking anything else.
-                settings |= {
-                    "mode": "peer", "connect/timeout_ms": -1, "connect/exit_on_failure": False,
-                }  # fmt: skip
-            for key, value in settings.items():
+                own |= {"mode": "peer", "connect/timeout_ms": -1, "connect/exit_on_failure": False}
+            for key, value in own.items():
                 config.insert_json5(key, msgspec.json.encode(value).decode())
         except (zenoh.ZError, OSError) as error:
             raise ConfigError(f"zenoh: {_shorten(error)}") from None
@@ -138,7 +136,7 @@ def _port_text(address: str) -> str:
 
 
 def _find_port(endpoint: str) -> int:
-    """Return an endpoint's TCP port; 0: none, or a free one, which Zenoh does not report."""
+    """Return an endpoint's TCP port; 0: none, or a free port that stays unknown."""
     protocol, _, address = endpoint.partition("/")
     return int(_port_text(address)) if protocol in ("tcp", "tls", "ws") else 0
 

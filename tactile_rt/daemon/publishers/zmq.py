@@ -48,7 +48,7 @@ class ZmqOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ZmqPublisher(Sender):
-    """A PUB socket; the first frame of a message is its topic, by which subscribers filter."""
+    """A PUB socket; a message's first frame is its topic, by which subscribers filter."""
 
     Options = ZmqOptions
 
