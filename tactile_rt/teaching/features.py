@@ -59,7 +59,7 @@ class FeatureNetwork:
         return cls(spec, substeps, kernels.astype(f), dilations, thresholds.astype(f))
 
     @staticmethod
-    def _find_axes(spec: ArraySpec) -> Floats:
+    def _locate_elements(spec: ArraySpec) -> Floats:
         """Compute coordinates (element, axis) along the axes that the array extends in, -1 to 1."""
         places = np.array(spec.positions)
         if np.ptp(places, axis=0).max() == 0:  # no positions given
@@ -72,7 +72,7 @@ class FeatureNetwork:
     @classmethod
     def _count_signals(cls, spec: ArraySpec, unit: str) -> int:
         """Count the signals of the loads of a unit."""
-        of_places = 1 + 2 * cls._find_axes(spec).shape[1] if len(spec.elements) > 1 else 0
+        of_places = 1 + 2 * cls._locate_elements(spec).shape[1] if len(spec.elements) > 1 else 0
         return spec.units.count(unit) + of_places
 
     @property
@@ -161,7 +161,7 @@ class FeatureNetwork:
         strength = g("Relu", g("Sub", strength, quiet))  # (batch, sub-step, element)
         whole = g("ReduceSum", strength, g.integers(2), keepdims=1)  # (batch, sub-step, 1)
         peak = g("Max", peak, g("ReduceMax", whole, g.integers(1), keepdims=0))
-        axes = self._find_axes(self.spec)
+        axes = self._locate_elements(self.spec)
         share = g("Div", strength, g("Max", whole, g.constant(LEAST)))
         centre = g("MatMul", share, g.constant(axes))  # (batch, sub-step, axis)
         square = g("MatMul", share, g.constant(axes**2))

@@ -25,7 +25,7 @@ REFUSED = 0.06  # of the touches, leave-one-out, at most, are taken for unknown
 # no more than that share of the classes' touches and is at most so many times the usual reach.
 OTHERS_LET_IN, REFUSED_FOR_OTHERS, WIDER = 0.1, 0.12, 1.2
 ENOUGH = 5  # touches of a class that suffice to estimate the reach
-MAD, FARTHEST = 1.4826, 2.5  # to standard deviations of the logarithmic distance; most of these
+MAD, FARTHEST = 1.4826, 2.5  # MAD to standard deviation; of the log distance, at most
 LIMIT = 5.0  # of standardised features, either way, so that one outlier does not decide
 # A feature's scale is at least so many times the median scale of its kind, and this share of its
 # whole spread: a feature that never varied in ten touches may still vary in the eleventh.

@@ -157,8 +157,7 @@ class Lesson:
         self._largest.append(listener.largest)
         found = []
         for chunk in recording:
-            touches = listener.push(chunk)
-            found += [(listener.seconds(onset), features) for onset, _, features in touches]
+            found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
         return found
 
     def listener(self, spec: ArraySpec) -> Listener:
