@@ -1,1 +1,1 @@
-"""From samples to decisions: what a model file is, contact, windows, steps and early exits."""
+"""From samples to decisions: model files, contact detection, windows, steps and early exits."""

@@ -1,4 +1,4 @@
-"""An array from a file: as `tactile-rt describe` writes it, or that which a model was made for."""
+"""Array descriptions from files: JSON as `tactile-rt describe` writes it, or an ONNX model."""
 
 from pathlib import Path
 from typing import Any
@@ -11,17 +11,17 @@ from tactile_rt.core.stream import SPEC_VERSION, ArraySpec
 
 
 def read_array(path: Path) -> ArraySpec:
-    """The array that a file describes.
+    """Read the array that a file describes.
 
     Args:
-        path: the JSON of an `ArraySpec`; or an ``.onnx`` model, whose array it then is.
+        path: the JSON of an `ArraySpec`; or an ``.onnx`` model, for the array it was made for.
 
     Raises:
-        ConfigError: it cannot be read, or is no array.
+        ConfigError: the file cannot be read, or does not describe an array.
         ModelError: the model cannot be read.
     """
     if path.suffix == ".onnx":
-        # Not before: a stream without a model needs no onnxruntime.
+        # Imported here, since a stream without a model needs no onnxruntime.
         from tactile_rt.classifier.model_file import read_model
 
         return read_model(path)[0].array
@@ -34,12 +34,12 @@ def read_array(path: Path) -> ArraySpec:
     try:
         return ArraySpec.from_json(text)
     except ConfigError as error:
-        _explain(text, path)
+        _raise_bad_field(text, path)
         raise ConfigError(f"{path}: {error}") from None
 
 
-def _explain(text: str, path: Path) -> None:
-    """Raise what is wrong with the array in words, if it is a key or its value."""
+def _raise_bad_field(text: str, path: Path) -> None:
+    """Raise an error that names the wrong key or value, if one is found."""
     try:
         fields = msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.MsgspecError:

@@ -6,11 +6,11 @@ Contact onset starts an episode, and without contact there is no decision. There
 
 - ``episode``: the recurrent state is zeroed at the onset, and every completed step gives a
   decision, the last of them final. With `sure`, the first decision that is sure enough is final.
-- ``sliding``: as before until the first final decision; from there on, as long as the contact
-  lasts, one every few steps, each equal to that of an episode which began so many steps later.
+- ``sliding``: as ``episode`` until the first final decision; then, while the contact lasts, a
+  decision every few steps, each equal to that of an episode begun that many steps later.
 
-A silence too long for the resampler to bridge ends an episode early, and so does a stretch that is
-skipped, see `tactile_rt.classifier.skips`.
+A silence too long for the resampler to bridge ends an episode early, and so does a skipped stretch,
+see `tactile_rt.classifier.skips`.
 """
 
 import logging
@@ -47,19 +47,18 @@ from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 Mode = Literal["episode", "sliding"]
 Floats = NDArray[np.float32]
 EVERY = 4
-# How far a live network may be behind before it skips to the newest sample: so many steps, and at
-# least so long.
+# A live network skips to the newest sample when it is further behind than the longer of these.
 BEHIND_STEPS, BEHIND_S = 3, 0.15
 # Far beyond any load, and far below where squares of float32 overflow.
 ABSURD = 1e9
-# Times the largest load that a model believes: beyond, a unit or a gain is not what it should be.
+# Times `ModelCard.clip`: a larger load points to a wrong unit or gain.
 IMPLAUSIBLE = 10.0
 IMPLAUSIBLE_LOADS = "loads are far beyond those that it learnt from: another unit, gain or sensor?"
 ENDLESS_S = 10.0
-JOINING_S = 5.0  # for so long a first baseline that moves is put off
+JOINING_S = 5.0  # until then, a first baseline that moves is rejected
 ENDLESS = "contact for 10 s without an end: something is held, or readings drift: let go to see"
 TOUCHES = 256
-FUSED = 8  # touches, at most, that are judged together
+FUSED = 8  # touches, at most, that are identified together
 log = logging.getLogger(__name__)
 
 
@@ -70,35 +69,34 @@ class Classification:
     Attributes:
         onset_ns: The stream time at which contact began, ns.
         t_ns: The stream time of the last resampled sample used, ns.
-        step: The number of steps that the decision rests on, counted from 1; earlier steps of a
-            longer contact are not in it.
+        step: The number of steps that the decision rests on, counted from 1, without earlier steps
+            of a longer contact.
         final: Whether this decision is the last one of its window; an episode that a silence of
             the stream cuts short has no final decision.
         label: The decision: the name of the most probable class, which is a shape where the model
-            tells kinds apart within it; or a refusal to name one: "unknown" for an object of no
-            class that the model knows, or what is wrong with the loads, see `ModelCard.refusals`.
+            distinguishes kinds within it; or a refusal: "unknown" for an object of no class that
+            the model knows, or what is wrong with the loads, see `ModelCard.refusals`.
         labels: (class,) The names of all classes and then of the refusals, in the order of
             `probabilities`.
         probabilities: (class,) The posterior probability of each of them, float32.
         latency_s: The time that the model's step took, s.
         prediction_set: The classes that are still possible, the most probable first, by the model's
-            rule for the noise that was measured; empty if it has none, as of windows of ``sliding``
+            rule for the measured noise; empty without such a rule, and for windows of ``sliding``
             that begin within a contact.
-        coverage: The share of touches of known kinds of which the true class is in the prediction
-            set of every step; None: there is no such set.
-        late: Whether more work had gathered than the deadline allows.
-        embedding: (unit,) What the network's last layer read in the step, or, of a model that was
-            trained to tell objects apart, where the touch lies, of length 1, float32; None unless
-            the classifier was asked for it.
+        coverage: The share of touches of known kinds whose true class is in the prediction set of
+            every step; None without a set.
+        late: Whether the decision missed its deadline, see `decision_rules.Deadline`.
+        embedding: (unit,) The input of the network's last layer in the step, or, for a model that
+            was trained to tell objects apart, a vector of length 1 that is alike for touches of one
+            object, float32; None unless the classifier was asked for it.
         names: The kinds of the label's class that are still possible, the most probable first:
-            box, crate; empty where the class has none or there is no rule, as `prediction_set`.
-        names_coverage: The share of touches of things of that class of which the true kind is among
-            the names of every step; None: there are no names.
-        object: The enrolled object that it is, or "none of these"; empty where none is enrolled,
-            and before a touch's last step, also where `sure` ends it: only of last steps is it
-            measured what is refused.
-        object_margin: By how much the likeness to the likeliest object is above what is needed;
-            below 0 it is none of these; None without objects.
+            box, crate; empty if the class has no kinds, or no rule as for `prediction_set`.
+        names_coverage: The share of touches of that class whose true kind is among the names of
+            every step; None without names.
+        object: The enrolled object, or "none of these"; empty if none is enrolled, and before a
+            touch's last step, also where `sure` ends it early: thresholds are for last steps only.
+        object_margin: The score of the likeliest object less its threshold; below 0 the object is
+            none of these; None without objects.
         object_touches: The number of touches that `object` rests on, more than 1 where they are
             fused; 0 without objects.
     """
@@ -134,16 +132,16 @@ class Classification:
 
 @dataclass
 class ClassifierStats:
-    """Counted since the classifier was made.
+    """Counters since the classifier was created.
 
     Attributes:
         withheld: The number of decisions that were not returned because they were late.
         skips: The number of stretches of the stream that were skipped.
-        bad_samples: The number of samples of one element that were no number, infinite or absurd
-            though marked valid; they were taken for invalid.
+        bad_samples: The number of samples of one element that were NaN, infinite or absurdly large
+            though marked valid; they were treated as invalid.
         bad_steps: The number of steps whose logits were not finite; they gave no decision.
-        implausible: The number of episodes with a load of more than ten times the largest that
-            the model believes, as of a sensor in another unit.
+        implausible: The number of episodes with a load of more than ten times `ModelCard.clip`, as
+            from a sensor in another unit.
     """
 
     steps: int = 0
@@ -164,39 +162,38 @@ class Classifier:
         model: path of the ``.onnx`` file.
         mode: ``episode`` or ``sliding``.
         every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
-            runs in ceil(steps / every) lanes, and takes up to as many times as long.
-        sure: probability of the best class at which an episode ends early, or None: accuracy
-            given for time, see `tactile_rt.classifier.decision_rules`. Of ``episode`` only.
-        in_a_row: steps running in which the same class must be so sure.
-        deadline_s: work that may gather, and age of its newest sample, before a step is late, s;
+            runs in ceil(steps / every) lanes, and takes up to that many times longer.
+        sure: probability of the best class at which an episode ends early, None: never. It trades
+            accuracy for time, see `tactile_rt.classifier.decision_rules`. For ``episode`` only.
+        in_a_row: consecutive steps in which the same class must be that probable.
+        deadline_s: backlog of work, and age of the newest sample, beyond which a step is late, s;
             None is the step's length.
-        late: what becomes of a late decision, see `tactile_rt.classifier.decision_rules.Deadline`.
+        late: how to treat a late decision, see `tactile_rt.classifier.decision_rules.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
-        embedding: whether decisions carry the step's embedding, a copy each.
-        age: of a live stream: how old the sample of a stream time (ns) is now, s.
-        catch_up: what is done where a live stream's decisions would be older than `behind_s`: the
-            network skips to the ``newest`` sample, or takes ``all`` steps.
-        behind_s: the greatest age of a step's newest sample when its decision is there, s; None:
-            three steps, or 0.15 s if that is more.
-        fuse_s: how soon after the last decision on an object a touch must begin to be of the same
-            thing, s: which enrolled object it is, these touches tell together; 0: each tells alone.
+        embedding: whether each decision carries a copy of the step's embedding.
+        age: returns the present age, s, of the sample of a stream time (ns); for live streams.
+        catch_up: what to do when a live stream's decisions would be older than `behind_s`: skip to
+            the ``newest`` sample, or take ``all`` steps.
+        behind_s: the greatest age of a step's newest sample at its decision, s; None: three steps,
+            or 0.15 s if that is more.
+        fuse_s: a touch that begins within this time after the last decision on an object counts as
+            the same thing and is identified together with it, s; 0: each touch alone.
 
     Attributes:
         detector: The contact detector, which holds the stream's contact state and baseline.
         deviation: (element, channel) The last resampled sample less the baseline, SI; zeros before
-            there is one. The next `push` overwrites it.
-        touches: The newest 256 changes of contact, as stream time (ns) and whether it began;
-            whoever reads them takes them out.
+            the first. The next `push` overwrites it.
+        touches: The newest 256 changes of contact, as stream time (ns) and whether contact began;
+            a reader removes what it reads.
         implausible: True if the newest episode has implausible loads, see `ClassifierStats`.
-        undecided: True if the newest answer was no number, and so no decision.
+        undecided: True if the newest answer was not finite, and so gave no decision.
         stats: The counters of steps, late steps and bad samples.
         providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:
         ModelError: the file cannot be used.
         SpecMismatch: the model was made for another array; the message says where they differ.
-        ConfigError: an option that cannot be, or an execution provider or engine that was asked
-            for and is not there.
+        ConfigError: an invalid option, or a requested execution provider that is missing.
     """
 
     def __init__(
@@ -247,15 +244,15 @@ class Classifier:
         self._stepper = Stepper(session, self.card, self._lanes.count)
         self._rate_hz = spec.rate_hz
         self._resampler = Resampler(self.card.period_ns, spec.rate_hz)
-        self._order = order  # where the array has the model's elements
-        # Of the episode; the detector does not change them, it makes new ones.
+        self._order = order  # index of each of the model's elements in the array
+        # Baseline of the episode; the detector never writes into these arrays, it replaces them.
         self._offset = self.detector.offset
         self._sigma = self.detector.sigma
-        self._filled = 0  # sub-steps of the step under way
+        self._filled = 0  # sub-steps of the current step
         self._step = 0  # steps done since the onset
         self._onset_ns: int | None = None  # None when no episode is under way
         self._decided = False  # the episode has had its final decision
-        self._touched_ns, self._endless = 0, False  # the latest change of contact
+        self._changed_ns, self._endless = 0, False  # time of the latest change of contact
         self._skipping = False
         self._next_seq = 0
         self._rated = rated_noise(self.card)
@@ -265,22 +262,23 @@ class Classifier:
         self._columns = kind_columns(self.card.kinds)
         self._name_rules: dict[str, PredictionSetRule | None] = {}  # likewise, by class
         self._fuse_ns = fuse_s * NS_PER_S
-        self._felt = deque[Floats](maxlen=FUSED)  # embeddings of touches of one thing
-        self._felt_ns = 0  # when the last of them was decided
+        self._embeddings = deque[Floats](maxlen=FUSED)  # embeddings of touches of one thing
+        self._fused_ns = 0  # decision time of the last of them
 
     @property
     def deciding(self) -> bool:
-        """Whether something is touched, or an episode is under way."""
+        """True if something is touched or an episode is under way."""
         return self.detector.contact or self._onset_ns is not None
 
     @property
     def step_ms(self) -> float:
-        """The time of the stream that a step takes, ms."""
+        """Length of a step in stream time, ms."""
         return self.card.substeps * self.card.period_ns / 1e6
 
     def go_on_from(self, other: "Classifier") -> bool:
-        """Take over where another classifier of the same stream is, with its baseline, as long as
-        nothing is under way; whether that can be: both must resample and hear alike."""
+        """Take over another classifier's stream position and baseline; return False if unable.
+
+        Both need the same period and floor, and no episode may be under way."""
         if self.card.period_ns != other.card.period_ns or self.card.floor != other.card.floor:
             return False
         self._resampler, self.detector = other._resampler, other.detector
@@ -289,24 +287,25 @@ class Classifier:
         return True
 
     def forget(self) -> None:
-        """Be as if no sample had come: find the baseline anew."""
+        """Return to the initial state, so that the baseline is measured anew."""
         self._renew_detector()
         self._resampler = Resampler(self.card.period_ns, self._rate_hz)
         self._onset_ns, self._next_seq = None, 0
-        self._felt.clear()
+        self._embeddings.clear()
 
     def _renew_detector(self) -> None:
         shape, floor = self.detector.offset.shape, self.detector.floor
         self.detector = ContactDetector((shape[0], shape[1]), floor)
 
     def push(self, chunk: Chunk) -> list[Classification]:
-        """Take samples as they come from the array, return the decisions that they complete."""
+        """Take samples as the array delivers them; return the decisions that they complete."""
         return list(self.decide(chunk))
 
     def decide(self, chunk: Chunk) -> Iterator[Classification]:
-        """As `push`, but each decision as soon as it is there: the samples are taken as the
-        iterator is, which must come to its end."""
-        # What no sensor measures is not taken for a measurement: no number, infinite, or absurd.
+        """Take samples as `push`, but yield each decision as soon as it is made.
+
+        The iterator must be exhausted: it takes the samples as it advances."""
+        # NaN, infinite and absurdly large values are no measurements.
         chunk, bad = without_bad_samples(chunk)
         self.stats.bad_samples += bad
         resampled = self._resampler.push(chunk)
@@ -314,24 +313,24 @@ class Classifier:
             return
         for i in range(len(resampled)):
             if resampled.seq[i] != self._next_seq:
-                self._onset_ns = None  # what is touched now need not be what was touched before
+                self._onset_ns = None  # after a gap, another object may be touched
             self._next_seq = int(resampled.seq[i]) + 1
-            decision = self._sample(int(resampled.t_ns[i]), resampled.values[i], resampled.valid[i])
+            decision = self._update(int(resampled.t_ns[i]), resampled.values[i], resampled.valid[i])
             if decision is not None:
                 yield decision
 
-    def _sample(self, t_ns: int, sample: Floats, valid: NDArray[np.bool_]) -> Classification | None:
+    def _update(self, t_ns: int, sample: Floats, valid: NDArray[np.bool_]) -> Classification | None:
         touched = self.detector.contact
         joined = self._next_seq * self.card.period_ns > JOINING_S * NS_PER_S
         ready = self.detector.ready or joined
         begins = self.detector.update(sample, valid)
         if self.detector.ready and not ready and self.detector.moves:
-            self._renew_detector()  # the stream is joined within a touch: wait for its end
+            self._renew_detector()  # the stream began within a touch: wait for its end
         if self.detector.contact != touched:
             self.touches.append((t_ns, not touched))
-            self._touched_ns = t_ns
-        elif touched and not self._endless and t_ns - self._touched_ns > ENDLESS_S * NS_PER_S:
-            self._endless = True  # told once
+            self._changed_ns = t_ns
+        elif touched and not self._endless and t_ns - self._changed_ns > ENDLESS_S * NS_PER_S:
+            self._endless = True  # warn once
             log.warning("%s: %s", self.card.name, ENDLESS)
         # An element without a trustworthy value, or without a baseline, reads as untouched.
         untouched = ~(valid & self.detector.has_baseline)
@@ -345,7 +344,7 @@ class Classifier:
         if begins and (self._onset_ns is None or self._decided):
             self._begin(t_ns)
         elif before and self._sliding and self.detector.contact:
-            self._begin(t_ns)  # a window within a contact, as others of this mode
+            self._begin(t_ns)  # a window that begins within a contact
             self._set_rule, self._name_rules = None, {}
         if self._decided and not self.detector.contact:
             self._onset_ns = None  # released: the next contact is a new episode
@@ -367,7 +366,7 @@ class Classifier:
         return self._advance(t_ns, self._onset_ns)
 
     def _skip(self) -> None:
-        """Leave the sample out, and with it the episode."""
+        """Skip the sample and end the episode."""
         self.stats.skips += not self._skipping
         self._skipping, self._onset_ns = True, None
 
@@ -380,14 +379,14 @@ class Classifier:
         self._sigma = self.detector.sigma
         self._stepper.begin(self._offset[self._order], self._sigma[self._order])
         self._deadline.begin()
-        # Of an element without a baseline the noise is not known.
+        # The noise of an element without a baseline is unknown.
         known = self._sigma[self.detector.has_baseline] / self._rated
         noise = float(np.median(known)) if known.size else np.inf
         self._set_rule = fitting(self.card.candidates, noise)
         self._name_rules = {k: fitting(rules, noise) for k, rules in self.card.names.items()}
 
     def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
-        """Take a step with the samples gathered; the decision that it gives, if any."""
+        """Run a step on the gathered samples; return its decision, if any."""
         began = time.perf_counter()
         lane = self._lanes.beginning(self._step)
         if lane is not None:
@@ -406,22 +405,22 @@ class Classifier:
         if asked is None:
             return None
         lane, step = asked
-        probabilities = self._posterior(logits[lane])
+        probabilities = self._compute_posterior(logits[lane])
         self.undecided = probabilities is None
         if probabilities is None:
-            # The state is no number and would stay none: end the episode, or begin windows anew.
+            # The state is not finite and would stay so: end the episode, or restart the windows.
             self.stats.bad_steps += 1
             self._step, self._decided = 0, True
             self._stepper.begin(self._offset[self._order], self._sigma[self._order])
             return None
         best = decided(self.card, probabilities, step)
         final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
-        # it was fitted on windows that begin where the contact does
+        # the rules were fitted on windows that begin at the onset
         rule = None if self._decided else self._set_rule
         left = rule.prediction_set(probabilities[: len(self.card.classes)], step) if rule else []
         label = self.card.labels[best]
         name_rule = None if self._decided else self._name_rules.get(label)
-        names = self._names_left(name_rule, label, lane, step) if name_rule else ()
+        names = self._find_kinds(name_rule, label, lane, step) if name_rule else ()
         whole = step == self.card.steps and not self._decided
         found = self._identify(onset_ns, t_ns, lane) if whole and self.card.enrolled else {}
         self._decided = self._decided or final
@@ -447,16 +446,16 @@ class Classifier:
         )
 
     def _identify(self, onset_ns: int, t_ns: int, lane: int) -> dict[str, Any]:
-        """Return what a decision says of enrolled objects, at the end of a touch."""
-        if onset_ns - self._felt_ns > self._fuse_ns:
-            self._felt.clear()
-        self._felt.append(self._stepper.embedding[lane].copy())
-        self._felt_ns = t_ns
+        """Return a decision's fields on enrolled objects, at the end of a touch."""
+        if onset_ns - self._fused_ns > self._fuse_ns:
+            self._embeddings.clear()
+        self._embeddings.append(self._stepper.embedding[lane].copy())
+        self._fused_ns = t_ns
         assert self.card.identity is not None
-        name, margin = identify(self.card.identity, self.card.enrolled, self._felt)
-        return {"object": name, "object_margin": margin, "object_touches": len(self._felt)}
+        name, margin = identify(self.card.identity, self.card.enrolled, self._embeddings)
+        return {"object": name, "object_margin": margin, "object_touches": len(self._embeddings)}
 
-    def _names_left(
+    def _find_kinds(
         self, rule: PredictionSetRule, label: str, lane: int, step: int
     ) -> tuple[str, ...]:
         logits = self._stepper.names[lane, self._columns[label]]
@@ -464,7 +463,7 @@ class Classifier:
         left = rule.prediction_set(probabilities / probabilities.sum(), step)
         return tuple(self.card.kinds[label][k] for k in left)
 
-    def _posterior(self, logits: Floats) -> Floats | None:
+    def _compute_posterior(self, logits: Floats) -> Floats | None:
         probabilities: Floats = logits / self.card.temperature
         probabilities -= probabilities.max()
         np.exp(probabilities, out=probabilities)
@@ -487,13 +486,13 @@ def fuse(posteriors: Sequence[Floats]) -> Floats:
 
 
 def without_bad_samples(chunk: Chunk) -> tuple[Chunk, int]:
-    """Mark elements invalid that claim a value which is none.
+    """Mark elements invalid whose values are NaN, infinite or absurdly large.
 
     Returns:
-        The chunk itself where nothing is wrong, else a copy with those elements marked and zero;
-        and how many element samples were marked that had not been.
+        The chunk itself if all values are good, else a copy with those elements marked and zero;
+        and the number of element samples that were newly marked.
     """
-    # One product is the cheapest look at all values: what is wrong with any of them shows in it.
+    # One dot product is the cheapest test of all values: a bad value makes it large or NaN.
     if np.vdot(chunk.values, chunk.values) < ABSURD**2:
         return chunk, 0
     largest = np.abs(chunk.values).max(axis=2)  # (n, element); NaN if one is

@@ -1,6 +1,6 @@
 """Baseline and contact onset: from a resampled stream to episodes.
 
-Training windows and the live classifier start where this detector says that contact began, on a
+Training windows and the live classifier start at the onset that this detector reports, and use the
 baseline (offset and noise) that it measured while nothing was touched.
 """
 
@@ -13,21 +13,21 @@ from tactile_rt.classifier.baseline_drift import Drift, RestLevels
 
 MIN_BASELINE_SAMPLES = 20  # quiet samples before the first decision: 180 ms at 9 ms
 BASELINE_SAMPLES = 100  # the baseline is the mean of at most this many of the last quiet samples
-# The latest quiet samples may already hold a faint onset: they wait outside until it would have
-# been found. The first baseline waits for fewer, or a robot would be numb for longer.
+# The latest quiet samples may already hold a faint onset: they join the baseline only once it would
+# have been detected. The first baseline holds back fewer, so that a robot feels sooner.
 GUARD_SAMPLES = 15
 FIRST_GUARD_SAMPLES = 5
-MOVES = 9.0  # times the variance that neighbours tell: no first baseline is as unsteady
+MOVES = 9.0  # times the variance between neighbouring samples: no quiet baseline varies as much
 RELEASE_SAMPLES = 20
 
 # EWMA charts of rate r: the sample itself, and means over about 7 and 19 samples (2/r - 1).
 RATES = np.array([1.0, 0.25, 0.1], dtype=np.float32)
 MEAN_VARIANCE = (RATES / (2 - RATES)).astype(np.float64)
 ONSET_Z2 = np.array([26.0, 40.0, 40.0])
-RELEASE = 0.83  # of the onset's threshold: from there on a contact lasts
-SUSPICION = 0.45  # of the onset's threshold: samples since then are not the baseline's
-# One sample adds no more than this to a chart, in sigma: a glitch is no touch, and it forgets a
-# touch soon after its end.
+RELEASE = 0.83  # of the onset's threshold: a contact lasts while a statistic exceeds it
+SUSPICION = 0.45  # of the onset's threshold: samples since it was exceeded stay out of the baseline
+# A sample counts at most this much in a chart, in sigma: a glitch is no touch, and the chart
+# recovers soon after a touch ends.
 LIMIT = np.array([np.inf, 3.0, 3.0], dtype=np.float32)[:, None, None]
 
 Floats = NDArray[np.float32]
@@ -36,9 +36,9 @@ Floats = NDArray[np.float32]
 def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
     """Compute the thresholds of the EWMA charts, (chart, element) sigma^2.
 
-    `quiet` (element,) samples make the baseline. The offset is itself a mean, of variance 1 / n;
-    and sigma is an estimate of n - 1 degrees of freedom, by which a square is too large by (n - 1)
-    / (n - 3) in the mean, as F has it.
+    An element's baseline is the mean of its n = `quiet` (element,) samples, which adds a variance
+    of 1 / n. Its sigma is estimated with n - 1 degrees of freedom, which raises the mean square by
+    (n - 1) / (n - 3), the mean of an F distribution.
     """
     n = np.maximum(quiet, MIN_BASELINE_SAMPLES)
     variance = (MEAN_VARIANCE[:, None] + 1 / n) * (n - 1) / (n - 3)
@@ -47,18 +47,18 @@ def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 class ContactDetector:
-    """EWMA charts: is anything touched, and what is the baseline? Sample by sample.
+    """Contact detector: EWMA charts against a running baseline, sample by sample.
 
     The statistic of an element is z^2 = sum over its channels of (m / sigma)^2 / v, where m is a
     mean of (x - offset) over the last samples, and v the variance of m in units of sigma^2: that
     of an exponentially weighted mean of rate r, r / (2 - r), and that of the baseline. While
     nothing is touched it is chi-square distributed with as many degrees of freedom as channels. An
     EWMA chart whose length suits the size of a step finds it in white noise nearly as soon as
-    any test can (Roberts 1959, Technometrics 1:239; of several channels together: Lowry et al.
-    1992, Technometrics 34:46, eq. 2.2 and 2.3). Touches are of every size, so three charts stand
-    side by side: the sample itself, about 7 and about 19.
+    any test can (Roberts 1959, Technometrics 1:239; for several channels together: Lowry et al.
+    1992, Technometrics 34:46, eq. 2.2 and 2.3). Touches are of every size, so three charts run
+    side by side: the sample itself, and means over about 7 and about 19 samples.
 
-    Contact begins when one element exceeds its threshold (26, 40, 40) in two samples running. It
+    Contact begins when an element exceeds its threshold (26, 40, 40) in two consecutive samples. It
     ends when no element has exceeded 0.83 of it for 20 samples. For six channels, 30 whiskers and
     111 Hz, 9 hours of white noise had 2 false onsets, 4,000 first seconds had 2, and 2 hours of
     a drift of 0.001 sigma per sample had 1; three times that drift has one in a minute.
@@ -67,29 +67,28 @@ class ContactDetector:
         shape: (element, channel).
         floor: (channel,) smallest sigma assumed, SI.
 
-    A baseline that was taken while something was touched, as by an array that is plugged in again
-    in the middle of a touch, would be a contact without end. So within a contact still stretches of
-    20 samples are looked for. Once the signal has come back to the level of one of them three
-    times, and was there for longer than it was ever quiet on the baseline, that level is the new
-    baseline.
+    A baseline measured during a touch, as when an array is plugged in again in the middle of one,
+    would make a contact without end. So the detector looks for still stretches of 20 samples within
+    a contact. Once the signal has returned to the level of one of them three times, and was there
+    for longer than it was quiet on the baseline, that level becomes the baseline.
 
-    Where quiet samples lie on a slope, as of a sensor that warms up, the baseline goes on along it,
-    also within a contact, for as long as the slope has been seen before. A contact of which the
-    newest samples lie on a slope that leads back to the baseline was none.
+    Where quiet samples drift along a line, as while a sensor warms up, the baseline follows it,
+    also within a contact, for as long as the drift was observed before. If the newest samples of a
+    contact lie on a line that leads back to the baseline, it was drift and no contact.
 
-    An element that is not trusted neither touches nor counts as rest: its baseline is that of its
-    own trusted samples, and it is left out until it has enough of them.
+    An invalid element counts neither as touched nor as at rest: its baseline rests on its own
+    valid samples, and the element is ignored until it has enough of them.
 
     Attributes:
         ready: Whether enough quiet samples have been seen for a baseline; no contact is reported
             before.
-        offset: (element, channel) The baseline, which is the mean of the quiet samples, or where
-            their slope has led since, SI.
+        offset: (element, channel) The baseline: the mean of the quiet samples, carried on along
+            their drift, SI.
         sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
             below `floor`.
         has_baseline: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
         doubted: The number of samples before the latest onset that the baseline leaves out, as
-            they may be of the touch already.
+            they may already belong to the touch.
     """
 
     def __init__(self, shape: tuple[int, int], floor: Floats) -> None:
@@ -99,7 +98,7 @@ class ContactDetector:
         self.sigma = np.broadcast_to(self.floor, shape).astype(np.float32)
         self.has_baseline: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
         self.doubted = 0
-        # Quiet samples with their validity; an invalid one counts as nothing in every sum.
+        # Quiet samples with their validity; an invalid one adds nothing to any sum.
         self._pending: deque[tuple[int, NDArray[np.float64], NDArray[np.bool_]]] = deque()
         self._baseline: deque[tuple[int, NDArray[np.float64], NDArray[np.bool_]]] = deque()
         self._count = np.zeros(shape[0], dtype=np.int64)
@@ -111,30 +110,30 @@ class ContactDetector:
         self._suspicious_for = np.zeros(shape[0], dtype=np.int64)
         self._above: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
         self._quiet_for = 0
-        self._quiet = 0  # samples that were quiet, ever
+        self._quiet = 0  # quiet samples since the baseline was started
         self._rest = RestLevels()
-        self._now = 0  # samples, ever
+        self._now = 0  # number of the sample, since the first
         self._drift = Drift()
-        self._slope = Drift()  # of the contact under way
+        self._slope = Drift()  # of the current contact
         self._level = self.offset  # the mean of the baseline
 
     @property
     def ready(self) -> bool:
-        """Whether the baseline is complete."""
+        """True if the baseline is complete."""
         return len(self._baseline) >= MIN_BASELINE_SAMPLES
 
     @property
     def moves(self) -> bool:
-        """Whether the samples of the baseline wander, as those of a touch: noise does not."""
+        """True if the baseline's samples wander, as in a touch but not in noise."""
         samples = np.array([sample for _, sample, _ in self._baseline])
-        steps = np.square(np.diff(samples, axis=0)).mean(axis=0) / 2  # in noise, its variance
+        steps = np.square(np.diff(samples, axis=0)).mean(axis=0) / 2  # of white noise, the variance
         known = self._count == len(samples)
         wander = samples.var(axis=0) > MOVES * np.maximum(steps, self.floor**2)
         return bool(wander[known].any())
 
     @property
     def drift(self) -> NDArray[np.float64]:
-        """(element, channel) slope of the baseline, SI per sample; 0: none that is certain."""
+        """(element, channel) Drift of the baseline, SI per sample; 0 where none is certain."""
         return np.broadcast_to(self._drift.slope, self.offset.shape)
 
     def update(self, sample: Floats, valid: NDArray[np.bool_]) -> bool:
@@ -148,10 +147,10 @@ class ContactDetector:
         if self._drift.found:
             self._follow_drift()
         if not self.ready:
-            self._wait(sample, valid)
-            self._learn(FIRST_GUARD_SAMPLES)
+            self._add_quiet(sample, valid)
+            self._grow_baseline(FIRST_GUARD_SAMPLES)
             return False
-        excess = self._excess(sample, valid)
+        excess = self._compute_excess(sample, valid)
         above: NDArray[np.bool_] = excess > 1
         certain = above & self._above
         begins = not self.contact and bool(certain.any())
@@ -161,9 +160,9 @@ class ContactDetector:
             self.contact = True
             self._quiet_for = 0
             self._rest, self._slope = RestLevels(), Drift()
-            # What came before the onset is known to be quiet now, and need not wait.
-            self._learn(max(FIRST_GUARD_SAMPLES, int(self._suspicious_for[certain].max())))
-            self.doubted = len(self._pending) + 1  # and the one that was above its threshold first
+            # Samples before the onset are now known to be quiet, and join the baseline.
+            self._grow_baseline(max(FIRST_GUARD_SAMPLES, int(self._suspicious_for[certain].max())))
+            self.doubted = len(self._pending) + 1  # plus the first above its threshold
             self._pending.clear()
         elif self.contact:
             self._quiet_for = 0 if (excess > RELEASE).any() else self._quiet_for + 1
@@ -175,12 +174,12 @@ class ContactDetector:
                 if self._slope.leads_to(self._middle(), self._level, self._pooled):
                     self._restart_baseline(self._slope)
         elif not above.any():
-            self._wait(sample, valid)
-            self._learn(GUARD_SAMPLES)
+            self._add_quiet(sample, valid)
+            self._grow_baseline(GUARD_SAMPLES)
         return begins
 
-    def _excess(self, sample: Floats, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """(element,) largest statistic, each in units of its threshold."""
+    def _compute_excess(self, sample: Floats, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Compute the largest statistic (element,), each in units of its threshold."""
         trusted = (valid & self.has_baseline)[:, None]
         z = np.where(trusted, sample - self.offset, np.float32(0)) / self._pooled
         self._ewma += RATES[:, None, None] * (np.minimum(np.maximum(z, -LIMIT), LIMIT) - self._ewma)
@@ -188,15 +187,15 @@ class ContactDetector:
         excess: NDArray[np.float64] = (z2 / self._onset_z2).max(axis=0)
         return excess
 
-    def _wait(self, sample: Floats, valid: NDArray[np.bool_]) -> None:
-        if not valid.any():  # it says nothing, and takes no place in the baseline of one that did
+    def _add_quiet(self, sample: Floats, valid: NDArray[np.bool_]) -> None:
+        if not valid.any():  # it must not displace a valid sample from the baseline
             return
         self._quiet += 1
         quiet = np.where(valid[:, None], sample, 0.0).astype(np.float64)
         self._pending.append((self._now, quiet, valid.copy()))
 
     def _follow_drift(self) -> None:
-        """Lead the baseline along the slope from its middle to now."""
+        """Move the baseline along the drift, from its middle to now."""
         ahead = min(self._now - self._middle(), self._drift.span)
         self.offset = (self._level + ahead * self._drift.slope).astype(np.float32)
 
@@ -205,7 +204,7 @@ class ContactDetector:
         return float(np.mean([at for at, _, _ in self._baseline]))
 
     def _restart_baseline(self, drift: "Drift") -> None:
-        """Measure the baseline anew: what was taken for a touch since long is rest."""
+        """Restart the baseline from the latest samples, which turned out to be rest."""
         self.contact = False
         self._above = np.zeros_like(self._above)
         self._suspicious_for = np.zeros_like(self._suspicious_for)
@@ -217,11 +216,11 @@ class ContactDetector:
         for total in (self._count, self._sum, self._sum_of_squares):
             total[...] = 0
         for sample, valid in self._rest.block:
-            self._wait(sample, valid)
-        self._learn(0)
+            self._add_quiet(sample, valid)
+        self._grow_baseline(0)
 
-    def _learn(self, guard: int) -> None:
-        """Let all but the latest `guard` waiting samples into the baseline."""
+    def _grow_baseline(self, guard: int) -> None:
+        """Update the baseline with all but the latest `guard` pending samples."""
         if len(self._pending) <= guard:
             return
         before = self._count.copy()
@@ -248,7 +247,7 @@ class ContactDetector:
         if self._drift.found:
             times = np.var([at for at, _, _ in self._baseline])
             variance = np.maximum(variance - np.square(self._drift.slope) * times, 0.0)
-        # An element with too few samples keeps what was last known of it.
+        # An element with too few samples keeps its last known values.
         known = self.has_baseline[:, None]
         self._level = np.where(known, mean.astype(np.float32), self._level)
         self.offset = self._level
@@ -257,5 +256,5 @@ class ContactDetector:
         sigma = np.maximum(np.sqrt(variance).astype(np.float32), self.floor)
         self.sigma = np.where(known, sigma, self.sigma)
         # Twenty samples underestimate an element's own noise often enough to raise false onsets:
-        # for detection no element counts as quieter than the typical one.
+        # for detection, no element counts as quieter than the median.
         self._pooled = np.maximum(self.sigma, np.median(self.sigma[self.has_baseline], axis=0))

@@ -1,16 +1,16 @@
-"""Where a whisker touches, from its base loads by mechanics alone: the classical estimates.
+"""Contact position along a whisker from the loads at its base: classical mechanical estimates.
 
-A contact at r from the base that pushes with F is felt there as F and M = r x F. So the contact
-lies on a known line, and the shape of the whisker tells where on it:
+A contact at r from the base that pushes with F loads the base with F and M = r x F. So the contact
+lies on a known line, and the shape of the whisker determines where on it:
 
 - straight: where a straight whisker crosses the line (Birdwell et al. 2007, J. Neurophysiol. 98:
   2439; Solomon & Hartmann 2006, Nature 443: 525): transverse moment over transverse force;
 - resting: the point of the undeflected, curved whisker that comes nearest to the line;
 - bent: the whisker as these loads bend it, integrated from the base to where its bending moment
-  has fallen to nothing (Scholz & Rahn 2004, IEEE Trans. Robot. Autom. 20: 124; in three dimensions
+  has fallen to zero (Scholz & Rahn 2004, IEEE Trans. Robot. Autom. 20: 124; in three dimensions
   as Huet et al. 2017, IEEE Trans. Robot. 33: 1031). It needs the stiffness as well.
 
-All take the force as it is, friction included, and inertia as none.
+All use the whole force, friction included, and neglect inertia.
 """
 
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ from tactile_rt.core.errors import ConfigError
 
 Floats = NDArray[np.float64]
 
-POINTS = 64  # pieces that a whisker is cut into
-TWICE = 0.02  # of the moment: a line that misses by less has been met, and may be met again
-AT_ONCE = 20_000  # loads worked on together, for the sake of memory
-SHARPEST = 0.3  # rad that a piece may bend: beyond it noise winds a thin tip up
+POINTS = 64  # segments of a whisker
+TWICE = 0.02  # of the moment: a second minimum along the whisker must be deeper by more than this
+AT_ONCE = 20_000  # loads per batch, to bound memory
+SHARPEST = 0.3  # rad that a segment may bend: beyond it, noise would coil up a thin tip
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class WhiskerShapes:
         young_modulus: (element,) Young's modulus of the whisker's material, Pa.
 
     Raises:
-        ConfigError: not one value of each for every whisker, or one that is not finite.
+        ConfigError: not one value of each for every whisker, or a value that is not finite.
     """
 
     length: Floats
@@ -61,7 +61,7 @@ class WhiskerShapes:
         return len(self.length)
 
     def abscissae(self, points: int = POINTS) -> Floats:
-        """(element, points + 1) x of the resting whisker at equal steps of arc length, m."""
+        """Compute x (element, points + 1) of the resting whiskers at equal arc-length steps, m."""
         share = np.linspace(0.0, 1.0, points + 1)
         fine = np.linspace(0.0, 1.0, 1001) * self.length[:, None]
         slope = 2 * self.curvature[:, None] * fine
@@ -73,11 +73,11 @@ class WhiskerShapes:
 
 
 def straight(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
-    """Distance (n,) from the base, m, taking the whisker for straight; within its length.
+    """Estimate the distance (n,) from the base, m, for a straight whisker, within its length.
 
     Args:
         loads: (n, 6) force (N) and moment (N m) at the base in the whisker's frame.
-        element: (n,) whose.
+        element: (n,) index of the whisker.
     """
     force, moment = loads[:, 1:3], loads[:, 4:6]
     squared = (force**2).sum(axis=1)
@@ -89,7 +89,7 @@ def straight(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -
 
 
 def resting(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
-    """Arc length (n,) to the point of the resting whisker nearest to the force's line, m.
+    """Estimate the arc length (n,) to the resting whisker's point nearest the force's line, m.
 
     Args:
         loads, element, shapes: as for `straight`.
@@ -101,7 +101,7 @@ def resting(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) ->
         some, who = loads[start : start + AT_ONCE], element[start : start + AT_ONCE]
         best, where = np.full(len(some), np.inf), np.zeros(len(some))
         for k in range(POINTS):
-            left, at = _left_over(some, nodes[who, k], nodes[who, k + 1])
+            left, at = _find_nearest(some, nodes[who, k], nodes[who, k + 1])
             where = np.where(left < best, k + at, where)
             best = np.minimum(best, left)
         found.append(where / POINTS * shapes.length[who])
@@ -109,10 +109,10 @@ def resting(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) ->
 
 
 def bent(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
-    """Arc length (n,) to where the whisker, bent by these very loads, meets the force's line, m.
+    """Estimate the arc length (n,) at which the bent whisker meets the force's line, m.
 
     Args:
-        loads, element, shapes: as for `straight`.
+        loads, element, shapes: as for `straight`; the loads also bend the whisker.
     """
     x = shapes.abscissae()
     headings = np.arctan(2 * shapes.curvature[:, None] * x)
@@ -136,14 +136,14 @@ def bent(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Fl
             size = np.linalg.norm(turn, axis=1, keepdims=True)
             turn *= np.minimum(1.0, SHARPEST / np.maximum(size, SHARPEST))
             turn[:, 2] += headings[who, k + 1] - headings[who, k]
-            middle = frame @ _rotations(turn / 2)
+            middle = frame @ _make_rotations(turn / 2)
             further = place + middle[:, :, 0] * step[:, None]
-            left, at = _left_over(some, place, further)
-            # Beyond the contact the curve goes on as nothing does, and may cross the line again.
+            left, at = _find_nearest(some, place, further)
+            # Beyond the contact the integrated curve is not real, and may cross the line again.
             nearing = (left < best) & (nearing | (left + met < best))
             where = np.where(nearing, k + at, where)
             best = np.where(nearing, left, best)
-            place, frame = further, frame @ _rotations(turn)
+            place, frame = further, frame @ _make_rotations(turn)
         found.append(where / POINTS * shapes.length[who])
     return np.concatenate(found) if found else np.zeros(0)
 
@@ -151,8 +151,8 @@ def bent(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Fl
 ESTIMATES = {"straight": straight, "resting": resting, "bent": bent}
 
 
-def _left_over(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats]:
-    """Least |M - r x F|^2 (n,) on the segments from near to far (n, 3), and how far along it is."""
+def _find_nearest(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats]:
+    """Find the least |M - r x F|^2 (n,) on segments, and where along them."""
     force, moment = loads[:, :3], loads[:, 3:]
     missing, gained = moment - np.cross(near, force), np.cross(far - near, force)
     squared = np.maximum((gained**2).sum(axis=1), np.finfo(float).tiny)
@@ -160,8 +160,8 @@ def _left_over(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats
     return ((missing - at[:, None] * gained) ** 2).sum(axis=1), at
 
 
-def _rotations(turn: Floats) -> Floats:
-    """(n, 3, 3) rotations by the vectors turn (n, 3), rad (Rodrigues)."""
+def _make_rotations(turn: Floats) -> Floats:
+    """Compute (n, 3, 3) rotations by the vectors turn (n, 3), rad (Rodrigues)."""
     angle = np.linalg.norm(turn, axis=1)[:, None, None]
     x, y, z = turn.T
     none = np.zeros_like(x)

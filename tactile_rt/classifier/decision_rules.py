@@ -1,12 +1,11 @@
-"""What becomes of a step's answer: when it is a decision, when unknown, what else it may be.
+"""Decision rules: early exits, overlapping windows, deadlines, open sets and prediction sets.
 
-The network takes every step. Early exits, overlapping windows and deadlines say which of them give
-a decision, and nothing here knows the network.
+The network takes every step. Early exits, overlapping windows and deadlines determine which steps
+give a decision, independently of the network.
 
-Rules that a model file may carry beside its network are fitted on sweeps of objects that it was not
-trained on, and stored in the `ModelCard`. A score is a number that is larger the less a step looks
-like what was learnt; it is stored by name, and whoever finds a name that they do not know cannot
-apply the rule.
+Open-set and prediction-set rules are fitted on sweeps of objects that the network was not trained
+on, and stored in the `ModelCard`. A score is larger the less a step looks like the training data.
+It is stored by name; a reader that does not know the name cannot apply the rule.
 """
 
 import logging
@@ -20,9 +19,9 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 
 MAX_NAME = 200  # characters
-UNKNOWN = "unknown"  # what is decided of an object of no class that the model knows
+UNKNOWN = "unknown"  # the decision on an object of no class that the model knows
 POSTERIOR = "posterior of unknown"  # the score of an `OpenSetRule`: of the label `unknown`
-# The score of a `PredictionSetRule`: how much of the posterior the more probable classes have.
+# The score of a `PredictionSetRule`: the posterior mass of the more probable classes.
 MASS_ABOVE = "mass above"
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -31,7 +30,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class OpenSetRule(msgspec.Struct, frozen=True):
-    """The open-set rule: when an object is of no class that the model knows.
+    """The open-set rule, by which an object is of no class that the model knows.
 
     Attributes:
         score: The name of the score: `POSTERIOR`.
@@ -44,7 +43,7 @@ class OpenSetRule(msgspec.Struct, frozen=True):
     thresholds: tuple[float, ...]
 
     def fault(self, steps: int) -> str:
-        """What makes the rule unusable for episodes of so many steps; "" if nothing does."""
+        """Return why the rule cannot be used for episodes of `steps` steps, or ""."""
         if not named(self.score):
             return f"score must be 1 to {MAX_NAME} printable characters"
         if len(self.thresholds) not in (1, steps):
@@ -54,24 +53,24 @@ class OpenSetRule(msgspec.Struct, frozen=True):
         return ""
 
     def threshold(self, step: int) -> float:
-        """That of a step, counted from 1."""
+        """Return the threshold of a step, counted from 1."""
         return self.thresholds[step - 1 if len(self.thresholds) > 1 else 0]
 
 
 class PredictionSetRule(msgspec.Struct, frozen=True):
-    """The rule of a step's prediction set: the classes that it leaves possible.
+    """The rule of a step's prediction set: the classes that the step leaves possible.
 
-    A class is in the set of a step if its score there is not above the step's quantile.
+    A class is in the set if its score in the step is at most the step's quantile.
 
     Attributes:
-        score: The name of the score that every class gets at a step: `MASS_ABOVE`.
-        coverage: The share of sweeps of unseen objects of which the true class is in the prediction
-            set of every step, in (0, 1).
+        score: The name of the score that every class gets in a step: `MASS_ABOVE`.
+        coverage: The share of sweeps of unseen objects whose true class is in the prediction set of
+            every step, in (0, 1).
         quantiles: (step,) The largest score of a class in the set, by step.
         objects: The number of objects that the quantiles were fitted on; the sweeps of an object
             count as one.
         noise: The largest noise for which the coverage holds, in multiples of the rated noise;
-            None if for any.
+            None: it holds for any noise.
     """
 
     score: str
@@ -81,7 +80,7 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
     noise: Annotated[float, msgspec.Meta(ge=0)] | None = None
 
     def fault(self, steps: int) -> str:
-        """What makes the rule unusable for episodes of so many steps; "" if nothing does."""
+        """Return why the rule cannot be used for episodes of `steps` steps, or ""."""
         if not named(self.score):
             return f"score must be 1 to {MAX_NAME} printable characters"
         if len(self.quantiles) != steps:
@@ -91,9 +90,9 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
         return ""
 
     def prediction_set(self, probabilities: NDArray[np.float32], step: int) -> list[int]:
-        """Form the set of a step, from 1, as indices of `probabilities` (class,).
+        """Form the prediction set of a step (from 1) as indices of `probabilities` (class,).
 
-        The most probable one is first, and always among them.
+        The most probable class is first, and always in the set.
         """
         order = np.argsort(-probabilities, kind="stable")
         allowed = mass_above(probabilities)[order] <= self.quantiles[step - 1]
@@ -101,16 +100,16 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
 
 
 def fitting(rules: Sequence[PredictionSetRule], noise: float) -> PredictionSetRule | None:
-    """The rule that holds at a noise, in multiples of the rated: the narrowest; None if none is."""
+    """Choose the narrowest rule valid at `noise` (in multiples of the rated noise), or None."""
     known = [r for r in rules if r.score == MASS_ABOVE and (r.noise is None or noise <= r.noise)]
     return min(known, key=lambda r: np.inf if r.noise is None else r.noise, default=None)
 
 
 def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(..., class) The share of the posterior that the classes have which are more probable.
+    """Compute for each class (..., class) the posterior mass of the more probable classes.
 
-    It is 0 for the most probable class, and next to 1 for the least. Where the posterior leaves
-    nothing to any class (all of it is a refusal's), all are alike.
+    It is 0 for the most probable class and close to 1 for the least. If the posterior of every
+    class is 0, since a refusal has all of it, the classes count as equally probable.
     """
     p = probabilities.astype(np.float64)
     p = np.where(p.sum(axis=-1, keepdims=True) > 0, p, 1.0)
@@ -124,7 +123,7 @@ def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def named(text: str) -> bool:
-    """Whether a text may stand for something on terminals, pages and in logs."""
+    """Return whether a text can be a name on terminals, pages and in logs."""
     return 0 < len(text) <= MAX_NAME and text.isprintable()
 
 
@@ -135,11 +134,11 @@ log = logging.getLogger("tactile_rt.classifier")
 
 
 class EarlyExit:
-    """Step by step: is the posterior sure enough to stop?
+    """The early exit: an episode ends once one class is probable enough.
 
     Args:
-        sure: probability of the best class, or None: never.
-        in_a_row: steps running in which the same class must be so sure.
+        sure: probability that the best class needs; None: no early exit.
+        in_a_row: consecutive steps in which the same class must be that probable.
 
     Raises:
         ConfigError: `sure` is no probability, or `in_a_row` not positive.
@@ -154,11 +153,11 @@ class EarlyExit:
         self._best, self._sure_for = -1, 0
 
     def begin(self) -> None:
-        """An episode begins."""
+        """Begin an episode."""
         self._sure_for = 0
 
     def reached(self, best: int, probability: float) -> bool:
-        """Take a step's best class and its probability; whether the episode may end with it."""
+        """Take a step's best class and probability; return whether the episode may end."""
         again = best == self._best
         self._best = best
         if probability < self._sure:
@@ -171,13 +170,13 @@ class EarlyExit:
 class Lanes:
     """Overlapping windows, each computed exactly: one lane of the batch per phase.
 
-    A network with state can answer for one window only, the one that began when its state was
-    zero. With windows of n steps that begin every k steps, ceil(n / k) copies of the state run
-    side by side, and each is zeroed when it is its turn to begin. This says which lane begins
-    before a step, and which is asked after it; steps are counted from 0.
+    A network with state can answer only for the window that began when its state was zero. With
+    windows of n steps that begin every k steps, ceil(n / k) copies of the state run side by side,
+    and each is zeroed when its window begins. `beginning` names the lane to zero before a step,
+    `asked` the lane that answers after it; steps are counted from 0.
 
     Args:
-        every: steps from one window's beginning to the next one's.
+        every: steps from the beginning of one window to that of the next.
 
     Attributes:
         count: The number of lanes, ceil(steps / every).
@@ -193,13 +192,13 @@ class Lanes:
         self.count = -(-steps // every)
 
     def beginning(self, step: int) -> int | None:
-        """The lane whose window begins with a step, or None."""
+        """Return the lane whose window begins with a step, or None."""
         return step // self.every % self.count if step % self.every == 0 else None
 
     def asked(self, step: int) -> tuple[int, int] | None:
-        """The lane to ask after a step, and its own step counted from 1; or None.
+        """Return the lane that answers after a step, with its own step; or None.
 
-        Until the first window is complete, that is the first window's lane.
+        A lane's steps are counted from 1. Until the first window is complete, its lane answers.
         """
         if step < self.steps:
             return 0, step + 1
@@ -208,27 +207,27 @@ class Lanes:
 
 
 class Deadline:
-    """Does the network keep up? Of every step: is its decision in time?
+    """The deadline of decisions: whether the network keeps up with its stream.
 
-    The work that waits shrinks with the stream's time and grows with every step's. A step is late
-    if more than `limit_s` of work has gathered by its end: because it took so long itself, or
-    because those before it did. That depends neither on how the stream was cut into chunks nor on
-    how fast it is read, so a replay says what a robot would have met. Of a live stream a step is
-    late, too, if its newest sample is older than `limit_s` by then, whatever kept it.
+    The backlog of work shrinks as stream time passes and grows by the time that each step takes. A
+    step is late if the backlog exceeds `limit_s` at its end, because it or the steps before it took
+    too long. That depends neither on how the stream was cut into chunks nor on how fast it is read,
+    so a replay shows what a robot would have met. In a live stream a step is also late if its
+    newest sample is then older than `limit_s`, for any reason.
 
     Args:
-        limit_s: work that may gather, and age of the newest sample that a step may have, s.
-        policy: what becomes of a late decision. ``count``: it is returned, marked and counted;
-            ``report``: and an episode's first is logged as a warning; ``skip``: it is counted and
-            withheld, as one that a robot must not act upon. The network takes every step in any
-            case: with one left out, the later decisions would be of another signal.
-        age: how old the sample of a stream time (ns) is now, s; None: the stream is not live.
+        limit_s: greatest backlog, and greatest age of a step's newest sample, s.
+        policy: how to treat a late decision. ``count``: return, mark and count it; ``report``:
+            also log the first of an episode as a warning; ``skip``: count and withhold it, so that
+            a robot does not act on it. The network takes every step in any case: with one left out,
+            later decisions would be about another signal.
+        age: returns the present age, s, of the sample of a stream time (ns); None: not live.
 
     Attributes:
-        behind_s: The work that had gathered at the end of the last step, s.
+        behind_s: The backlog at the end of the last step, s.
 
     Raises:
-        ConfigError: no such policy, or a limit that is not positive.
+        ConfigError: an unknown policy, or a limit that is not positive.
     """
 
     def __init__(
@@ -248,15 +247,15 @@ class Deadline:
         self._reported = False
 
     def begin(self) -> None:
-        """An episode begins; its first late step may be reported."""
+        """Begin an episode, whose first late step may be reported."""
         self._reported = False
 
     def missed(self, t_ns: int, took_s: float) -> bool:
-        """Whether a step is late.
+        """Add a step to the backlog; return whether it is late.
 
         Args:
             t_ns: stream time of its last sample, ns.
-            took_s: how long it took, s.
+            took_s: duration of the step, s.
         """
         passed = 0.0 if self._last_ns is None else (t_ns - self._last_ns) / 1e9
         self._last_ns = t_ns

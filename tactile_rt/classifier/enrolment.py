@@ -1,11 +1,11 @@
-"""Enrolled objects: which of them touches are of, or none, from embeddings alone.
+"""Enrolled objects: identify touches of them, or refuse, from embeddings alone.
 
-A network that was trained to tell objects apart puts touches of one object near each other. How
-objects differ, and how touches of one do, was measured on objects that it was not trained on: two
-Gaussians (probabilistic linear discriminant analysis: Ioffe 2006, doi:10.1007/11744085_41). They
-give the log odds that touches are of an object, of which some touches are known, against one of
-which none are. Below a threshold they are of none that is enrolled. Network, Gaussians and
-thresholds are fitted to last steps: of embeddings of earlier ones the rule promises nothing.
+A network that was trained to tell objects apart embeds touches of one object near each other. Two
+Gaussians, fitted on objects that it was not trained on, describe how objects differ and how touches
+of one object differ (probabilistic linear discriminant analysis: Ioffe 2006,
+doi:10.1007/11744085_41). They give the log odds that touches are of an enrolled object, against an
+unknown object. Below a threshold the touches are of no enrolled object. Network, Gaussians and
+thresholds are fitted to last steps: for embeddings of earlier steps the rule guarantees nothing.
 """
 
 from collections.abc import Sequence
@@ -17,31 +17,31 @@ from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.classifier.decision_rules import MAX_NAME, Count, Positive, Share, named
 
-NONE_OF_THESE = "none of these"  # what is decided of an object that is not enrolled
-LOG_ODDS = "log odds"  # the score of an `IdentityRule`: of the same object
+NONE_OF_THESE = "none of these"  # the decision on an object that is not enrolled
+LOG_ODDS = "log odds"  # the score of an `IdentityRule`: of being the same object
 
 Floats = NDArray[np.float64]
 
 
-ENROLLED, JUDGED = 5, 2  # touches, at most, that thresholds tell apart
+ENROLLED, JUDGED = 5, 2  # largest numbers of touches with thresholds of their own
 
 
 class IdentityRule(msgspec.Struct, frozen=True):
-    """When touches are of an enrolled object. Bytes are float16, little-endian.
+    """The rule that identifies enrolled objects. Bytes are float16, little-endian.
 
     Attributes:
         score: The name of the score: `LOG_ODDS`.
         refused: The share of touches of enrolled objects that are refused.
-        among: The numbers of enrolled objects that thresholds are for, ascending from 1; between
-            them they are interpolated over the logarithm.
+        among: The numbers of enrolled objects that have thresholds, ascending from 1; between them
+            thresholds are interpolated over the logarithm.
         thresholds: (among, 5, 2) The score below which touches are refused, by the number of
             objects, of touches that the object was enrolled by, from 1, and of touches that are
             judged, from 1; more count as 5 and 2.
-        objects: The number of objects that all this was measured on.
+        objects: The number of objects that the rule was fitted on.
         origin: (unit,) The mean of objects.
-        directions: (unit, direction) The map to directions in which touches of an object have the
-            variance 1 each.
-        between: (direction,) The variance of objects in them.
+        directions: (unit, direction) The map to directions in which touches of one object have
+            variance 1.
+        between: (direction,) The variance between objects in these directions.
     """
 
     score: str
@@ -75,16 +75,16 @@ class EnrolledObject(msgspec.Struct, frozen=True):
 def identify(
     rule: IdentityRule, objects: Sequence[EnrolledObject], embeddings: Sequence[NDArray[Any]]
 ) -> tuple[str, float]:
-    """Tell which enrolled object touches of one thing are of.
+    """Identify the enrolled object that touches of one thing belong to.
 
     Args:
-        embeddings: (unit,) of each touch, at its last step; order does not matter.
+        embeddings: (unit,) of each touch, at its last step, in any order.
 
     Returns:
-        The object's name, or `NONE_OF_THESE`; and by how much the score of the likeliest object is
-        above its threshold, below 0 where it is refused.
+        The object's name, or `NONE_OF_THESE`; and the score of the likeliest object less its
+        threshold, below 0 if it is refused.
     """
-    means = _numbers(b"".join(one.mean for one in objects)).reshape(len(objects), -1)
+    means = _decode_float16(b"".join(one.mean for one in objects)).reshape(len(objects), -1)
     enrolled = np.array([one.touches for one in objects])
     touches = project(rule, np.mean(embeddings, axis=0))
     found = margins(rule, project(rule, means), enrolled, touches, len(embeddings))
@@ -94,8 +94,8 @@ def identify(
 
 def project(rule: IdentityRule, embeddings: NDArray[Any]) -> Floats:
     """Map embeddings (..., unit), or means of them, to the rule's directions."""
-    origin = _numbers(rule.origin)
-    directions = _numbers(rule.directions).reshape(len(origin), -1)
+    origin = _decode_float16(rule.origin)
+    directions = _decode_float16(rule.directions).reshape(len(origin), -1)
     return np.asarray((embeddings - origin) @ directions)
 
 
@@ -106,12 +106,12 @@ def margins(
     touches: Floats,
     judged: int = 1,
 ) -> Floats:
-    """Compute by how much scores (..., object) are above their thresholds.
+    """Compute the scores (..., object) less their thresholds.
 
     Args:
-        objects: (..., object, direction) the means of touches that they were enrolled by.
-        enrolled: (..., object) how many these were.
-        touches: (..., direction) the mean of those that are judged, of which there are so many.
+        objects: (..., object, direction) the mean of the touches that enrolled each object.
+        enrolled: (..., object) the number of these touches.
+        touches: (..., direction) the mean of the `judged` touches to identify.
     """
     between = np.array(rule.between)
     odds = log_odds(between, objects, enrolled[..., None], touches[..., None, :], judged)
@@ -127,10 +127,10 @@ def log_odds(
     """Compute log odds (...) that touches are of an object, against an unknown one.
 
     Args:
-        between: (direction,) variance of objects; that of touches of one is 1.
-        objects, touches: (..., direction) means of so many touches each, enrolled and judged.
+        between: (direction,) variance between objects; that of touches of one object is 1.
+        objects, touches: (..., direction) means of `enrolled` and of `judged` touches.
     """
-    rest = between / (np.asarray(enrolled) * between + 1)  # the variance of where the object is
+    rest = between / (np.asarray(enrolled) * between + 1)  # variance left of the object's mean
     own, any_object = rest + 1 / judged, between + 1 / judged
     away = touches - np.asarray(enrolled) * rest * objects
     each = touches**2 / any_object - away**2 / own + np.log(any_object / own)
@@ -140,7 +140,7 @@ def log_odds(
 def enrolment_fault(
     rule: IdentityRule | None, objects: Sequence[EnrolledObject], units: int
 ) -> str:
-    """Say what makes a card's enrolment unusable; "" if nothing does."""
+    """Return why a card's enrolment cannot be used, or ""."""
     if rule is None:
         return "enrolled objects, but no rule `identity`" if objects else ""
     if rule.score != LOG_ODDS:
@@ -152,7 +152,7 @@ def enrolment_fault(
         return f"identity: {sizes[:9]} bytes for {units} units"
     if sizes[1] != 2 * units * len(rule.between):
         return f"identity: {sizes[1]} bytes for {units} units, {len(rule.between)} directions"
-    numbers = map(_numbers, (rule.origin, rule.directions, *(one.mean for one in objects)))
+    numbers = map(_decode_float16, (rule.origin, rule.directions, *(one.mean for one in objects)))
     if not all(np.isfinite(one).all() for one in numbers):
         return "identity or enrolled: numbers that are none"
     names = [one.name for one in objects]
@@ -161,5 +161,5 @@ def enrolment_fault(
     return ""
 
 
-def _numbers(data: bytes) -> Floats:
+def _decode_float16(data: bytes) -> Floats:
     return np.frombuffer(data, "<f2").astype(float)

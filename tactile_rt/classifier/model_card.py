@@ -1,7 +1,7 @@
-"""What a model file says of itself: the array, the episode, the classes, what was measured.
+"""Model cards: a model file's metadata on its array, episode, classes and measured figures.
 
-Fields that a release does not know are passed over; the version is raised only when an older
-reader would misread a file.
+A release ignores fields that it does not know; the version is raised only when an older reader
+would misread a file.
 """
 
 import math
@@ -35,8 +35,8 @@ from tactile_rt.core.stream.sensor_spec import SensorSpec, channel_limits
 CARD_VERSION = 3
 STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
 MAX_STEPS = 1_000_000
-PERIODS_NS = range(1_000, 10**12 + 1)  # of samples: from a million a second
-MAX_EPISODE = 2**24  # values: checks run one at once, and a robot's has some 20,000
+PERIODS_NS = range(1_000, 10**12 + 1)  # of samples: at most a million per second
+MAX_EPISODE = 2**24  # values: checks run a whole episode at once; a robot's has some 20,000
 
 Kind = Literal["step", "window"]
 
@@ -44,7 +44,7 @@ Kind = Literal["step", "window"]
 class StateTensor(msgspec.Struct, frozen=True):
     """One recurrent state: its name, shape without the batch axis, and element type.
 
-    `in_place`: a step only writes some rows of it, so `<name>_next` may be the same memory.
+    `in_place`: a step writes only some of its rows, so `<name>_next` may be the same memory.
     """
 
     name: str
@@ -66,32 +66,30 @@ class ModelCard(msgspec.Struct, frozen=True):
         clip, scale: (channel,) Limits and smallest scale of the input compression, SI.
         floor: (channel,) The smallest sigma that the contact detector assumes, SI.
         temperature: The number that divides the logits, fitted on validation sweeps so that
-            probabilities mean what they say.
+            probabilities are calibrated.
         provenance: The origin of the file: network, training, data set, hashes.
         figures: The figures measured on the model, such as parity and accuracy.
         kind: The form of the input, "step" or "window", see `model_file`.
         precision: The number format in which weights are stored and multiplied.
         opset: The version of ONNX's operators that the graph uses.
-        hashes: SHA-256 sums, hex, by what they are of; "graph" is `onnx_check.graph_sha256` of the
-            file.
+        hashes: SHA-256 sums, hex, by subject; "graph" is `onnx_check.graph_sha256` of the file.
         probe: (step, class) Logits of the built-in probe episode, by which `tactile-rt model
-            verify` tells whether another machine computes the same.
+            verify` checks whether another machine computes the same.
         embedding: The number of units of the output ``embedding``.
-        sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
-        changes: The share of readings at rest that differ from the one before, of the element that
-            repeats most; 0 if it is not known.
-        unknown: The rule by which an object is of no known class; None if there is none.
+        sensor: Known properties of the array's sensor (rate, noise, range, ...); may be empty.
+        changes: The share of readings at rest that differ from the one before, for the element that
+            repeats most; 0 if unknown.
+        unknown: The open-set rule; None if the model has none.
         candidates: The rules of prediction sets, each for another noise or coverage.
-        kinds: The kinds that the model tells apart within a class, by the names of the classes that
-            have some; in this order, and theirs, they are those of the output ``names``.
-        names: The rules of prediction sets of these kinds, by the names of the classes.
-        refusals: The last of the labels, if any: those that name no class, but say that the object
-            is unknown, or what is wrong with the loads.
-        identity: The rule by which touches are of an enrolled object, of networks whose embedding
-            was trained to tell objects apart; None: the file cannot enrol any.
-        enrolled: The objects that it knows beside its classes, by touches of each.
-        license: The licence of the file, an SPDX expression such as "Apache-2.0"; empty if it is
-            not told.
+        kinds: The kinds that the model distinguishes within a class, by class; only classes that
+            have kinds. All kinds in this order are the columns of the output ``names``.
+        names: The rules of prediction sets of these kinds, by class.
+        refusals: The last of the labels, if any: they name no class, but say that the object is
+            unknown, or what is wrong with the loads.
+        identity: The rule that identifies enrolled objects, for networks whose embedding was
+            trained to tell objects apart; None: no object can be enrolled.
+        enrolled: The objects that the model knows by a few touches, in addition to its classes.
+        license: The licence of the file, an SPDX expression such as "Apache-2.0"; empty if unknown.
     """
 
     name: Annotated[str, msgspec.Meta(max_length=MAX_NAME)]
@@ -127,7 +125,7 @@ class ModelCard(msgspec.Struct, frozen=True):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The labels that are classes: those before the refusals."""
+        """The labels that are classes, which are those before the refusals."""
         return self.labels[: len(self.labels) - len(self.refusals)]
 
     @property
@@ -137,7 +135,7 @@ class ModelCard(msgspec.Struct, frozen=True):
 
     @property
     def class_of(self) -> dict[str, str]:
-        """Classes by the categories that count as them, by the first sweep set's recipe."""
+        """The class of each category, from the recipe of the first sweep set."""
         with suppress(TypeError, KeyError, msgspec.ValidationError):
             classes = self.provenance["sweep_set"]["objects"]["classes"]
             merged = msgspec.convert(classes, dict[str, tuple[str, ...]])
@@ -152,7 +150,7 @@ def kind_columns(kinds: Mapping[str, Sequence[str]]) -> dict[str, slice]:
 
 
 def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.intp]:
-    """Where the source has each element of the model: ``samples[..., order, :]`` feeds the model.
+    """Find the source's index of each model element: ``samples[..., order, :]`` feeds the model.
 
     Name, rate and the order of elements may differ; nothing else may.
 
@@ -160,7 +158,7 @@ def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.in
         (element,) indices into the source's elements, 0, 1, 2, ... when the order is the same.
 
     Raises:
-        SpecMismatch: the two are different arrays; the message says exactly where.
+        SpecMismatch: the arrays differ; the message says exactly where.
     """
     mine, theirs = card_spec.elements, source_spec.elements
     if set(mine) == set(theirs):
@@ -182,7 +180,7 @@ def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.in
 
 
 def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp]:
-    """As `element_order`, for a model's file: where the source has the elements of its array.
+    """Find the `element_order` of a source for a model file.
 
     Args:
         model: the file, for the message.
@@ -207,10 +205,10 @@ def parse_card(path: Path, text: str) -> ModelCard:
     """Read a model's metadata.
 
     Raises:
-        ModelError: damaged, of another version, or describing what cannot be run.
+        ModelError: the metadata is damaged, of another version, or describes no usable model.
     """
 
-    def damaged(why: object) -> ModelError:
+    def reject(why: object) -> ModelError:
         return ModelError(f"{path} has damaged metadata: {one_line(why)}")
 
     try:
@@ -223,69 +221,69 @@ def parse_card(path: Path, text: str) -> ModelCard:
         card = msgspec.json.decode(text, type=ModelCard)
         elements, channels = card.array.shape
     except (msgspec.MsgspecError, ConfigError) as error:
-        raise damaged(error) from None
+        raise reject(error) from None
     except RecursionError:
-        raise damaged("nested too deeply") from None
+        raise reject("nested too deeply") from None
     for what in ("clip", "scale", "floor"):
         if len(getattr(card, what)) != channels:
-            raise damaged(f"{len(getattr(card, what))} values of {what} for {channels} channels")
+            raise reject(f"{len(getattr(card, what))} values of {what} for {channels} channels")
     if not card.labels or len(set(card.labels)) != len(card.labels):
-        raise damaged("labels are missing or repeat")
-    # Decisions carry them to terminals, pages and logs.
+        raise reject("labels are missing or repeat")
+    # Decisions carry labels to terminals, pages and logs.
     if not all(map(named, card.labels)):
-        raise damaged(f"labels must be 1 to {MAX_NAME} printable characters")
+        raise reject(f"labels must be 1 to {MAX_NAME} printable characters")
     if card.license and not named(card.license):
-        raise damaged(f"a licence must be at most {MAX_NAME} printable characters")
+        raise reject(f"a licence must be at most {MAX_NAME} printable characters")
     if not isinstance(card.provenance.get("unseen_objects", []), list):
-        raise damaged("unseen_objects of the provenance must be a list")
+        raise reject("unseen_objects of the provenance must be a list")
     names = ["samples", "offset", "sigma", *(s.name for s in card.state)]
     if len(set(names)) != len(names):
-        raise damaged("names of the state repeat")
+        raise reject("names of the state repeat")
     if card.kind == "window" and card.state:
-        raise damaged("a window has no state")
+        raise reject("a window has no state")
     shapes = {s.name: s.shape for s in card.state}
     window = (card.steps,) if card.kind == "window" else ()
     shapes["samples"] = (*window, card.substeps, elements, channels)
     for name, shape in shapes.items():
-        # Python's integers: a product of int64 may come round to something small.
+        # Python's integers, since a product of int64 may overflow to a small number.
         if min(shape, default=1) < 1 or math.prod(shape) > MAX_ELEMENTS:
-            raise damaged(f"{name[:40]} of shape {'x'.join(map(str, shape))[:80]}")
+            raise reject(f"{name[:40]} of shape {'x'.join(map(str, shape))[:80]}")
     episode = card.steps * card.substeps * elements * channels
     if episode > MAX_EPISODE:
-        raise damaged(f"an episode of {episode} values")
+        raise reject(f"an episode of {episode} values")
     if sum(math.prod(shape) for shape in shapes.values()) > MAX_ELEMENTS:
-        raise damaged("its state is larger than any robot's memory should hold")
+        raise reject("its state is larger than any robot's memory should hold")
     for state in card.state:
         if state.dtype not in STATE_TYPES:
-            raise damaged(f"{state.name[:40]} of type {state.dtype[:40]!r}")
+            raise reject(f"{state.name[:40]} of type {state.dtype[:40]!r}")
     if card.probe and [len(row) for row in card.probe] != [len(card.labels)] * card.steps:
-        raise damaged(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
+        raise reject(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
     if card.embedding < 1:
-        raise damaged(f"an embedding of {card.embedding} units")
+        raise reject(f"an embedding of {card.embedding} units")
     for name, kinds in card.kinds.items():
         if name not in card.classes or not kinds or len(set(kinds)) != len(kinds):
-            raise damaged(f"kinds of {name[:MAX_NAME]!r}: it is no class, or they repeat")
+            raise reject(f"kinds of {name[:MAX_NAME]!r}: it is no class, or they repeat")
         if not all(map(named, kinds)):
-            raise damaged(f"kinds must be 1 to {MAX_NAME} printable characters")
+            raise reject(f"kinds must be 1 to {MAX_NAME} printable characters")
     if not card.names.keys() <= card.kinds.keys():
-        raise damaged("names have rules of a class without kinds")
+        raise reject("names have rules of a class without kinds")
     rules = {f"candidates[{i}]": rule for i, rule in enumerate(card.candidates)}
     for name, own in card.names.items():
         rules |= {f"names.{name[:MAX_NAME]}[{i}]": rule for i, rule in enumerate(own)}
     for what, rule in {"unknown": card.unknown, **rules}.items():
         if rule is not None and (wrong := rule.fault(card.steps)):
-            raise damaged(f"{what}.{wrong}")
+            raise reject(f"{what}.{wrong}")
     if card.refusals != card.labels[len(card.labels) - len(card.refusals) :]:
-        raise damaged("refusals are not the last of the labels")
+        raise reject("refusals are not the last of the labels")
     if len(card.refusals) == len(card.labels):
-        raise damaged("there are no labels but refusals")
+        raise reject("there are no labels but refusals")
     if wrong := enrolment_fault(card.identity, card.enrolled, card.embedding):
-        raise damaged(wrong)
+        raise reject(wrong)
     return card
 
 
 def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> int:
-    """The index of the label that a model decides for.
+    """Return the index of the label that a model decides for.
 
     Args:
         probabilities: (class,) of all its labels.
@@ -296,7 +294,7 @@ def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> i
         return int(probabilities.argmax())
     best, unknown = int(probabilities.argmax()), card.labels.index(UNKNOWN)
     if best != unknown and best >= len(card.classes):
-        return best  # what is wrong with the loads says nothing of the object
+        return best  # faulty loads say nothing about the object
     if probabilities[unknown] > rule.threshold(step):
         return unknown
     others = probabilities.copy()
@@ -305,9 +303,9 @@ def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> i
 
 
 def rated_noise(card: ModelCard) -> NDArray[np.float32]:
-    """(channel,) the rated noise per sample of the array that a model is for, SI.
+    """Return the rated noise (channel,) per sample of a model's array, SI.
 
-    Where neither the card nor a unit tells it, that from which the floor is derived.
+    If neither the card nor a unit determines it, it is the card's floor.
     """
     try:
         return channel_limits(card.array, sensor_of(card), card.period_ns).noise
@@ -316,7 +314,7 @@ def rated_noise(card: ModelCard) -> NDArray[np.float32]:
 
 
 def sensor_of(card: ModelCard) -> SensorSpec | None:
-    """The sensor that a model was made for; None where the card does not tell it."""
+    """Return the sensor that a model was made for, or None if unknown."""
     try:
         return msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
     except (ConfigError, msgspec.ValidationError):
@@ -324,6 +322,6 @@ def sensor_of(card: ModelCard) -> SensorSpec | None:
 
 
 def one_line(reason: object) -> str:
-    """The first line of a reason, without what a terminal would obey."""
+    """Return the first line of a reason, with unprintable characters replaced."""
     line = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
     return "".join(c if c.isprintable() else "?" for c in line)

@@ -1,4 +1,4 @@
-"""A classifier at rest: one ONNX file whose metadata says everything needed to run it.
+"""Model files: one ONNX file each, whose metadata holds everything needed to run it.
 
 Inputs of the graph, one step of a stream, for a batch of independent streams:
 
@@ -7,12 +7,12 @@ Inputs of the graph, one step of a stream, for a batch of independent streams:
     sigma    (batch, element, channel) float32, SI: noise per sample, measured with the baseline
     <state>  every tensor of `ModelCard.state`, all zeros when an episode begins
 
-Outputs: ``logits (batch, class)``, ``embedding (batch, unit)`` (what the network's last linear
-layer reads in this step, or, where it was trained to tell objects apart, a vector of length 1 of
-all steps so far), ``names (batch, name)`` of models with `ModelCard.kinds` (logits, of which those
-of one class are a choice) and for every state tensor ``<name>_next``, its next value. Units,
-clipping, scaling and the layout on the grid are inside the graph, where a sample that is no number,
-or infinite, is no load and leaves nothing in the state.
+Outputs: ``logits (batch, class)``, ``embedding (batch, unit)`` (the input of the network's last
+linear layer in this step, or, if it was trained to tell objects apart, a vector of length 1 from
+all steps so far), ``names (batch, name)`` of models with `ModelCard.kinds` (logits; the softmax is
+taken over the kinds of one class) and for every state tensor ``<name>_next``, its next value.
+Units, clipping, scaling and the layout on the grid are inside the graph, where a sample that is NaN
+or infinite counts as no load and leaves nothing in the state.
 
 A file of kind "window" takes a whole episode instead: ``samples (batch, step, sub-step, element,
 channel)``, no state, and gives the other outputs with a step axis after the batch's.
@@ -60,21 +60,21 @@ __all__ = [
 ]
 
 METADATA_KEY = "tactile_rt"
-MESSAGE = 300  # characters of what a file, or onnxruntime, has us say
+MESSAGE = 300  # characters quoted from a file or from onnxruntime
 Described = tuple[tuple[Any, ...], str]
 SHIPPED = Path(__file__).parents[1] / "assets" / "mouse13.onnx"
 
 
 def shipped_model() -> Path:
-    """The model that comes with the package: twelve shapes, on the right mouse array."""
+    """Return the path of the packaged model: twelve shapes, on the right mouse array."""
     return SHIPPED
 
 
 def hash_of(model: Path) -> str:
-    """The sha256 of a model's file.
+    """Return the SHA-256 (hex) of a model's file.
 
     Raises:
-        ConfigError: it cannot be read.
+        ConfigError: the file cannot be read.
     """
     try:
         return hashlib.sha256(model.read_bytes()).hexdigest()
@@ -83,14 +83,14 @@ def hash_of(model: Path) -> str:
 
 
 def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Contents, bytes]:
-    """Read a model file without running it: its card, what else it holds, its bytes.
+    """Read a model file without running it; return card, contents and bytes.
 
     Args:
         path: the ``.onnx`` file.
         kind: the kind of model that is needed; None takes any.
 
     Raises:
-        ModelError: not of this kind, not there, too large, not ONNX, reaching outside the file or
+        ModelError: not of this kind, missing, too large, not ONNX, reaching outside the file or
             past the limits of `onnx_check`, without our metadata, or with metadata that is damaged,
             of another version, or names other inputs and outputs than the graph.
     """
@@ -104,7 +104,7 @@ def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Content
         data = path.read_bytes()
         contents = read_onnx(data)
     except (BadModel, OSError) as error:
-        reason = error.strerror if isinstance(error, OSError) else _mistaken(data) or error
+        reason = error.strerror if isinstance(error, OSError) else _describe_mistake(data) or error
         raise ModelError(f"{path} is not a readable ONNX model: {reason}") from None
     text = contents.metadata.get(METADATA_KEY)
     if text is None:
@@ -117,7 +117,7 @@ def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Content
         raise ModelError(f"{path} is a model of kind {card.kind!r}; this needs {kind!r}")
     named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
     if wrong := sorted(named ^ set(contents.inputs)):
-        raise _disagree(path, wrong)
+        raise _make_input_error(path, wrong)
     for name in (*output_sizes(card), *(f"{s.name}_next" for s in card.state)):
         if name not in contents.outputs:
             raise ModelError(f"{path}: no output `{one_line(name)}`, which its metadata promises")
@@ -137,8 +137,8 @@ def load_model(
         kind: the kind of model that is needed; None takes any.
 
     Raises:
-        ModelError: as `read_model`; or not of this kind, not run by onnxruntime, or the graph
-            disagrees with the card.
+        ModelError: as `read_model`; or onnxruntime cannot run the graph, or the graph disagrees
+            with the card.
         ConfigError: this onnxruntime lacks a provider, or cannot use it here.
     """
     available = ort.get_available_providers()
@@ -149,17 +149,17 @@ def load_model(
     options = ort.SessionOptions()
     # A 1 ms step gains nothing from more threads, and the robot has other work for its cores.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
-    # For helper threads; this one's mode onnxruntime may change for ever: `FlushDenormals`.
+    # For helper threads. onnxruntime may change this thread's mode for good: see `FlushDenormals`.
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
     options.log_severity_level = 4  # failures come as exceptions; the log would repeat them
-    # What was read as ONNX is not to be taken for another format by its first bytes.
+    # Load as ONNX, as checked, whatever other format the first bytes suggest.
     options.add_session_config_entry("session.load_model_format", "ONNX")
     try:
-        # The bytes that were checked, not the file, which may be another by now.
-        with FlushDenormals():  # which in the end puts the thread's mode back
+        # Load the checked bytes, not the file, which may have changed by now.
+        with FlushDenormals():  # restores the thread's mode on leaving
             session = ort.InferenceSession(data, options, providers=list(providers))
     except Exception as error:  # onnxruntime raises a dozen unrelated types for a bad file
-        raise ModelError(f"{path} is not a readable ONNX model: {_reason(error)}") from None
+        raise ModelError(f"{path} is not a readable ONNX model: {_shorten_reason(error)}") from None
     unused = [p for p in providers if p not in session.get_providers()]
     if unused:
         raise ConfigError(f"onnxruntime cannot use {', '.join(unused)} on this machine")
@@ -177,12 +177,12 @@ def check_graph(
     Args:
         card: of the file.
         inputs: shape and type of each, the latter as onnxruntime writes it, ``tensor(float)``; an
-            axis that is not known is no int, and a shape that is not known is empty.
+            unknown axis is not an int, and an unknown shape is empty.
         outputs: likewise.
         path: of the file, for the message.
 
     Raises:
-        ModelError: they disagree; names where.
+        ModelError: they disagree; the message names where.
     """
     window = card.kind == "window"
     # (shape without the batch axis, element type) of everything the classifier will feed
@@ -197,12 +197,12 @@ def check_graph(
     }
     if window and "samples" in inputs:
         steps = (without_batch["samples"][0] or (0,))[0]
-        if not isinstance(steps, int):  # a window may be made for any number of them
+        if not isinstance(steps, int):  # the graph takes any number of steps
             expected["samples"] = ((steps, *sample), _onnx_type("float32"))
     wrong = {k for k in without_batch | expected if without_batch.get(k) != expected.get(k)}
     wrong |= {name for name, (shape, _) in inputs.items() if not shape}  # not even a batch
     if wrong:
-        raise _disagree(path, sorted(wrong))
+        raise _make_input_error(path, sorted(wrong))
     batches = {shape[0] for shape, _ in inputs.values()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
@@ -221,19 +221,19 @@ def check_graph(
 
 
 def output_sizes(card: ModelCard) -> dict[str, int]:
-    """List the outputs that are no state, and how many numbers each has."""
+    """Return the sizes of the outputs that are not states, by name."""
     sizes = {"logits": len(card.labels), "embedding": card.embedding}
     names = sum(map(len, card.kinds.values()))
     return {**sizes, "names": names} if names else sizes
 
 
-def _disagree(path: Path, wrong: Sequence[str]) -> ModelError:
+def _make_input_error(path: Path, wrong: Sequence[str]) -> ModelError:
     names = one_line(", ".join(wrong))[:MESSAGE]
     return ModelError(f"{path}: the graph's inputs disagree with its metadata at {names}")
 
 
-def _mistaken(data: bytes) -> str:
-    """What a file is that somebody took for a model, as far as its first bytes tell."""
+def _describe_mistake(data: bytes) -> str:
+    """Describe a file that is not a model, from its first bytes; "" if unknown."""
     if not data:
         return "it is empty"
     if is_pointer(data):
@@ -246,8 +246,8 @@ def _mistaken(data: bytes) -> str:
     return ""
 
 
-def _reason(error: Exception) -> str:
-    """What onnxruntime says, less where in its source that is."""
+def _shorten_reason(error: Exception) -> str:
+    """Return onnxruntime's message without locations in its source."""
     text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", one_line(error))
     if newest := re.search(r"Opset (\d+) is .* is till opset (\d+)", text):
         return (
@@ -270,15 +270,15 @@ def _onnx_type(dtype: str) -> str:
 
 
 Floats = NDArray[np.float32]
-# Of the probe's logits, over their spread: sums are rounded in another order on another processor,
-# and int8 activations then fall on the other side of a step now and then.
+# Tolerances of the probe's logits, relative to their spread: another processor rounds sums in
+# another order, which sometimes moves an int8 activation by one level.
 PROBE_BARS = {"fp32": 1e-4, "fp16": 1e-2, "bf16": 1e-2, "int8": 0.1}
 
 
 def file_outputs(
     session: ort.InferenceSession, card: ModelCard, samples: Floats, offset: Floats, sigma: Floats
 ) -> dict[str, Floats]:
-    """What a file of either kind says of windows, each from a state of zeros.
+    """Run a model file of either kind on windows, each from a zero state.
 
     Args:
         session, card: the file, as `load_model` gives it.
@@ -289,61 +289,60 @@ def file_outputs(
         ``logits`` (batch, step, class), ``embedding`` (batch, step, unit) and, of a model with
             kinds, ``names`` (batch, step, name).
     """
-    wanted = list(output_sizes(card))
+    outputs = list(output_sizes(card))
     feed: dict[str, NDArray[Any]] = {"offset": offset, "sigma": sigma}
     if card.kind == "window":
-        windows = session.run(wanted, {"samples": samples, **feed})
-        return dict(zip(wanted, windows, strict=True))
+        windows = session.run(outputs, {"samples": samples, **feed})
+        return dict(zip(outputs, windows, strict=True))
     feed |= {s.name: np.zeros((len(samples), *s.shape), dtype=s.dtype) for s in card.state}
-    names = [*wanted, *(f"{s.name}_next" for s in card.state)]
+    names = [*outputs, *(f"{s.name}_next" for s in card.state)]
     kept: dict[str, list[Floats]] = defaultdict(list)
     for t in range(samples.shape[1]):
         out = dict(zip(names, session.run(names, {"samples": samples[:, t], **feed}), strict=True))
         feed |= {s.name: out[f"{s.name}_next"] for s in card.state}
-        for name in wanted:
+        for name in outputs:
             kept[name].append(out[name])
     return {name: np.stack(steps, axis=1) for name, steps in kept.items()}
 
 
 def probe_logits(session: ort.InferenceSession, card: ModelCard) -> Floats:
-    """Run one episode of built-in input, the same on every machine: logits (step, class)."""
-    logits: Floats = file_outputs(session, card, *_probe(card))["logits"][0]
+    """Run the probe episode, the same on every machine; return logits (step, class)."""
+    logits: Floats = file_outputs(session, card, *_make_probe(card))["logits"][0]
     return logits
 
 
 def verify_model(path: Path) -> list[str]:
-    """Check a file against what it says of itself: one line for each thing checked.
+    """Check a file against its metadata; return a line for each check.
 
     Raises:
         ModelError: as `load_model`; the graph is not the one that was exported, this machine
-            computes other logits than those stored, or a sample that is no number outlives its
-            step.
+            computes other logits than those stored, or a NaN sample affects later steps.
     """
     session, card = load_model(path, kind=None)
-    said = []
+    lines = []
     if stored := card.hashes.get("graph"):
         found = graph_sha256(read_model(path)[2])
         if found != stored:
             raise ModelError(f"{path}: the graph is another than was exported: sha256 {found}")
-        said.append(f"graph: as it was exported, sha256 {found}")
+        lines.append(f"graph: as it was exported, sha256 {found}")
     else:
-        said.append("graph: the file stores no hash of it")
-    samples, offset, sigma = _probe(card)
+        lines.append("graph: the file stores no hash of it")
+    samples, offset, sigma = _make_probe(card)
     outputs = file_outputs(session, card, samples, offset, sigma)
     if bad := [name for name, values in outputs.items() if not np.isfinite(values).all()]:
         raise ModelError(f"{path}: the probe episode gives `{bad[0]}` that is not finite")
-    if not _same(outputs, file_outputs(session, card, samples, offset, sigma)):
+    if not _are_equal(outputs, file_outputs(session, card, samples, offset, sigma)):
         raise ModelError(f"{path}: the probe episode gives other logits when run again")
-    said.append(f"probe: {card.steps} finite steps, the same again after a reset")
-    said.append(f"embedding: {card.embedding} units, finite")
+    lines.append(f"probe: {card.steps} finite steps, the same again after a reset")
+    lines.append(f"embedding: {card.embedding} units, finite")
     samples[:, 0] = offset[:, None]
     at_rest = file_outputs(session, card, samples, offset, sigma)
     samples[:, 0] = np.resize((np.nan, np.inf, -np.inf), samples[:, 0].shape)
-    if not _same(file_outputs(session, card, samples, offset, sigma), at_rest):
+    if not _are_equal(file_outputs(session, card, samples, offset, sigma), at_rest):
         raise ModelError(f"{path}: a sample that is no number is not taken for no load")
-    said.append("bad samples: NaN and infinity are no load")
+    lines.append("bad samples: NaN and infinity are no load")
     if not card.probe:
-        return [*said, "parity: the file stores no logits to compare with"]
+        return [*lines, "parity: the file stores no logits to compare with"]
     logits, expected = outputs["logits"][0], np.array(card.probe)
     bar = PROBE_BARS[card.precision] * max(1.0, float(expected.std()))
     worst = float(abs(logits - expected).max())
@@ -352,18 +351,18 @@ def verify_model(path: Path) -> list[str]:
             f"{path}: logits of the probe episode differ by {worst:.1e} from those stored "
             f"(at most {bar:.1e} is allowed): damage, or arithmetic unlike where it was made"
         )
-    return [*said, f"parity: logits within {worst:.1e} of those stored (bar {bar:.1e})"]
+    return [*lines, f"parity: logits within {worst:.1e} of those stored (bar {bar:.1e})"]
 
 
-def _same(found: dict[str, Floats], expected: dict[str, Floats]) -> bool:
+def _are_equal(found: dict[str, Floats], expected: dict[str, Floats]) -> bool:
     return all(np.array_equal(found[name], expected[name]) for name in expected)
 
 
-def _probe(card: ModelCard) -> tuple[Floats, Floats, Floats]:
-    """Samples, offset and sigma of the probe episode, a batch of one.
+def _make_probe(card: ModelCard) -> tuple[Floats, Floats, Floats]:
+    """Make samples, offset and sigma of the probe episode, a batch of one.
 
-    Made by integer and exact arithmetic only: a heavy-tailed sequence that reaches from below the
-    scale of the input compression to above its clip.
+    Only integer and exact arithmetic is used, for a heavy-tailed sequence that reaches from below
+    the scale of the input compression to above its clip.
     """
     elements, channels = card.array.shape
     shape = (card.steps + 2, card.substeps, elements, channels)

@@ -1,8 +1,8 @@
-"""What an ONNX file holds, read without running it: a bounded walk over its protobuf fields.
+"""Safe inspection of ONNX files: a bounded walk over their protobuf fields, without running them.
 
-onnxruntime follows what a file says: external data to any path, an operator's context to another
-file, a constant's shape to any amount of memory. So a file is walked first, and refused if it is
-anything but weights, ONNX's own operators and metadata within these limits. Only the bytes given
+onnxruntime obeys the file: external data at any path, an operator's context in another file, a
+constant's shape of any amount of memory. So a file is walked first, and refused if it holds
+anything but weights, ONNX's own operators and metadata within these limits. Only the given bytes
 are read. Field numbers are those of ``onnx.proto`` (IR version 10).
 """
 
@@ -22,16 +22,16 @@ MAX_OPSET = 1000  # ONNX is at 26 after nine years
 MAX_ELEMENTS = 2**28  # of one tensor: 1 GiB of float32
 MAX_SHAPE = 16  # axes of a constant that may be a shape
 
-# Of onnxruntime's own operators those that quantised and fused networks need; EPContext, for one,
-# opens the file that it names.
+# onnxruntime's own operators that quantised and fused networks need. No others are allowed:
+# EPContext, for example, opens the file that it names.
 MICROSOFT = frozenset(
     ("DynamicQuantizeMatMul", "FastGelu", "FusedMatMul", "Gelu", "MatMulIntegerToFloat",
      "MatMulNBits", "QGemm", "QuickGelu", "SkipLayerNormalization")
 )  # fmt: skip
-# Operators whose output is as large as a constant input says: the input's position.
+# Operators whose output size is the value of a constant input: that input's position.
 SIZED_BY = {"ConstantOfShape": 0, "Expand": 1, "OneHot": 1, "Pad": 1, "Range": 1, "Tile": 1}
-# Operators whose output has a shape that is not known from the shapes of the inputs: it follows the
-# values of all inputs, or of those from this position on. Memory and time must not follow a touch.
+# Operators whose output shape depends on the values of inputs, not only on their shapes: of all
+# inputs, or of those from this position on. Memory and time must not depend on a touch.
 SHAPED_BY = {
     **dict.fromkeys(
         ("BlackmanWindow", "ConstantOfShape", "HammingWindow", "HannWindow", "If", "ImageDecoder",
@@ -46,7 +46,7 @@ SHAPED_BY = {
     "MaxUnpool": 2,
     "SequenceInsert": 2,
 }  # fmt: skip
-VALUE_AT = {"OneHot": 2, "Pad": 2}  # but for this input, which fills places and makes none
+VALUE_AT = {"OneHot": 2, "Pad": 2}  # except this input, which only gives a fill value
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 TENSOR_BITS = {1: 32, 2: 8, 3: 8, 4: 16, 5: 16, 6: 32, 7: 64, 9: 8, 10: 16, 11: 64, 12: 32,
                13: 64, 14: 64, 15: 128, 16: 16, 17: 8, 18: 8, 19: 8, 20: 8, 21: 4,
@@ -55,12 +55,12 @@ INT64 = 7
 
 
 class BadModel(Exception):
-    """The bytes are no model, or one that we do not open: the message says why, in one line."""
+    """The bytes are no model that may be opened; the message is one line."""
 
 
 @dataclass
 class Contents:
-    """What a model file holds.
+    """The contents of a model file.
 
     Attributes:
         opset: The version of each operator set, by domain; ``""`` is ONNX's own.
@@ -90,7 +90,7 @@ def read_onnx(data: bytes) -> Contents:
 
 
 def graph_sha256(data: bytes) -> str:
-    """SHA-256 (hex) of a model's bytes less its metadata: what computes, whoever described it.
+    """Return the SHA-256 (hex) of a model without metadata, so of its computation alone.
 
     Raises:
         BadModel: damaged.
@@ -121,12 +121,12 @@ class _Walk:
         self.data = memoryview(data)
         self.parts = 0
         self.found = Contents()
-        self.sizes: dict[str, int] = {}  # of constants that may be shapes: elements they ask for
+        self.sizes: dict[str, int] = {}  # elements that constants ask for, if used as shapes
         self.asked: list[tuple[str, str]] = []  # (operator, constant) to look up at the end
         self.nodes: list[tuple[str, list[str], list[str]]] = []  # operator, inputs, outputs
 
     def fields(self, at: int, end: int) -> Iterator[tuple[int, int, int, int]]:
-        """(field number, wire type, start or varint value, end) of every field in a message."""
+        """Yield (field number, wire type, start or varint value, end) of each field."""
         while at < end:
             self.parts += 1
             if self.parts > MAX_PARTS:
@@ -162,7 +162,7 @@ class _Walk:
         raise BadModel(f"damaged at byte {at}")
 
     def messages(self, at: int, end: int, **wanted: int) -> Iterator[tuple[str, int, int]]:
-        """(name, start, end) of the wanted fields; they must hold bytes. The rest is skipped."""
+        """Yield (name, start, end) of the named fields, which must hold bytes; skip others."""
         names = {number: name for name, number in wanted.items()}
         for number, wire, start, stop in self.fields(at, end):
             if number in names:
@@ -207,13 +207,13 @@ class _Walk:
         return self.found
 
     def check_shapes(self) -> None:
-        """Refuse shapes that follow the values of the graph's inputs.
+        """Refuse shapes that depend on the values of the graph's inputs.
 
-        No trial could try them all. Nodes may stand in any order, and names of a graph within a
-        graph count as everybody's."""
+        No trial run could cover them all. Nodes may be in any order, and names within a subgraph
+        count as global."""
         readers: dict[str, list[int]] = {}
         for i, (operator, inputs, _) in enumerate(self.nodes):
-            if operator not in ("Shape", "Size"):  # what they read is the same whatever is touched
+            if operator not in ("Shape", "Size"):  # they read shapes, which no touch changes
                 for name in set(inputs):
                     readers.setdefault(name, []).append(i)
         live, waiting = set(self.found.inputs), list(self.found.inputs)
@@ -247,7 +247,7 @@ class _Walk:
         self.found.metadata[pair["key"]] = pair["value"]
 
     def graph(self, at: int, end: int, depth: int) -> tuple[list[str], list[str]]:
-        """Returns the names of its inputs and outputs."""
+        """Check a graph; return the names of its inputs and outputs."""
         if depth > MAX_DEPTH:
             raise BadModel(f"more than {MAX_DEPTH} graphs within graphs")
         names: dict[str, list[str]] = {"tensor": [], "input": [], "output": [], "value": []}
@@ -291,7 +291,7 @@ class _Walk:
         if operator == "Loop":
             raise BadModel("operator 'Loop', which may never end")
         self.found.operators[operator] += 1
-        outputs = [name for name in outputs if name]  # those that are left out have none
+        outputs = [name for name in outputs if name]  # omitted outputs have no name
         self.nodes.append((operator, inputs, outputs))
         for start, stop in attributes:
             for inner_inputs, inner_outputs in self.attribute(
@@ -305,8 +305,9 @@ class _Walk:
     def attribute(
         self, at: int, end: int, depth: int, output: str
     ) -> list[tuple[list[str], list[str]]]:
-        """`output`: what a Constant node would call the tensor. Returns what `graph` does of each
-        graph in it."""
+        """Check an attribute; return inputs and outputs of each graph in it.
+
+        `output` is the name of the tensor if the node is a Constant."""
         graphs = []
         for what, start, stop in self.messages(
             at, end, tensor=5, graph=6, tensors=10, graphs=11, sparse=22, sparses=23
@@ -324,7 +325,7 @@ class _Walk:
             self.tensor(start, stop)
 
     def tensor(self, at: int, end: int, name: str = "") -> str:
-        """`name`: if another than it says. Returns the name."""
+        """Check a tensor, named `name` or as it says; return its name."""
         dims: list[int] = []
         kind, raw, values = 0, None, []
         for number, wire, value, stop in self.fields(at, end):
@@ -342,7 +343,7 @@ class _Walk:
                 raw = (value, stop)
             elif number == 13 or (number == 14 and (wire != VARINT or value)):
                 raise BadModel(f"tensor {name[:40]!r} is in another file, which we do not open")
-        elements = math.prod(dims)  # a negative one is huge as read
+        elements = math.prod(dims)  # a negative dimension reads as a huge number
         if elements > MAX_ELEMENTS:
             raise BadModel(f"tensor {name[:40]!r} of {elements} elements")
         if raw is None:
@@ -370,9 +371,9 @@ class _Walk:
         return values
 
     def value(self, at: int, end: int) -> str:
-        """ValueInfoProto -> TypeProto -> TypeProto.Tensor -> TensorShapeProto -> dimensions.
+        """Check the size of a value; return its name.
 
-        Returns the value's name.
+        ValueInfoProto -> TypeProto -> TypeProto.Tensor -> TensorShapeProto -> dimensions.
         """
         elements, name = 1, ""
         for what, a, b in self.messages(at, end, name=1, type=2):
@@ -387,7 +388,7 @@ class _Walk:
                             if (number, wire) == (1, VARINT):
                                 sizes.append(start)
                             elif (number, wire) == (2, BYTES):
-                                self.text(start, stop)  # a name, which onnxruntime hands on
+                                self.text(start, stop)  # a symbolic name, which onnxruntime keeps
                         elements *= max(sizes, default=1)
         if elements > MAX_ELEMENTS:
             raise BadModel(f"a value of {elements} elements")

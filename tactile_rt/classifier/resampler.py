@@ -10,10 +10,10 @@ import numpy as np
 
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
 
-# A silence beyond it (or two input periods) is skipped instead of filled with invalid rows.
+# A silence beyond it (and two input periods) is skipped instead of filled with invalid rows.
 LONGEST_GAP_NS = NS_PER_S
-# Of the kernel's nominal weight. Half would blank a slow sensor whose samples jitter by a fifth of
-# their period; much less would take a neighbour's value for that of a lost sample.
+# Share of the kernel's nominal weight that an output needs. Half would blank a slow sensor whose
+# samples jitter by a fifth of their period; much less would replace a lost sample by a neighbour.
 LEAST_WEIGHT = 0.25
 
 
@@ -32,11 +32,11 @@ class Resampler:
         input_rate_hz: nominal input rate; below the output rate the kernel widens to the input's
             period, which interpolates.
         aligned: whether outputs are at whole periods of the clock, so that several streams' outputs
-            coincide; else the first is as early as it can be.
+            coincide; else the first is as early as possible.
 
     Attributes:
-        out_of_order: The number of input samples that were not later than the one before, and
-            were therefore left out.
+        out_of_order: The number of input samples that were dropped because they were not later
+            than the one before.
     """
 
     def __init__(self, period_ns: int, input_rate_hz: float, aligned: bool = False) -> None:
@@ -58,25 +58,25 @@ class Resampler:
         Returns:
             Outputs with `seq` counting output periods since the first (`aligned`: since time 0),
             `t_ns` at the kernel's centre, and `valid` False (value 0) where less than a quarter of
-            the kernel's weight had a valid sample, be it lost or marked.
+            the kernel's weight had a valid sample.
         """
-        ordered = self._in_order(chunk)
+        ordered = self._drop_disorder(chunk)
         if ordered is None:
             return None
         pieces = []
-        for run in self._runs(ordered):
+        for run in self._split_at_gaps(ordered):
             if self._held is not None and run.t_ns[0] - self._held.t_ns[-1] > self._longest_gap_ns:
                 self._held = self._next = None
             pieces += self._resample(run)
         return concatenate(pieces) if pieces else None
 
-    def _runs(self, chunk: Chunk) -> list[Chunk]:
-        """Cut a chunk at its long silences."""
+    def _split_at_gaps(self, chunk: Chunk) -> list[Chunk]:
+        """Split a chunk at its long silences."""
         cuts = np.flatnonzero(np.diff(chunk.t_ns) > self._longest_gap_ns) + 1
         edges = [0, *cuts.tolist(), len(chunk)]
         return [chunk.select(slice(a, b)) for a, b in itertools.pairwise(edges)]
 
-    def _in_order(self, chunk: Chunk) -> Chunk | None:
+    def _drop_disorder(self, chunk: Chunk) -> Chunk | None:
         last = np.iinfo(np.int64).min if self._held is None else self._held.t_ns[-1]
         newest = np.maximum.accumulate(np.concatenate([[last], chunk.t_ns]))
         keep = chunk.t_ns > newest[:-1]
@@ -86,7 +86,7 @@ class Resampler:
         return chunk.select(keep) if keep.any() else None
 
     def _resample(self, chunk: Chunk) -> list[Chunk]:
-        filled_ns = int(chunk.t_ns[0]) + self.half_width_ns  # on both sides of a kernel
+        filled_ns = int(chunk.t_ns[0]) + self.half_width_ns  # samples on both sides of the kernel
         if self._origin is None:
             self._origin = filled_ns
         if self._next is None:
@@ -94,14 +94,14 @@ class Resampler:
         held = chunk if self._held is None else concatenate([self._held, chunk])
         # An output is complete when its kernel's end has been reached (the weight there is zero).
         ready = (int(held.t_ns[-1]) - self.half_width_ns - self._origin) // self.period_ns + 1
-        out = [self._output(held, k) for k in range(self._next, ready)]
+        out = [self._compute_output(held, k) for k in range(self._next, ready)]
         self._next = max(self._next, ready)
         oldest = self._origin + self._next * self.period_ns - self.half_width_ns
         keep = min(int(np.searchsorted(held.t_ns, oldest)), len(held) - 1)
         self._held = held.select(slice(keep, None))
         return out
 
-    def _output(self, held: Chunk, k: int) -> Chunk:
+    def _compute_output(self, held: Chunk, k: int) -> Chunk:
         assert self._origin is not None
         centre = self._origin + k * self.period_ns
         lo = np.searchsorted(held.t_ns, centre - self.half_width_ns, side="right")

@@ -1,14 +1,14 @@
-"""ONNX Runtime as this package uses it: where a network computes, and in which floating-point mode.
+"""ONNX Runtime as used here: the choice of execution providers, and the floating-point mode.
 
-Two things are told honestly here rather than left to ONNX Runtime. A provider that is asked for
-and not there is an error that names what to install, not a silent fall back to the CPU. And
-denormal numbers count as zero while a network runs, and only then: a decaying state ends in
-denormals, which cost a hundred times an ordinary number.
+Two things are not left to ONNX Runtime. A requested provider that is missing is an error that names
+what to install, not a silent fallback to the CPU. And denormal numbers count as zero while a
+network runs, and only then: a decaying state ends in denormals, which cost a hundred times an
+ordinary number.
 
-ONNX Runtime's own option for the latter (``session.set_denormal_as_zero``) changes the thread that
-opens the process's first session for ever, numpy in it included, and without helper threads does
-nothing in any later session. So the floating-point mode of the running thread is set here, and put
-back afterwards.
+ONNX Runtime's own option for the latter (``session.set_denormal_as_zero``) permanently changes the
+thread that opens the process's first session, numpy included, and without helper threads has no
+effect in later sessions. So this module sets the floating-point mode of the running thread, and
+restores it afterwards.
 """
 
 import ctypes
@@ -39,16 +39,16 @@ WORDS = 8
 
 
 def available() -> tuple[str, ...]:
-    """Names of the providers that the installed onnxruntime was built with."""
+    """Return the names of the providers that the installed onnxruntime was built with."""
     built = ort.get_available_providers()
     return tuple(name for name, known in PROVIDERS.items() if known in built)
 
 
 def onnxruntime_names(providers: Sequence[str]) -> list[str]:
-    """Translate names, first choice first; what none of them can do, the CPU does.
+    """Translate provider names, first choice first, with the CPU as the last.
 
     Raises:
-        ConfigError: none, one that we do not know, or one that this onnxruntime lacks.
+        ConfigError: no name, an unknown name, or a provider that this onnxruntime lacks.
     """
     if isinstance(providers, str):
         providers = (providers,)
@@ -66,27 +66,27 @@ def onnxruntime_names(providers: Sequence[str]) -> list[str]:
 
 
 def device_of(session: ort.InferenceSession) -> str:
-    """Where a session wants its state: ``cuda`` or ``cpu``."""
+    """Return the device on which a session keeps its state: ``cuda`` or ``cpu``."""
     first = session.get_providers()[0]
     return "cuda" if first in (PROVIDERS["cuda"], PROVIDERS["tensorrt"]) else "cpu"
 
 
-def _library() -> ctypes.PyDLL | None:
+def _load_libc() -> ctypes.PyDLL | None:
     if sys.platform != "linux" or platform.machine() not in MODES:
         return None
-    # PyDLL keeps the interpreter's lock: the calls take less time than giving it away.
+    # PyDLL keeps the interpreter's lock: the calls take less time than releasing it.
     library = ctypes.PyDLL(None)
     return library if hasattr(library, "fegetenv") and hasattr(library, "fesetenv") else None
 
 
-LIBRARY = _library()
+LIBRARY = _load_libc()
 
 
 class FlushDenormals:
-    """Context in which this thread's denormals are zero; use one object in one thread at a time.
+    """Context manager in which this thread's denormals count as zero.
 
-    Leaving it restores the thread's mode and its floating-point exception flags. On systems other
-    than Linux on x86-64 and aarch64 it does nothing.
+    Leaving it restores the thread's mode and its floating-point exception flags. Use an object in
+    one thread at a time. On systems other than Linux on x86-64 and aarch64 it does nothing.
     """
 
     def __init__(self) -> None:

@@ -2,10 +2,9 @@
 
     source --(thread)--> bounded queue --> classifier --> (chunk, decisions)
 
-Of a live source, a thread reads whatever arrives. When the consumer falls behind by more than the
-queue holds, the oldest chunks are dropped and counted, so that decisions stay recent. A source
-that waits for its reader (a recording, a simulation at full speed) is read in step, and nothing
-can be lost.
+A thread reads a live source. When the consumer falls behind by more than the queue holds, the
+oldest chunks are dropped and counted, so that decisions stay recent. A source that waits for its
+reader (a recording, a simulation at full speed) is read in step, and nothing can be lost.
 """
 
 import contextlib
@@ -21,10 +20,10 @@ POLL_S = 0.1  # how soon a reader thread notices that it should stop
 
 
 class Session:
-    """Run a classifier on a source; iterate to get every chunk with the decisions it completed.
+    """A classifier on a source; iterate over it for chunks with their decisions.
 
     Args:
-        source: where samples come from; the session closes it.
+        source: the source of samples; the session closes it.
         classifier: made for the source's array.
         queue_chunks: chunks that may wait for the classifier.
     """
@@ -41,12 +40,12 @@ class Session:
 
     @property
     def dropped(self) -> int:
-        """How many samples a live source delivered and the classifier was too late for."""
+        """Number of samples of a live source that were dropped before classification."""
         return self._queue.dropped["samples"]
 
     def __iter__(self) -> Iterator[tuple[Chunk, list[Classification]]]:
         # Closing: an error of the classifier ends the reader now, not when its traceback is freed.
-        with contextlib.closing(self._queued() if self.source.live else self._in_step()) as chunks:
+        with contextlib.closing(self._drain() if self.source.live else self._read_all()) as chunks:
             for chunk in chunks:
                 yield chunk, self.classifier.push(chunk)
 
@@ -62,13 +61,13 @@ class Session:
         self._close()
 
     def _close(self) -> None:
-        """Close the source when nobody reads it any more."""
+        """Stop the reader thread, then close the source."""
         self.stop()
         if self._reader is not None:
             self._reader.join()
         self.source.close()
 
-    def _in_step(self) -> Generator[Chunk, None, None]:
+    def _read_all(self) -> Generator[Chunk, None, None]:
         try:
             while not self._stopping:
                 chunk = self.source.read()
@@ -79,7 +78,7 @@ class Session:
         finally:
             self._close()
 
-    def _queued(self) -> Generator[Chunk, None, None]:
+    def _drain(self) -> Generator[Chunk, None, None]:
         self._reader = threading.Thread(target=self._read, name="tactile-rt-reader", daemon=True)
         self._reader.start()
         try:
@@ -101,7 +100,7 @@ class Session:
         while not self._stopping:
             try:
                 chunk = self.source.read(POLL_S)
-            except Exception as error:  # whatever it is, it belongs to the consumer's thread
+            except Exception as error:  # any error is raised in the consumer's thread
                 self._ending = error
                 self._queue.close()
                 return

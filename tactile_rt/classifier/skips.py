@@ -1,15 +1,15 @@
-"""Which stretches of a stream the network skips, so that it decides about what is touched now.
+"""Skipped stretches of a stream, so that the network decides about what is touched now.
 
-A network that is too slow, or that the processor was kept from, falls behind its stream; from then
-on it would decide about what was touched seconds ago. It can take every step all the same, as a
-laboratory may want (``all``); or skip to the newest sample, as a robot must (``newest``).
+A network that is too slow, or that was denied the processor, falls behind its stream; from then on
+it would decide about what was touched seconds ago. It can still take every step, as a laboratory
+may want (``all``); or skip to the newest sample, as a robot must (``newest``).
 
-A network with a state must not be fed a stream with a hole in it: what it then says is of no signal
-that it was trained on. So a stretch is skipped whole. The episode under way ends where it begins,
-an onset within it begins none, and the next onset after it begins one. The contact detector takes
-every sample all the same: that costs little, and it then knows its baseline, and what is touched.
+A network with a state must not be fed a stream with a hole in it: it was trained on no such signal.
+So a stretch is skipped whole. It ends the current episode, an onset within it begins no episode,
+and the next onset after it begins one. The contact detector still takes every sample: that costs
+little, and keeps its baseline and contact state up to date.
 
-A stretch is said in stream times. The same stretches given to a replay give the same decisions.
+Stretches are given in stream time. The same stretches given to a replay give the same decisions.
 """
 
 from collections import deque
@@ -19,17 +19,17 @@ from typing import Literal
 
 CatchUp = Literal["newest", "all"]
 
-SMOOTHING = 0.2  # of the time that a step is expected to take
-# Shares of the greatest age. A step whose samples are this young is tried whatever it is expected
-# to take: else one that was slow once would be the last.
+SMOOTHING = 0.2  # weight of the newest step in the expected duration of a step
+# Shares of the greatest age. A step whose samples are this young is always taken, whatever its
+# expected duration: otherwise one slow step would be the last.
 FRESH = 0.1
-# Another one should be done by here: the rest is for its publication, on a machine that is busy.
+# Any other step should end by this age: the rest is for its publication, on a busy machine.
 DONE = 0.8
 
 
 @dataclass(frozen=True)
 class Skip:
-    """A stretch of a stream of which the network takes no step.
+    """A stretch of a stream in which the network takes no step.
 
     Attributes:
         from_ns: The stream time of the first sample that is left out, ns.
@@ -41,13 +41,13 @@ class Skip:
 
 
 class Skips:
-    """Says of every sample whether it is skipped, and finds what has to be.
+    """The stretches of a stream to skip, planned or found while it runs.
 
     Args:
-        planned: stretches that are known beforehand, in their order.
-        most_s: how old the newest sample of a step may be when its decision is there, s; infinite:
-            nothing is ever skipped for its age.
-        age: how old the sample of a stream time (ns) is now, s.
+        planned: stretches that are known beforehand, in order of time.
+        most_s: greatest age of a step's newest sample at its decision, s; infinite: nothing is
+            skipped for its age.
+        age: returns the present age, s, of the sample of a stream time (ns).
 
     Attributes:
         found: The stretches that were found since the list was last emptied.
@@ -61,11 +61,11 @@ class Skips:
     ) -> None:
         self._ahead = deque(planned)
         self._most_s, self._age = most_s, age
-        self._expected_s = 0.0  # what a step takes
+        self._expected_s = 0.0  # duration of a step
         self.found: list[Skip] = []
 
     def covers(self, t_ns: int) -> bool:
-        """Whether the sample of this stream time is skipped; times only ever grow."""
+        """Return whether the sample of this stream time is skipped; times must ascend."""
         while self._ahead and t_ns >= self._ahead[0].until_ns:
             self._ahead.popleft()
         return bool(self._ahead) and t_ns >= self._ahead[0].from_ns
@@ -76,8 +76,7 @@ class Skips:
         self.found.append(Skip(from_ns, until_ns))
 
     def before_step(self, t_ns: int) -> bool:
-        """Whether the step that this sample completes would come too late; if so it is skipped,
-        with all that was taken up to now."""
+        """Return True, and skip up to now, if the coming step would be too late."""
         if self._age is None:
             return False
         age_s = self._age(t_ns)
@@ -87,11 +86,11 @@ class Skips:
         return True
 
     def after_step(self, t_ns: int, took_s: float) -> bool:
-        """Whether a step has come too late; if so it is as if it had been skipped.
+        """Return True, and skip up to now, if the finished step is too late.
 
         Args:
             t_ns: stream time of its newest sample, ns.
-            took_s: how long it took, s.
+            took_s: duration of the step, s.
         """
         self._expected_s += SMOOTHING * (took_s - self._expected_s)
         age_s = 0.0 if self._age is None else self._age(t_ns)

@@ -1,8 +1,8 @@
-"""The network's step, bound once to buffers that are made once.
+"""The network's step, bound once to preallocated buffers.
 
-The state lives in two sets of buffers; a step reads the one and writes the other, by turns. So a
-step allocates nothing, and with a GPU the state never leaves it. A cache of which a step writes a
-few rows is in both sets the same buffer: onnxruntime then copies nothing.
+The state lives in two sets of buffers; steps in turn read one and write the other. So a step
+allocates nothing, and with a GPU the state never leaves it. A cache of which a step writes only a
+few rows is the same buffer in both sets: onnxruntime then copies nothing.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ from tactile_rt.classifier.model_file import output_sizes
 from tactile_rt.classifier.runtime import PROVIDERS, FlushDenormals, device_of
 from tactile_rt.core.errors import ConfigError
 
-WARM_UP = 4  # runs, two of each binding: the first ones allocate, and may even compile
+WARM_UP = 4  # runs, two of each binding: the first runs allocate, and may even compile
 
 
 class Tensor:
@@ -26,11 +26,11 @@ class Tensor:
     def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
         self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)
         self.value = ort.OrtValue.ortvalue_from_numpy(self.array, device, 0)
-        self._apart = device != "cpu"
+        self._on_device = device != "cpu"
 
     def send(self) -> None:
         """Copy the host array to the device."""
-        if self._apart:
+        if self._on_device:
             self.value.update_inplace(self.array)
 
     def zero(self, lane: int | None = None) -> None:
@@ -38,19 +38,19 @@ class Tensor:
         if lane is None:
             self.array.fill(0)
         else:
-            if self._apart:
+            if self._on_device:
                 self.array[:] = self.value.numpy()
             self.array[lane] = 0
         self.send()
 
 
 class Stepper:
-    """A model file's graph, run step by step in so many lanes at once.
+    """A model file's graph, run step by step in several lanes at once.
 
     Attributes:
         samples: (lane, sub-step, element, channel) SI: write the step's input here.
         embedding: (lane, unit) The embedding of the last step, which the next one overwrites.
-        names: (lane, name) The logits of kinds, likewise; of a model without, none.
+        names: (lane, name) The logits of kinds, likewise; no columns for a model without kinds.
 
     Raises:
         ConfigError: the graph's batch is fixed to another number than `lanes`.
@@ -65,7 +65,7 @@ class Stepper:
             )
         self._session = session
         device = device_of(session)
-        # How other providers than onnxruntime's own write rows is not known.
+        # It is unknown whether providers other than onnxruntime's own can write in place.
         in_place = session.get_providers() == [PROVIDERS["cpu"]]
         elements, channels = card.array.shape
         shape = (lanes, elements, channels)
@@ -99,7 +99,7 @@ class Stepper:
         self.begin(self._offset.array[0], self._sigma.array[0])
 
     def begin(self, offset: NDArray[np.float32], sigma: NDArray[np.float32]) -> None:
-        """Zero the state of every lane, and take on a baseline (element, channel), SI."""
+        """Zero the state of every lane, and set the baseline (element, channel), SI."""
         self._offset.array[:] = offset
         self._sigma.array[:] = sigma
         self._offset.send()
@@ -122,7 +122,7 @@ class Stepper:
         return logits
 
     def _bind(self, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Any:
-        """Bind the buffers of a step from the one state to the other."""
+        """Bind the buffers of a step that reads `before` and writes `after`."""
         inputs = {
             "samples": self._samples, "offset": self._offset, "sigma": self._sigma, **before,
         }  # fmt: skip

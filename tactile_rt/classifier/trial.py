@@ -1,11 +1,11 @@
-"""A model file on trial: loaded, warmed and touched in a process of its own, within limits.
+"""Trial runs of model files, in a child process with limits on memory and time.
 
-`onnx_check` refuses what a file says that it is; what it does when it runs only running it shows.
-Shapes that are computed can ask for any memory, and a graph of a few kilobytes for hours. So before
-a daemon, which has samples to lose, loads a file, a child process does: with a limit on its memory,
-on its processor time and on the clock. It dies with whoever started it.
+`onnx_check` judges a file by its contents; its cost shows only when it runs. Computed shapes can
+ask for any memory, and a graph of a few kilobytes for hours. So before a daemon, which has samples
+to lose, loads a file, a child process does, with limits on its memory, processor time and duration.
+The child dies with its parent.
 
-    try_model(path, Limits) -> Trial        in the process that asks
+    try_model(path, Limits) -> Trial        in the parent
     python -m tactile_rt.classifier.trial   the child: settings as JSON in, result as JSON out
 """
 
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
     from tactile_rt.classifier.model_card import ModelCard
 
 MB = 1_000_000
-LOOK_S = 0.02  # how soon it is seen that the child has ended, or that nobody waits for it
-CPU_S = 2  # beyond the limit on the clock: threads of onnxruntime may share the work
+LOOK_S = 0.02  # how often the parent checks the child and `stopped`
+CPU_S = 2  # beyond the limit on duration: threads of onnxruntime may share the work
 STEPS = 5  # at least, of a touch and at rest, after the warm-up
 EXTREME_STEPS = 3  # of each of the loads that no touch makes
-TOUCH_S = 1.0  # how long a touch may take beyond that
+TOUCH_S = 1.0  # a touch ends after this time, once it has had the least number of steps
 PR_SET_PDEATHSIG = 1
 WANTED_MEMORY = ("bad_alloc", "Failed to allocate", "BFCArena", "bad allocation")
 MESSAGE = 400  # characters
 
 
 class TrialLimits(msgspec.Struct, frozen=True):
-    """What a model may need.
+    """The limits of a trial.
 
     Attributes:
-        memory_mb: The memory beside four times the file's size, in MB.
-        seconds: The time to load, to warm up and to be touched, s.
+        memory_mb: The memory beyond four times the file's size, in MB.
+        seconds: The time to load, to warm up and to run all steps, s.
     """
 
     memory_mb: float = 256.0
@@ -55,13 +55,13 @@ class TrialLimits(msgspec.Struct, frozen=True):
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """What a model needed.
+    """The result of a trial: the time and memory that a model needed.
 
     Attributes:
         sha256: The hash of the bytes that were tried, hexadecimal.
-        load_s: The time that it took to load and to warm up, s.
-        step_s: The median time of a step, s, of what takes longest: rest, a touch, or extremes.
-        memory_mb: The memory that it took, in MB.
+        load_s: The time to load and to warm up, s.
+        step_s: The median time of a step, s, for the slowest of rest, touch and extreme loads.
+        memory_mb: The memory in use at the end, in MB.
     """
 
     sha256: str
@@ -72,9 +72,9 @@ class Trial(msgspec.Struct, frozen=True):
 
 class _Task(msgspec.Struct, frozen=True):
     path: str
-    every: int  # of windows that slide; 0: none does
+    every: int  # steps between sliding windows; 0: no sliding windows
     limits: TrialLimits
-    parent: int = 0  # the process that waits for it; 0: whoever it is
+    parent: int = 0  # process id of the parent; 0: any
 
 
 class _Refusal(msgspec.Struct, frozen=True):
@@ -91,9 +91,9 @@ def try_model(
 
     Args:
         path: of the ``.onnx`` file, of kind ``step``.
-        limits: what it may need; None: the usual ones.
-        every: steps between windows that slide, for as many lanes; 0: one lane.
-        stopped: whether nobody wants to know any more; asked again and again.
+        limits: None: the defaults.
+        every: steps between sliding windows, which determine the number of lanes; 0: one lane.
+        stopped: returns True once the result is no longer needed; called repeatedly.
 
     Raises:
         ModelError: one line: what is wrong with the file, or which limit it broke.
@@ -119,7 +119,7 @@ def try_model(
                     "and warm up"
                 )
             time.sleep(LOOK_S)
-        return _result(path, limits, child.returncode, child.stdout.read())
+        return _read_result(path, limits, child.returncode, child.stdout.read())
     except BrokenPipeError:
         raise ModelError(f"{path} is refused: its trial could not begin") from None
     finally:
@@ -128,9 +128,9 @@ def try_model(
         child.stdout.close()
 
 
-def _result(path: Path, limits: TrialLimits, code: int, said: bytes) -> Trial:
+def _read_result(path: Path, limits: TrialLimits, code: int, output: bytes) -> Trial:
     try:
-        found = msgspec.json.decode(said, type=dict)
+        found = msgspec.json.decode(output, type=dict)
     except msgspec.MsgspecError:
         found = {}
     if "refused" in found:
@@ -140,13 +140,13 @@ def _result(path: Path, limits: TrialLimits, code: int, said: bytes) -> Trial:
     if -code == signal.SIGXCPU:
         why = f"more than limits.model_s = {limits.seconds:g} s of the processor"
     elif code < 0 or code == MEMORY:
-        why = _too_large(limits)
+        why = _explain_memory(limits)
     else:
         why = f"its trial ended with exit code {code}"
     raise ModelError(f"{path} is refused: {why}")
 
 
-def _too_large(limits: TrialLimits) -> str:
+def _explain_memory(limits: TrialLimits) -> str:
     return (
         f"it needs more memory than limits.model_mb = {limits.memory_mb:g} MB and four times its "
         "size, breaks onnxruntime, or was killed"
@@ -155,10 +155,10 @@ def _too_large(limits: TrialLimits) -> str:
 
 # the child
 
-MEMORY = 77  # its exit code when there was not enough
+MEMORY = 77  # its exit code when memory ran out
 
 
-def _run(task: _Task) -> Trial:
+def _run_task(task: _Task) -> Trial:
     import numpy as np
 
     from tactile_rt.classifier.decision_rules import Lanes
@@ -166,7 +166,7 @@ def _run(task: _Task) -> Trial:
     from tactile_rt.classifier.stepper import Stepper
 
     path, limits = Path(task.path), task.limits
-    before = _data_bytes()
+    before = _read_data_bytes()
     size = path.stat().st_size if path.is_file() else 0
     most = before + round(limits.memory_mb * MB) + 4 * size
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
@@ -196,14 +196,14 @@ def _run(task: _Task) -> Trial:
             if decides and not np.isfinite(logits).all():
                 raise ModelError(f"{path} is refused: its answer to {name} is no number")
         step_s = max(step_s, float(np.median(took)))
-    return Trial(sha256, load_s, step_s, (_data_bytes() - before) / MB)
+    return Trial(sha256, load_s, step_s, (_read_data_bytes() - before) / MB)
 
 
 def _list_loads(card: "ModelCard") -> list[tuple[str, bool, "NDArray[np.float64]"]]:
-    """List what a model is tried on.
+    """List the loads that a model is tried on.
 
-    Each is a name, whether it must decide on it, and loads (step, element, channel), SI, which grow
-    and go as those of a touch, made up from the card's.
+    Each is a name, whether the answer must be finite, and loads (step, element, channel), SI, which
+    rise and fall as in a touch, derived from the card.
     """
     import numpy as np
 
@@ -229,8 +229,8 @@ def _list_loads(card: "ModelCard") -> list[tuple[str, bool, "NDArray[np.float64]
     ]
 
 
-def _data_bytes() -> int:
-    """What counts against RLIMIT_DATA."""
+def _read_data_bytes() -> int:
+    """Return the memory that counts against RLIMIT_DATA, bytes."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmData:"):
             return 1024 * int(line.split()[1])
@@ -239,32 +239,32 @@ def _data_bytes() -> int:
 
 def _main() -> int:
     if sys.platform == "linux":
-        with suppress(OSError):  # where memory runs out, this one goes, and not whoever asks
+        with suppress(OSError):  # if memory runs out, the kernel kills this process first
             Path("/proc/self/oom_score_adj").write_text("1000")
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of who presses Ctrl-C: the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches it too: the parent decides
     task = msgspec.json.decode(sys.stdin.buffer.read(), type=_Task)
-    if task.parent not in (0, os.getppid()):  # it died before it was said whom to die with
+    if task.parent not in (0, os.getppid()):  # the parent died before prctl
         return 1
-    os.nice(5)  # what is under way comes first
+    os.nice(5)  # running parts come first
     try:
-        result: Trial | _Refusal = _run(task)
+        result: Trial | _Refusal = _run_task(task)
     except ModelError as error:
-        result = _Refusal(_within(str(error), task))
+        result = _Refusal(_rewrite_error(str(error), task))
     except MemoryError:
         return MEMORY
     except Exception as error:  # onnxruntime raises a dozen unrelated types
         text = " ".join(str(error).split())
-        result = _Refusal(_within(f"{task.path} is refused: it cannot be run: {text}", task))
+        result = _Refusal(_rewrite_error(f"{task.path} is refused: it cannot be run: {text}", task))
     sys.stdout.buffer.write(msgspec.json.encode(result))
     sys.stdout.flush()
-    os._exit(0)  # onnxruntime may yet want memory to put its things away
+    os._exit(0)  # onnxruntime may need more memory to clean up
 
 
-def _within(text: str, task: _Task) -> str:
-    """What onnxruntime says of memory, in our words."""
+def _rewrite_error(text: str, task: _Task) -> str:
+    """Shorten an error text; replace onnxruntime's words on lack of memory."""
     if any(word in text for word in WANTED_MEMORY):
-        return f"{task.path} is refused: {_too_large(task.limits)}"
+        return f"{task.path} is refused: {_explain_memory(task.limits)}"
     return text[:MESSAGE]
 
 

@@ -5,6 +5,6 @@
              +--> mailbox <-------------------------+--> mailbox --> consumer (publisher, recorder,
                                                                      page, metrics, systemd, log)
 
-Every mailbox is bounded, drops its oldest items and counts them, so that nothing that is slow or
-gone ever holds up acquisition. `Daemon` builds all that from a `Config`, one TOML file.
+Every mailbox is bounded, drops its oldest items and counts them, so that no slow or lost part ever
+holds up acquisition. `Daemon` builds all parts from a `Config`, one TOML file.
 """

@@ -1,7 +1,7 @@
-"""A model on its way into the daemon: tried in a process of its own, then loaded and warm.
+"""Admission of a model to the daemon: a trial in a child process, then loading and warm-up.
 
-All of that happens in a thread that nobody waits for. Where a model decides already, it goes on
-meanwhile; the part takes the new one when it is there.
+All of that happens in a background thread. A model that already decides goes on meanwhile; its part
+takes the new model when that is ready.
 """
 
 import threading
@@ -17,18 +17,18 @@ from tactile_rt.daemon.items import Opened
 
 
 class Admission:
-    """Begins at once.
+    """The admission of a model, which begins at once in a thread of its own.
 
     Args:
-        opened: the stream that it will classify; None: it is only tried.
-        age: of the stream, see `Classifier`; used if it is live.
-        trial: of the same file, if there was one.
+        opened: the stream that the model will classify; None: the model is only tried.
+        age: of the stream's samples, see `Classifier`; used if the stream is live.
+        trial: an earlier trial of the same file, if any.
 
     Attributes:
-        stamp: What the file was when it was tried, see `file_stamp`.
-        finished: Set when the model is there, or refused.
-        error: The reason for which the model is refused; None: it is not.
-        trial: What the trial found; None before.
+        stamp: The `file_stamp` of the file that is tried.
+        finished: Set when the model is ready or refused.
+        error: The reason for a refusal; None: the model is not refused.
+        trial: The result of the trial; None before.
         classifier: The model, warm; None before, and without a stream.
     """
 
@@ -51,34 +51,34 @@ class Admission:
         threading.Thread(target=self._run, name=ADMISSION, daemon=True).start()
 
     def give_up(self) -> None:
-        """Nobody wants it any more."""
+        """Abandon the admission, whose model is no longer needed."""
         self._given_up.set()
 
     @property
     def words(self) -> str:
-        """What came of it."""
+        """Description of the result, for the log."""
         if self.error is not None:
             return str(self.error)
         assert self.trial is not None
         t = self.trial
-        said = (
+        text = (
             f"{self.file}, sha256 {t.sha256[:12]}: warm after {t.load_s:.2f} s, "
             f"{t.memory_mb:.0f} MB, {1e3 * t.step_s:.1f} ms a step"
         )
         if self.classifier is not None and 1e3 * t.step_s > self.classifier.step_ms:
-            said += f", longer than the {self.classifier.step_ms:.0f} ms of it: it cannot keep up"
-        return said
+            text += f", longer than the {self.classifier.step_ms:.0f} ms of it: it cannot keep up"
+        return text
 
     def _run(self) -> None:
         try:
-            self._try()
+            self._admit()
         except TactileError as error:
             self.error = error
-        except Exception as error:  # whatever it is, it is the model's
+        except Exception as error:  # any other error is the model's, too
             self.error = ModelError(f"{self.file}: {type(error).__name__}: {error}")
         self.finished.set()
 
-    def _try(self) -> None:
+    def _admit(self) -> None:
         config, opened = self.config, self._opened
         if self.trial is None:
             every = (config.every or EVERY) if config.mode == "sliding" else 0
@@ -100,12 +100,12 @@ class Admission:
 
 
 def model_path(config: ModelConfig) -> Path:
-    """The model's file; that of the package if the configuration names none."""
+    """Return the model's file; the packaged model if the configuration names none."""
     return Path(config.file) if config.file else shipped_model()
 
 
 def file_stamp(file: Path) -> tuple[int, ...]:
-    """Changes when a file is replaced, written, or taken away."""
+    """Return a stamp that changes when a file is replaced, written or removed."""
     try:
         found = file.stat()
     except (OSError, ValueError):

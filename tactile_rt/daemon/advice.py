@@ -1,7 +1,7 @@
-"""Say of each diagnostic in a sentence what is wrong, since when, and what to do.
+"""Advice on diagnostics: a sentence on what is wrong, since when, and what to do.
 
 The page and `tactile-rt doctor --daemon` show it, `/health` and the ``state`` message carry it. A
-sentence stays the same as long as its diagnostic does.
+sentence stays the same as long as its diagnostic lasts.
 """
 
 import threading
@@ -51,24 +51,24 @@ ADVICE = {
 
 
 class DiagnosticOnsets:
-    """Keeps when each diagnostic began; from any thread."""
+    """The onsets of the current diagnostics; safe from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._begun: dict[tuple[str, str], tuple[int, str]] = {}
+        self._onsets: dict[tuple[str, str], tuple[int, str]] = {}
 
     def explain(
         self, found: Sequence[Diagnostic], now_ns: int, utc_ns: int
     ) -> tuple[Diagnostic, ...]:
-        """Return those of now, host CLOCK_MONOTONIC and UTC in ns, with onset and advice."""
+        """Add onset and advice to the present diagnostics (host CLOCK_MONOTONIC and UTC, ns)."""
         when = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         with self._lock:
             keys = [(one.part, one.what) for one in found]
-            begun = self._begun = {key: self._begun.get(key, (now_ns, when)) for key in keys}
-        return tuple(_explain(one, *begun[one.part, one.what]) for one in found)
+            begun = self._onsets = {key: self._onsets.get(key, (now_ns, when)) for key in keys}
+        return tuple(_add_advice(one, *begun[one.part, one.what]) for one in found)
 
 
-def _explain(one: Diagnostic, since_ns: int, when: str) -> Diagnostic:
+def _add_advice(one: Diagnostic, since_ns: int, when: str) -> Diagnostic:
     it = "it " if one.why.startswith(BREAKS) else ""
     still = f"; {one.still}" if one.still else ""
     says = f"{one.part}: {one.what} since {when}: {it}{one.why}{still}."

@@ -1,6 +1,6 @@
-"""What one key alone does not tell: whether a configuration as a whole can work.
+"""Checks of whether a configuration as a whole can work, beyond those of single keys.
 
-Nothing is opened, and no device is asked; files that are named must be there.
+No device is opened or queried; named files must exist.
 """
 
 import ipaddress
@@ -23,7 +23,7 @@ from tactile_rt.daemon.publishers import Wanted, wanted_consumers
 from tactile_rt.daemon.service import MADE
 from tactile_rt.sources.opening import check_source
 
-SHORTEST_TOKEN = 16  # of a page that others can reach
+SHORTEST_TOKEN = 16  # of a page that other computers can reach
 HOST = re.compile(r"(?=.{1,253}\Z)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.?)+\Z")
 ANY = ("", "*", "0.0.0.0", "::")
 
@@ -31,7 +31,7 @@ KeyPath = list[str | int]
 
 
 def check_config(loaded: Loaded) -> None:
-    """Raise `ConfigError` with file, line and key of whatever cannot be."""
+    """Raise `ConfigError` with file, line and key if the configuration cannot work."""
     config = loaded.config
     _check_names(loaded, config)
     arrays = {s.name: _check_source(loaded, i, s) for i, s in enumerate(config.source)}
@@ -47,7 +47,7 @@ def check_config(loaded: Loaded) -> None:
         try:
             wanted.make()
         except TactileError as error:
-            loaded.refuse(_path(loaded, wanted), str(error))
+            loaded.refuse(_find_path(loaded, wanted), str(error))
 
 
 def _check_names(loaded: Loaded, config: Config) -> None:
@@ -63,7 +63,7 @@ def _check_names(loaded: Loaded, config: Config) -> None:
 
 
 def _check_source(loaded: Loaded, i: int, source: SourceConfig) -> ArraySpec | None:
-    """The array that it will be, where that is known beforehand."""
+    """Check a source; return its array, if that is known before it opens."""
     path: KeyPath = ["source", i]
     spec: ArraySpec | None = _try(loaded, [*path, "url"], check_source, source.url)
     given: dict[str, str] = {}
@@ -81,7 +81,7 @@ def _check_model(
         loaded.refuse([*path, "file"], f"{model.file} is a folder")
     file = Path(model.file) if model.file else shipped_model()
     if model.file:
-        # What it does when it runs is for its trial to find out, see `admission`.
+        # How it behaves when it runs is tested by its trial, see `admission`.
         _try(loaded, [*path, "file"], lambda f: read_model(f, "step"), file)
     _try(loaded, [*path, "providers"], onnxruntime_names, model.providers)
     if model.every and model.mode != "sliding":
@@ -101,7 +101,7 @@ def _check_model(
 
 
 def _check_devices(loaded: Loaded, config: Config) -> None:
-    """Two sources cannot share a device."""
+    """Refuse two sources that share a device."""
     taken: dict[str, str] = {}
     for i, source in enumerate(config.source):
         for key in device_keys([source.url]):
@@ -147,26 +147,26 @@ def _try(loaded: Loaded, path: KeyPath, check: Callable[[Any], Any], value: Any)
         loaded.refuse(path, f"{value}: {error}")
 
 
-# what two tables cannot both have, and what no table can
+# conflicts between tables, and values that no table can have
 
 
 def _check_host(loaded: Loaded, path: KeyPath, host: str) -> None:
-    """Refuse what is neither an IP address nor can be the name of a host."""
+    """Refuse a host that is neither an IP address nor a valid host name."""
     try:
         ipaddress.ip_address(host.strip("[]"))
     except ValueError:
-        # Digits alone are an address that went wrong, not a name.
+        # Digits and dots alone are a malformed address, not a name.
         if not HOST.match(host) or re.fullmatch(r"[\d.]+", host):
             why = "no address: 127.0.0.1, ::1 or a host's name; a port has a key of its own"
             loaded.refuse(path, f"{host!r:.60} is {why}")
 
 
 def _check_listeners(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse a second one at a port."""
+    """Refuse two consumers that listen at one port."""
     taken: list[tuple[str, int, str]] = []
     for one in wanted:
-        for key, host, port in _addresses(one):
-            path = _path(loaded, one, key)
+        for key, host, port in _list_addresses(one):
+            path = _find_path(loaded, one, key)
             if key == "port":
                 _check_host(loaded, [*path[:-1], "host"], host)
             host = "127.0.0.1" if host == "localhost" else host.strip("[]")
@@ -177,19 +177,19 @@ def _check_listeners(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
 
 
 def _check_domains(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse a second one in a DDS domain, of which a process has one."""
+    """Refuse two publishers in one DDS domain, which a process can join only once."""
     taken: dict[int, str] = {}
     for one in wanted:
         if one.kind == "ros2":
             domain = one.options.domain
             if domain in taken:
-                path = _path(loaded, one, "domain")
+                path = _find_path(loaded, one, "domain")
                 loaded.refuse(path, f"DDS domain {domain} is where {taken[domain]} publishes")
             taken[domain] = one.name
 
 
 def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse a file that cannot be one, that is read, or that another writes already."""
+    """Refuse an output file that is invalid, also an input, or written by another consumer."""
     config = loaded.config
     read = [str(loaded.path), *(m.file for m in config.model)]
     read += [file for s in config.source for file in (s.calibration, s.array)]
@@ -198,7 +198,7 @@ def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
     for one in wanted:
         if one.kind not in ("log", "jsonl"):
             continue
-        path, file = _path(loaded, one, "file"), one.options.file
+        path, file = _find_path(loaded, one, "file"), one.options.file
         if not file and one.kind == "log":
             continue
         if "\0" in file:
@@ -217,21 +217,21 @@ def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
 
 
 def _check_folder(loaded: Loaded, folder: str) -> None:
-    """Refuse a recorder's folder that cannot be made."""
+    """Refuse a recorder's folder that cannot be created."""
     place = Path(folder)
     if "\0" in folder or (os.path.exists(folder) and not os.path.isdir(folder)):
         loaded.refuse(["recorder", "folder"], f"{folder!r} is not a folder")
     above = next((p for p in place.parents if os.path.lexists(p)), None)
     if above is not None and not os.path.isdir(above):
         loaded.refuse(["recorder", "folder"], f"{folder!r}: {above} is not a folder")
-    elif above is not None and not shutil.disk_usage(above).total:  # as of /proc and /sys
+    elif above is not None and not shutil.disk_usage(above).total:  # such as /proc and /sys
         loaded.refuse(["recorder", "folder"], f"{folder!r}: {above} is on no disk")
 
 
-def _addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:
-    """(key, host, port) at which a consumer will listen; ports that are chosen then are left out.
+def _list_addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:
+    """Yield (key, host, port) at which a consumer will listen, except ports chosen later.
 
-    Of kinds that other packages add it is not known what their options mean.
+    The options of kinds from other packages are unknown.
     """
     options = wanted.options
     if wanted.kind in ("page", "metrics", "foxglove"):
@@ -239,23 +239,23 @@ def _addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:
             yield "port", options.host, options.port
     elif wanted.kind == "zmq":
         if options.bind.startswith("tcp:") and not options.bind.endswith(":*"):
-            yield "bind", *_split(options.bind.partition("://")[2])
+            yield "bind", *_split_address(options.bind.partition("://")[2])
     elif wanted.kind == "zenoh":
         for endpoint in options.listen:
             protocol, _, address = endpoint.partition("/")
-            host, port = _split(re.split("[?#]", address)[0])
+            host, port = _split_address(re.split("[?#]", address)[0])
             if protocol in ("tcp", "tls", "ws") and port:
                 yield "listen", host, port
 
 
-def _split(address: str) -> tuple[str, int]:
-    """(host, port); 0: none."""
+def _split_address(address: str) -> tuple[str, int]:
+    """Split an address into host and port; 0: no port."""
     host, _, port = address.rpartition(":")
     return host, int(port) if port.isdecimal() else 0
 
 
-def _path(loaded: Loaded, wanted: Wanted, key: str = "") -> KeyPath:
-    """Where a consumer's table is; with a key, where that is, or would be."""
+def _find_path(loaded: Loaded, wanted: Wanted, key: str = "") -> KeyPath:
+    """Return the key path of a consumer's table, or of a key in it."""
     table, _, name = wanted.name.partition(".")
     if table != "publisher":
         return [table, key] if key else [table]

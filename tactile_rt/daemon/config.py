@@ -1,9 +1,9 @@
-"""The daemon's configuration: what one TOML file may say, with units and ranges.
+"""The daemon's configuration: the keys of one TOML file, with units and ranges.
 
-Version 1 of the keys is promised: a file that is right for it stays right for later releases, or
-is refused by its ``version``, never misread. Relative paths are meant from the file's folder.
-`loading` reads such a file, `checks` says whether it can work; `EXAMPLE` explains its keys, the
-docstrings what it leaves out.
+Version 1 of the keys is stable: a valid file stays valid in later releases, or is refused for its
+``version``, but never misread. Relative paths start at the file's folder. `loading` reads such a
+file, `checks` tests whether it can work; `EXAMPLE` explains its keys, and the docstrings those that
+it leaves out.
 """
 
 import ipaddress
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-ADMISSION = "tactile-rt admission"  # the thread that loads a model, not to be torn out of that
+ADMISSION = "tactile-rt admission"  # the thread that loads a model; must not be ended meanwhile
 CONFIG_VERSION = 1
 
 NAME = "name: letters, digits, - and _, 64 at most"
@@ -32,11 +32,11 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
     """``[[source]]``: an array.
 
     Attributes:
-        array: A file of the array that the source is, as `tactile-rt describe` writes it, or an
-            ``.onnx`` model, whose array it then is; empty if it is what the URL says.
-        stuck_at_s: Time without any change of any value that is a stuck-at fault: the device hangs,
-            s; 0 for what follows from the noise, where the model, the tare or the stream tells it,
-            else for ever: a coarse sensor at rest does not change either.
+        array: A file that describes the source's array, as `tactile-rt describe` writes it, or an
+            ``.onnx`` model, for the array that it was made for; empty: as the URL says.
+        stuck_at_s: Time without a change of any value that counts as a stuck-at fault, s; 0: from
+            the noise, if the model, the tare or the stream determines it; otherwise never, as a
+            coarse sensor at rest does not change either.
     """
 
     name: Name
@@ -54,11 +54,11 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
             long as contact lasts, each time about the newest steps, as many as an episode has.
         every: Number of steps from one sliding decision to the next, at most those of an episode;
             0 for 4, or those of a shorter episode.
-        sure: Probability that ends an episode early when one class reaches it `in_a_row` steps
-            running; 0 for never.
-        in_a_row: Number of steps running for `sure`, at most those of an episode.
-        fuse_s: Time within which touches that follow each other are of one thing, s: which enrolled
-            object it is, they tell together; 0 for each alone.
+        sure: Probability that ends an episode early when one class reaches it in `in_a_row`
+            consecutive steps; 0 for never.
+        in_a_row: Number of consecutive steps for `sure`, at most those of an episode.
+        fuse_s: Time within which touches that follow each other count as one thing and are
+            identified together, s; 0 for each alone.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
     """
 
@@ -79,7 +79,7 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
 
 
 class PublisherConfig(_Table, frozen=True, kw_only=True):
-    """``[[publisher]]``: where messages go.
+    """``[[publisher]]``: a destination of messages.
 
     Attributes:
         kind: One of `publishers.PUBLISHERS`, or one that another package adds.
@@ -131,7 +131,7 @@ class LogConfig(_Table, frozen=True, kw_only=True):
 
 
 class LimitsConfig(_Table, frozen=True, kw_only=True):
-    """``[limits]``: how much may wait, and how long things may take; `EXAMPLE` says of what."""
+    """``[limits]``: sizes of queues and limits of time, explained in `EXAMPLE`."""
 
     queue_items: Annotated[int, msgspec.Meta(ge=16, le=1_000_000)] = 4096
     queue_mb: Annotated[float, msgspec.Meta(ge=1, le=4096)] = 32.0
@@ -149,7 +149,7 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
 
 
 class Config(_Table, frozen=True, kw_only=True):
-    """The file: one table, or one of a list of tables, for each part."""
+    """The whole file: one table, or a list of tables, for each kind of part."""
 
     version: Literal[1]
     source: tuple[SourceConfig, ...] = ()
@@ -163,7 +163,7 @@ class Config(_Table, frozen=True, kw_only=True):
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach what listens there."""
+    """Return whether only this computer can reach a host's address."""
     if host == "localhost":
         return True
     try:
@@ -249,7 +249,7 @@ HIDDEN = "***"
 
 
 def config_text(config: Config) -> str:
-    """TOML that says the same with all defaults, but for secrets, which are hidden."""
+    """Return a configuration as TOML with all defaults, and with secrets hidden."""
     lines = [f"version = {config.version}"]
     for table, several in (
         ("source", True), ("model", True), ("publisher", True), ("recorder", False),
@@ -259,30 +259,30 @@ def config_text(config: Config) -> str:
         for one in found if several else [found] if found is not None else []:
             lines += ["", f"[[{table}]]" if several else f"[{table}]"]
             for key, value in msgspec.structs.asdict(one).items():
-                lines.append(f"{key} = {_toml(_hide(key, value))}")
+                lines.append(f"{key} = {_format_toml(_hide_secrets(key, value))}")
     return "\n".join(lines) + "\n"
 
 
-def _hide(key: str, value: Any) -> Any:
+def _hide_secrets(key: str, value: Any) -> Any:
     if isinstance(value, dict):
-        return {k: _hide(k, v) for k, v in value.items()}
+        return {k: _hide_secrets(k, v) for k, v in value.items()}
     secret = any(key.lower() == s or key.lower().endswith(f"_{s}") for s in SECRETS)
     return HIDDEN if secret and isinstance(value, str) and value else value
 
 
-def _toml(value: Any) -> str:
+def _format_toml(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        # TOML's basic strings are JSON's, but for the one control character that JSON leaves bare.
+        # TOML's basic strings are JSON's, except for a control character that JSON does not escape.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, float):
         text = repr(value)
         return text if any(c in text for c in ".en") else f"{text}.0"
     if isinstance(value, dict):
-        pairs = [f"{_toml(k)} = {_toml(v)}" for k, v in value.items()]
+        pairs = [f"{_format_toml(k)} = {_format_toml(v)}" for k, v in value.items()]
         inner = ", ".join(pairs)
         return f"{{ {inner} }}" if inner else "{}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml, value))}]"
+        return f"[{', '.join(map(_format_toml, value))}]"
     return str(value) if isinstance(value, int) else value.isoformat()

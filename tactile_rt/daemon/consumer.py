@@ -1,5 +1,5 @@
-"""What publishers, the recorder, the page, metrics and systemd are to the daemon, and how each is
-run: in a thread of its own, fed from a mailbox."""
+"""Consumers (publishers, recorder, page, metrics, systemd, log): their interface, and the part that
+runs each in a thread of its own, fed from a mailbox."""
 
 import abc
 import time
@@ -26,46 +26,46 @@ TAKEN = "all its connections are taken, and others are turned away"
 
 
 class View(Protocol):
-    """The daemon as a consumer sees it; every method from any thread, at once."""
+    """The daemon as a consumer sees it; every method returns at once, in any thread."""
 
     def snapshot(self) -> Snapshot:
-        """All states now."""
+        """Return all states now."""
 
     def streams(self) -> Mapping[str, Opened]:
-        """The sources that are open now, by name."""
+        """Return the sources that are open now, by name."""
 
     def config_text(self) -> str:
-        """The configuration in force, whole, as TOML, without secrets."""
+        """Return the configuration in force, whole, as TOML, without secrets."""
 
     def report(self, part: str, state: str, reason: str, level: str = "info") -> None:
         """Put an event into the log and to all consumers."""
 
     def send(self, consumer: str, control: Control) -> bool:
-        """Ask something of another consumer, e.g. ``recorder``; whether there is one."""
+        """Send a control to another consumer, e.g. ``recorder``; return whether it exists."""
 
     def utc_offset_ns(self) -> int:
-        """UTC less host monotonic time, now."""
+        """Return UTC less host monotonic time, now, ns."""
 
     def silent(self) -> Mapping[str, float]:
-        """How long the current turn of each thread that must go on has taken, s: ``main``,
-        ``watch``, ``source.NAME``, ``model.NAME``; one that waits for work: 0."""
+        """Return the duration of each critical thread's current turn, s. The threads are ``main``,
+        ``watch``, ``source.NAME`` and ``model.NAME``; 0 for a thread that waits for work."""
 
 
 class Consumer(abc.ABC):
-    """Takes what happens. All methods are called in one thread, the consumer's own.
+    """A consumer of the daemon's items, whose methods run in a thread of its own.
 
         __init__(options) -> open(view) -> handle(items)... -> close()
 
-    Whatever `open` or `handle` raises is logged as the reason; then `close` is called and, after a
-    pause, `open` again on the same object. What came meanwhile waits in the mailbox (bounded,
-    oldest dropped). A `handle` that does not return is told as stalled, and harms only itself.
+    An error of `open` or `handle` is logged as the reason; then `close` is called and, after a
+    pause, `open` again on the same object. Items wait meanwhile in the mailbox (bounded, oldest
+    dropped). A `handle` that does not return is reported as stalled, and delays no other part.
 
     Attributes:
         Options: The msgspec.Struct (frozen, forbid_unknown_fields) of a publisher's ``options``.
-        wants: The classes of items that are handed over. Ask for `SourceChunk` and `Packet` only
-            if needed.
-        gather_s: The time that samples and packets may wait to come together, s; all else comes
-            at once.
+        wants: The classes of items that it receives. Ask for `SourceChunk` and `Packet` only if
+            needed.
+        gather_s: The time that samples and packets may wait to be handed over together, s; other
+            items are handed over at once.
         tick_s: The longest time between two calls of `handle`, with no items if need be, s; 0:
             never without items.
     """
@@ -77,39 +77,39 @@ class Consumer(abc.ABC):
 
     @abc.abstractmethod
     def open(self, view: View) -> None:
-        """Begin. Sources that are open already are in `view.streams()`.
+        """Start. The sources that are already open are in `view.streams()`.
 
-        An `Opened` that is in the mailbox may be of one of these: compare `t_ns`.
+        An `Opened` in the mailbox may be of one of these: compare `t_ns`.
         """
 
     @abc.abstractmethod
     def handle(self, items: list[Item]) -> None:
-        """Take what has come since the last call, in order."""
+        """Take the items that arrived since the last call, in order."""
 
     def close(self) -> None:  # noqa: B027
-        """End; also after `open` or `handle` raised. At the daemon's end everything that waited
-        has been handled before, if there was time."""
+        """Release all resources, also after an error of `open` or `handle`. When the daemon stops,
+        waiting items are handled before, if there is time."""
 
     def details(self) -> dict[str, str | int | float]:
-        """What to tell in the snapshot; called from any thread, must be quick."""
+        """Return details for the snapshot; called from any thread, must be quick."""
         return {}
 
     def diagnose(self) -> str:
-        """Say what keeps it from its work now; empty: nothing. It holds no number that counts on,
-        is called from any thread, must be quick."""
+        """Return what prevents its work now, or an empty string. The text has no number that keeps
+        changing; called from any thread, must be quick."""
         return ""
 
     def foresee(self) -> str:
-        """Say what will keep it from its work soon, and when; as `diagnose`."""
+        """Return what will soon prevent its work, and when; otherwise as `diagnose`."""
         return ""
 
     def on_disk(self) -> Mapping[str, OnDisk]:
-        """Of a consumer that records: what is on the disk, by source; as `details`."""
+        """Return what a recording consumer has on disk, by source; called as `details`."""
         return {}
 
 
 class ConsumerPart(Part):
-    """Runs a consumer in a thread of its own, fed from a mailbox."""
+    """The part that runs a consumer in its own thread, fed from a mailbox."""
 
     def __init__(
         self,
@@ -132,11 +132,11 @@ class ConsumerPart(Part):
 
     @property
     def consumer_state(self) -> ConsumerState:
-        """For the snapshot."""
+        """State for the snapshot."""
         try:
             details, diagnostic = self.consumer.details(), self.consumer.diagnose()
             on_disk, soon = self.consumer.on_disk(), self.consumer.foresee()
-        except Exception as error:  # telling of itself must not break the snapshot of all others
+        except Exception as error:  # it must not break the snapshot of all others
             diagnostic, on_disk = f"cannot tell how it is: {type(error).__name__}: {error}", {}
             details, soon = {}, ""
         queue = self.box.state
@@ -156,7 +156,7 @@ class ConsumerPart(Part):
         consumer.open(self._view)
         self._busy_ns = 0
         box.taking = True
-        self._up(str(consumer.details().get("url", "")))
+        self._report_running(str(consumer.details().get("url", "")))
         tick = consumer.tick_s or None
         due = time.monotonic() + consumer.tick_s
         while True:

@@ -1,4 +1,4 @@
-"""The daemon: parts made from a configuration, watched, exchanged and closed."""
+"""The daemon: parts created from a configuration, watched, replaced and closed."""
 
 import gc
 import logging
@@ -35,21 +35,21 @@ from tactile_rt.drivers.health import Identity
 
 WATCH_S = 0.25
 LOGGER = logging.getLogger("tactile_rt.classifier")
-STARTED_S = 5.0  # what has not started by then is told as degraded instead
-LATELY_NS = 1_000_000_000  # how long it is told that the wall clock has jumped
+STARTED_S = 5.0  # a part that has not started by then is reported as degraded
+LATELY_NS = 1_000_000_000  # how long a jump of the wall clock is reported
 
 
 class Daemon:
-    """Everything that a configuration asks for; a `View` for its consumers.
+    """All parts of a configuration; a `View` for its consumers.
 
     Args:
-        locks: that keep a second daemon away; None: none.
-        on_over: called once, from another thread, when all streams are over.
-        freeze: whether to keep what is there after the start out of the garbage collector, which
-            is right for a process that does nothing else.
+        locks: keep a second daemon away; None: no locks.
+        on_over: called once, from another thread, when all streams have ended.
+        freeze: whether to exempt the objects that exist after the start from garbage collection,
+            which suits a process that does nothing else.
 
     Raises:
-        ConfigError: a consumer cannot be made.
+        ConfigError: a consumer cannot be created.
         AlreadyRunning: another process has a device, or this configuration.
     """
 
@@ -64,17 +64,17 @@ class Daemon:
     ) -> None:
         self._on_over = on_over
         self._loaded, self._clock, self._locks = loaded, clock or Clock(), locks
-        self._configured: list[str] = []  # the names of its file that are held
+        self._file_keys: list[str] = []  # lock keys of its file that are held
         self._freeze = freeze
         self._hub = Hub()
         self._lines = Acquisition()
         folder = os.environ.get("STATE_DIRECTORY")  # the service's, by systemd
         self._memory = Path(folder, "arrays.json") if folder else None
-        self._arrays: dict[str, Identity] = {}  # that were accepted, by URL
+        self._arrays: dict[str, Identity] = {}  # accepted arrays, by URL
         self._sources: dict[str, SourcePart] = {}
         self._models: dict[str, tuple[Any, ModelPart]] = {}
         self._consumers: dict[str, tuple[Any, ConsumerPart]] = {}
-        self._changing = threading.RLock()  # of the parts
+        self._changing = threading.RLock()  # held while parts change
         self._started_ns = time.monotonic_ns()
         self._starting, self._stopping = True, False
         self._degraded: tuple[str, ...] = ()
@@ -91,26 +91,26 @@ class Daemon:
     # life
 
     def start(self) -> None:
-        """Start all parts; returns at once."""
-        self._hold(self._loaded, lock_keys(self._loaded.path, []))
-        # Consumers first: they are to hear of everything.
+        """Start all parts, without waiting for them."""
+        self._lock(self._loaded, lock_keys(self._loaded.path, []))
+        # Consumers first, so that they miss no event.
         ready, self._ready = self._ready, []
         with self._changing:
             for wanted, consumer in ready:
                 self._add_consumer(wanted, consumer)
-            self._recall()
+            self._load_accepted()
             self._reconcile()
         self.report("daemon", "starting", f"{self._loaded.path}")
         self._watcher.start()
         LOGGER.addHandler(self._warnings)
 
     def reload(self, loaded: Loaded) -> None:
-        """Reconcile the parts with a configuration: what is the same in it goes on undisturbed.
+        """Reconcile the parts with a configuration; unchanged parts go on undisturbed.
 
-        A model goes on until the one that takes its place is admitted.
+        A model goes on until its replacement is admitted.
 
         Raises:
-            ConfigError: a consumer cannot be made; nothing has changed.
+            ConfigError: a consumer cannot be created; nothing has changed.
             AlreadyRunning: another process has a device; nothing has changed.
         """
         with self._changing:
@@ -122,12 +122,12 @@ class Daemon:
                 for name, w in wanted.items()
                 if name not in self._consumers or self._consumers[name][0] != w.key
             }
-            self._hold(loaded, lock_keys(loaded.path, []))
+            self._lock(loaded, lock_keys(loaded.path, []))
             self._loaded, self._refused = loaded, ""
             self._reloads += 1
             gone = [n for n in self._consumers if n not in wanted or n in new]
             old = [self._consumers.pop(name)[1] for name in gone]
-            self._end(old)
+            self._stop_parts(old)
             for name, consumer in new.items():
                 self._add_consumer(wanted[name], consumer)
             self._reconcile()
@@ -135,13 +135,13 @@ class Daemon:
         self.report("daemon", "reloaded", f"{loaded.path}: {parts} new or changed")
 
     def refuse(self, reason: str) -> None:
-        """Tell that the newest configuration is not in force, for this reason."""
+        """Report that the newest configuration is not in force, and why."""
         self._refused = reason
         self.report("daemon", "refused", f"the old configuration goes on: {reason}", "error")
 
     def stop(self) -> list[str]:
-        """Close everything within `limits.stop_s`: sources, then models, then consumers, each
-        after it has taken what waited for it.
+        """Close sources, then models, then consumers, all within `limits.stop_s`. Each part first
+        takes the items that wait for it.
 
         Returns:
             The parts that did not end in time; their threads are left behind.
@@ -162,7 +162,7 @@ class Daemon:
             for n, group in enumerate(groups):
                 for part in group:
                     part.stop()
-                # Whoever hangs must not take the time of those that come after it.
+                # A part that hangs must leave time for the groups after it.
                 left = until - time.monotonic()
                 end = time.monotonic() + left * (0.5 if n < len(groups) - 1 else 0.9)
                 late += [part for part in group if not part.join(end)]
@@ -175,11 +175,11 @@ class Daemon:
             self._locks.close()
         return [part.name for part in late if not part.join(0.0)]
 
-    # what consumers see
+    # the view of consumers
 
     def snapshot(self) -> Snapshot:
-        """All states now."""
-        # Copies of dictionaries that another thread may be changing are whole: copying is atomic.
+        """Return all states now."""
+        # Another thread may change these dictionaries; copying them is atomic.
         sources = tuple(p.source_state for p in self._sources.copy().values())
         models = tuple(p.model_state for _, p in self._models.copy().values())
         consumers = tuple(p.consumer_state for _, p in self._consumers.copy().values())
@@ -207,11 +207,11 @@ class Daemon:
         )  # fmt: skip
 
     def streams(self) -> Mapping[str, Opened]:
-        """Sources that are open now."""
+        """Return the sources that are open now, by name."""
         return self._hub.streams()
 
     def config_text(self) -> str:
-        """The configuration in force as TOML, without secrets."""
+        """Return the configuration in force as TOML, without secrets."""
         return config_text(self._loaded.config)
 
     def report(self, part: str, state: str, reason: str, level: str = "info") -> None:
@@ -220,7 +220,7 @@ class Daemon:
         self._hub.post(Event(part, state, reason, level, now, self._clock.utc_offset_ns()))
 
     def send(self, consumer: str, control: Control) -> bool:
-        """Ask something of a consumer; whether there is one of that name that listens."""
+        """Send a control to a consumer; return whether one of that name takes it."""
         box = self._hub.box(consumer)
         if box is None or Control not in box.wants:
             return False
@@ -228,15 +228,15 @@ class Daemon:
         return True
 
     def utc_offset_ns(self) -> int:
-        """UTC less monotonic time, now."""
+        """Return UTC less monotonic time, now, ns."""
         return self._clock.utc_offset_ns()
 
     def turned(self, name: str) -> None:
-        """A thread that must go on, and is no part, tells that it does."""
+        """Note a turn of a thread that is no part but must keep running."""
         self._turns.take(name)
 
     def silent(self) -> Mapping[str, float]:
-        """How long the current turn of each thread that must go on has taken, s."""
+        """Return the duration of each critical thread's current turn, s."""
         return {
             **({} if self._stopping else self._turns.silent()),
             **{p.name: p.silent_s for p in self._sources.copy().values()},
@@ -268,12 +268,12 @@ class Daemon:
                 self._models[name] = (new[0], running)
                 running.exchange(new[1])
         for name, part in list(self._sources.items()):
-            if part.another:  # it is accepted
+            if part.another:  # a reload accepts another array
                 self._arrays.pop(part.config.url, None)
             elif sources.get(name) == part.config and part.state.state != "failed":
-                continue  # of what one has failed of the file may be another by now
+                continue  # but restart one that has failed: its files may have changed
             old.append(self._sources.pop(name))
-        self._end(old)
+        self._stop_parts(old)
         for name, (key, model) in models.items():
             if name not in self._models:
                 made = ModelPart(model, self._hub, self.report, limits, self._clock)
@@ -289,8 +289,8 @@ class Daemon:
                 self._sources[name] = part
                 part.start()
 
-    def _end(self, parts: list[Any]) -> None:
-        """Stop parts that are no longer wanted."""
+    def _stop_parts(self, parts: list[Any]) -> None:
+        """Stop parts that are no longer configured."""
         for part in parts:
             box = getattr(part, "box", None)
             if box is not None:
@@ -307,8 +307,8 @@ class Daemon:
     def _watch(self) -> None:
         self.turned("watch")
         while not self._unwatch.wait(WATCH_S):
-            self._notice_starving()
-            self._hold_devices()
+            self._report_starvation()
+            self._renew_locks()
             self.turned("watch")
             for name, source in self._sources.copy().items():
                 on_it = [p for _, p in self._models.copy().values() if p.config.source == name]
@@ -323,16 +323,16 @@ class Daemon:
                 self._clock_steps += 1
                 self._stepped_ns = self._clock.monotonic_ns()
                 self.report("daemon", "clock", f"the wall clock jumped by {step / 1e9:+.3f} s")
-            if self._starting and self._settled():
+            if self._starting and self._has_started():
                 self._starting = False
                 if self._freeze:
-                    # What is there now stays: to look through it again and again costs pauses.
+                    # The objects that exist now stay; scanning them repeatedly costs pauses.
                     gc.collect()
                     gc.freeze()
                 if not self.snapshot().degraded:
                     self.report("daemon", "running", "")
             elif not self._starting:
-                self._tell_degraded()
+                self._report_degraded()
             if self._sources and all(
                 p.state.state == "ended" for p in self._sources.copy().values()
             ):
@@ -340,15 +340,15 @@ class Daemon:
                 if done is not None:
                     done()
 
-    def _recall(self) -> None:
+    def _load_accepted(self) -> None:
         if self._memory is None or not self._memory.exists():
             return
         try:
             self._arrays = msgspec.json.decode(self._memory.read_bytes(), type=dict[str, Identity])
-        except Exception as error:  # whatever is wrong with it
+        except Exception as error:  # any damage to the file
             self.report("daemon", "memory", f"delete {self._memory}: {reason_of(error)}", "warning")
 
-    def _remember(self) -> None:
+    def _store_accepted(self) -> None:
         known = {p.config.url: p.accepted for p in self._sources.copy().values() if p.accepted}
         if self._memory is None or (arrays := {**self._arrays, **known}) == self._arrays:
             return
@@ -359,24 +359,24 @@ class Daemon:
         except OSError as error:
             self.report("daemon", "memory", reason_of(error), "warning")
 
-    def _hold_devices(self) -> None:
-        """A link to a device that was plugged in again leads to another one: that is held now, and
-        the one before is free for others."""
+    def _renew_locks(self) -> None:
+        """Renew the locks on devices. A link to a device that was plugged in again may lead to
+        another device node: that is locked now, and the one before is released."""
         if self._changing.acquire(blocking=False):
             try:
-                self._remember()
-                with suppress(AlreadyRunning):  # then opening it fails, and says so
-                    self._hold(self._loaded, self._configured)
+                self._store_accepted()
+                with suppress(AlreadyRunning):  # opening it then fails and reports it
+                    self._lock(self._loaded, self._file_keys)
             finally:
                 self._changing.release()
 
-    def _hold(self, loaded: Loaded, configured: list[str]) -> None:
-        """Have the devices of a configuration, and its file under these names, to ourselves."""
+    def _lock(self, loaded: Loaded, configured: list[str]) -> None:
+        """Lock the devices of a configuration, and its file under the keys `configured`."""
         if self._locks is not None and not self._stopping:
             self._locks.hold([*configured, *device_keys([s.url for s in loaded.config.source])])
-            self._configured = configured
+            self._file_keys = configured
 
-    def _notice_starving(self) -> None:
+    def _report_starvation(self) -> None:
         if lasted_s := self._turns.watch(self._watcher.native_id):
             why = f"it had no turn for {lasted_s:.1f} s: it was stopped, or the processor was taken"
             self.report("daemon", "starved", why, "warning")
@@ -388,12 +388,12 @@ class Daemon:
             *(p for _, p in self._consumers.copy().values()),
         ]
 
-    def _settled(self) -> bool:
+    def _has_started(self) -> bool:
         if time.monotonic_ns() - self._started_ns > STARTED_S * 1e9:
             return True
         return all(p.state.state != "starting" or p.state.failures for p in self._parts())
 
-    def _tell_degraded(self) -> None:
+    def _report_degraded(self) -> None:
         lines = self.snapshot().degraded
         for line in lines:
             if line not in self._degraded:

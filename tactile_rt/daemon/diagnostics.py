@@ -1,14 +1,14 @@
-"""Diagnostics: what the daemon does not do as it should, said from facts.
+"""Diagnostics: what does not work now, derived from measured facts.
 
-That a thread runs says nothing of whether its work is done. So what counts is how old the newest
-sample is, whether it is on the disk, how long what is to be published has waited, and what was lost
-within the newest second; each against a limit of the configuration. `diagnose` names them.
+A running thread does not prove that its work is done. So `diagnose` compares with limits of the
+configuration: the age of the newest sample, how long samples are not on disk and messages not
+published, and what was lost within the newest second.
 
-What is the consequence of something else is not told besides it: with no samples there are no
-decisions, and while the whole process had no turn none of its parts is to blame.
+The consequence of another diagnostic is not reported: without samples there are no decisions, and
+while the whole process had no turn, none of its parts is to blame.
 
-A diagnostic is one line that stays the same as long as what it says is true: it holds no number
-that counts on. The numbers are in the snapshot.
+A diagnostic is one line that stays the same as long as it holds: it contains no number that keeps
+changing. The numbers are in the snapshot.
 """
 
 import math
@@ -36,21 +36,21 @@ from tactile_rt.drivers.health import State
 NS = 1e9
 MINUTE_S, SECOND_S, LOOK_S = 60.0, 1.0, 0.05
 REPEATED = 0.01  # of the samples of a second: a copy now and then is no harm
-PERIODS = 3  # of a slow sensor, before a sample of it is old
+PERIODS = 3  # of a slow sensor, after which its newest sample is old
 
 
 class LossWindow:
-    """How much of a count that only grows was added within the newest second and minute."""
+    """The growth of a count within the newest second and minute."""
 
     def __init__(self, first: int = 0) -> None:
         self._lock = threading.Lock()
         self._seen: deque[tuple[float, int]] = deque([(time.monotonic(), first)])
 
     def add(self, count: int) -> Losses:
-        """Take the count as it is now; what was added. From any thread."""
+        """Take the count as it is now; return its growth. Safe from any thread."""
         now = time.monotonic()
         with self._lock:
-            if now - self._seen[-1][0] >= LOOK_S:  # whoever looks more often is no burden
+            if now - self._seen[-1][0] >= LOOK_S:  # more frequent calls take no memory
                 self._seen.append((now, count))
             while len(self._seen) > 1 and self._seen[1][0] <= now - MINUTE_S:
                 self._seen.popleft()
@@ -63,7 +63,7 @@ class LossWindow:
 
 
 def oldest_s(limits: LimitsConfig, rate_hz: float) -> float:
-    """How old the newest sample of a source with this rate may be, s."""
+    """Return the greatest age of the newest sample of a source, s."""
     return max(limits.sample_age_s, PERIODS / rate_hz)
 
 
@@ -77,19 +77,19 @@ def diagnose(
     clock_stepped: bool = False,
     refused: str = "",
 ) -> tuple[Diagnostic, ...]:
-    """Name all that do not do what they promise, in the order of the stream.
+    """Return the diagnostics of all parts, in the order of the stream.
 
     Args:
-        now_ns: The time at which all this is true, host CLOCK_MONOTONIC, ns.
+        now_ns: The time of these states, host CLOCK_MONOTONIC, ns.
         starved_s: How long the whole process had no turn, within the newest second, s.
-        clock_stepped: The wall clock jumped within the newest second.
+        clock_stepped: Whether the wall clock jumped within the newest second.
         refused: The reason why the newest configuration is not in force; empty: it is.
     """
     found = []
     if starved_s:
         why = "it had no turn: it was stopped, or another program took the processor"
         found.append(Diagnostic("daemon", "late", why))
-        # none of its parts is to blame for what came late meanwhile; but what is lost is lost
+        # no part is to blame for being late meanwhile, but losses still count
         limits = structs.replace(limits, sample_age_s=math.inf, behind_s=math.inf)
     if clock_stepped:
         found.append(Diagnostic("daemon", "UTC has jumped", "the wall clock was set"))
@@ -97,29 +97,29 @@ def diagnose(
         why = f"the new one is refused: {refused}"
         found.append(Diagnostic("daemon", "old configuration", why, "the one before is in force"))
     for source in sources:
-        found += _of_source(source, limits, now_ns, bool(starved_s))
+        found += _diagnose_source(source, limits, now_ns, bool(starved_s))
     recording = any(c.kind == "recorder" and c.part.state == "running" for c in consumers)
     on = "recording goes on" if recording else "acquisition goes on"
     for model in models:
-        found += _of_model(model, limits, now_ns, on, bool(starved_s))
+        found += _diagnose_model(model, limits, now_ns, on, bool(starved_s))
     for consumer in consumers:
-        found += _of_consumer(consumer, sources, limits, now_ns, bool(starved_s))
+        found += _diagnose_consumer(consumer, sources, limits, now_ns, bool(starved_s))
     return tuple(found)
 
 
-def _of_source(
+def _diagnose_source(
     source: SourceState, limits: LimitsConfig, now_ns: int, starved: bool
 ) -> list[Diagnostic]:
     part, device = source.part, source.device
     name = part.name
-    if _broken(part, starved):
-        return [Diagnostic(name, "no samples", _why(part))]
+    if _is_broken(part, starved):
+        return [Diagnostic(name, "no samples", _describe_failure(part))]
     if part.state != "running":
         return []
     rate_hz = source.measured_hz if source.slow else source.rate_hz
     most = oldest_s(limits, rate_hz) if rate_hz else limits.sample_age_s
     read_s, taken_s = (now_ns - source.read_ns) / NS, (now_ns - source.newest_ns) / NS
-    late = starved or (source.slow and read_s <= most)  # then it is not silent
+    late = starved or (source.slow and read_s <= most)  # slow or starved, but not silent
     away = (State.LOST,) if late else (State.STALE, State.LOST)
     if device is not None and device.state in away:
         return [Diagnostic(name, "no samples", f"the device is {device.state}")]
@@ -160,18 +160,18 @@ def _of_source(
         found.append(Diagnostic(name, "device fault", f"it says: {', '.join(faults)}"))
     if source.losses.second:
         found.append(Diagnostic(name, "lost samples", "some did not come, or came damaged"))
-    if source.bad.second and not faults:  # what a device says invalid as it fails is none
+    if source.bad.second and not faults:  # a failing device marks values invalid
         why = "some values are no numbers, or absurd, or none is valid"
         found.append(Diagnostic(name, "bad samples", why))
     return found
 
 
-def _of_model(
+def _diagnose_model(
     model: ModelState, limits: LimitsConfig, now_ns: int, still: str, starved: bool
 ) -> list[Diagnostic]:
     part = model.part
-    if _broken(part, starved):
-        return [Diagnostic(part.name, "no decisions", _why(part), still)]
+    if _is_broken(part, starved):
+        return [Diagnostic(part.name, "no decisions", _describe_failure(part), still)]
     if part.state == "starting" and now_ns - part.since_ns > limits.behind_s * NS:
         return [Diagnostic(part.name, "no decisions", "it is still being tried and loaded", still)]
     if part.state != "running":
@@ -194,7 +194,7 @@ def _of_model(
     return []
 
 
-def _of_consumer(
+def _diagnose_consumer(
     consumer: ConsumerState,
     sources: Sequence[SourceState],
     limits: LimitsConfig,
@@ -205,8 +205,8 @@ def _of_consumer(
     missing = "not published"
     if not part.name.startswith("publisher."):
         missing = "no recording" if consumer.kind == "recorder" else f"no {consumer.kind}"
-    if _broken(part, starved):
-        return [Diagnostic(part.name, missing, _why(part), still)]
+    if _is_broken(part, starved):
+        return [Diagnostic(part.name, missing, _describe_failure(part), still)]
     if part.state not in ("running", "starting"):
         return []
     if consumer.behind_s > limits.behind_s:
@@ -216,14 +216,14 @@ def _of_consumer(
     elif consumer.losses.second:
         why = "it was too slow, and some of it was dropped"
     else:
-        why = "" if starved else _unrecorded(consumer, sources, limits, now_ns)
+        why = "" if starved else _diagnose_disk(consumer, sources, limits, now_ns)
     return [Diagnostic(part.name, missing, why, still)] if why else []
 
 
-def _unrecorded(
+def _diagnose_disk(
     consumer: ConsumerState, sources: Sequence[SourceState], limits: LimitsConfig, now_ns: int
 ) -> str:
-    """What of the sources is not on the disk, in words."""
+    """Return which samples are not on disk, and why, or an empty string."""
     for source in sources:
         name = source.part.name.partition(".")[2]
         disk = consumer.on_disk.get(name)
@@ -242,15 +242,15 @@ def _unrecorded(
     return ""
 
 
-def _broken(part: PartState, starved: bool) -> bool:
+def _is_broken(part: PartState, starved: bool) -> bool:
     if part.state == "stalled":
         return not starved
-    # While it is tried again it is not well yet.
+    # A part that is being restarted still counts as broken.
     broken = part.state in ("waiting", "failed")
     return broken or (part.state == "starting" and part.failures > 0)
 
 
-def _why(part: PartState) -> str:
+def _describe_failure(part: PartState) -> str:
     if part.state == "stalled":
         return "stalls"
     return f"{'has failed' if part.state == 'failed' else 'fails'}: {part.reason}"

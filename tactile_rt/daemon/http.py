@@ -1,15 +1,15 @@
 """HTTP for the page and the metrics: one small server, which each runs at an address of its own.
 
-It is there so that a robot that is only measured needs no other package, and so that what stands
-against a hostile network is written once. It does what those two need and no more: GET and small
-POSTs, answers of known length, and streams without end.
+It exists so that metrics alone need no other package, and so that the protection against a hostile
+network is written once. It does only what those two need: GET and small POSTs, answers of known
+length, and streams without end.
 
-A connection carries one request. Its head must be there whole within a time and a size, its body is
-read when the application asks for it, and after the answer the connection is closed. So there is
-never a second request that could be taken for the rest of the first, and nobody keeps a place
-without asking for something. Everything that a peer can make us hold is bounded: connections, bytes
-of a head and of a body, the time to send either, and the time to take an answer. Who exceeds that
-is hung up on and counted.
+A connection carries one request. Its head must arrive within limits of time and size, its body is
+read when the application asks for it, and after the answer the connection is closed. So no second
+request can be mistaken for the rest of the first, and no peer keeps a connection without a request.
+Everything that a peer can make the server hold is bounded: connections, bytes of a head and of a
+body, the time to send either, and the time to take an answer. A peer that exceeds a limit is
+disconnected and counted.
 
 All connections of a server are tasks of one event loop in a thread of its own. The application is
 one function, from a `Request` to a `Response`; it refuses by raising `Refused`.
@@ -28,26 +28,26 @@ from typing import Any
 from tactile_rt.core.errors import SourceError
 
 BACKLOG = 64
-END_S = 0.5  # what streams have for their end when the server closes
-TURNS = 5  # of the loop, however late: from an accepted connection to `_meet` it is three
+END_S = 0.5  # for streams to end when the server closes
+TURNS = 5  # of the loop at closing; an accepted connection reaches `_accept` after three
 JOIN_S = 2.0
 TOKEN = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
 CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
-ONCE = ("host", "origin", "content-length", "transfer-encoding")  # else who reads which?
+ONCE = ("host", "origin", "content-length", "transfer-encoding")  # ambiguous if repeated
 
 
 @dataclass(frozen=True)
 class HttpLimits:
-    """What those who ask may cost.
+    """The limits that clients of a server must keep.
 
     Attributes:
-        connections: The number of connections at a time; one more is dropped at once, before a file
-            descriptor is missed elsewhere.
+        connections: The number of connections at a time; a further one is dropped at once, before
+            file descriptors run out elsewhere.
         head_bytes: The largest head of a request with the empty line that ends it, in bytes.
-        head_s: The time from the connection to the end of the head, however it drips in, s.
-        send_s: The time that a peer may leave what is sent to it untaken, s.
-        newest_first: Whether one more takes the place of the oldest, which was slow then, instead
-            of being dropped: where all answers are short, nobody can keep others away.
+        head_s: The time from the connection to the end of the head, however slowly it arrives, s.
+        send_s: The time that a peer may take to receive what is sent, s.
+        newest_first: Whether a further connection replaces the oldest, which is slow then, instead
+            of being dropped: if all answers are short, no peer can keep others away.
     """
 
     connections: int
@@ -61,7 +61,7 @@ class Refused(Exception):
     """A request that is not served.
 
     Args:
-        reason: One line, shown to who asked.
+        reason: One line, shown to the client.
     """
 
     def __init__(self, status: int, reason: str, headers: Mapping[str, str] | None = None) -> None:
@@ -71,13 +71,13 @@ class Refused(Exception):
 
 @dataclass
 class Request:
-    """What somebody asks.
+    """A client's request.
 
     Attributes:
         path: The path as it was sent, not decoded, beginning with a slash.
-        query: What follows the first question mark of the target.
+        query: The part after the first question mark of the target.
         version: HTTP/1.0 or HTTP/1.1.
-        headers: The values by name in lower case; those given several times are joined.
+        headers: The values by name in lower case; repeated headers are joined.
         begun: The part of the body that came with the head.
         reader: The connection, from which the rest of the body is read.
     """
@@ -92,10 +92,10 @@ class Request:
     reader: asyncio.StreamReader | None = None
 
     async def body(self, most: int, seconds: float) -> bytes:
-        """Read the whole body of at most so many bytes.
+        """Read the whole body, of at most `most` bytes, within a time, s.
 
         Raises:
-            Refused: It is too large or too slow, breaks off, or does not tell its length.
+            Refused: It is too large or too slow, breaks off, or does not state its length.
         """
         if "transfer-encoding" in self.headers:
             raise Refused(411, "tell the length of the body")
@@ -118,12 +118,12 @@ class Request:
 
 @dataclass(frozen=True)
 class Response:
-    """What is sent back.
+    """The answer to a request.
 
     Attributes:
         body: The body; or a generator of its pieces, which is closed when the peer goes or the
-            server ends. What it raises before the first piece becomes the answer instead.
-        headers: Beside those that all answers of the server carry.
+            server ends. An error that it raises before its first piece becomes the answer.
+        headers: Headers in addition to those of all answers of the server.
     """
 
     status: int = 200
@@ -133,18 +133,18 @@ class Response:
 
 
 class HttpServer:
-    """Answers from now on until it is closed.
+    """An HTTP server that answers from its creation until it is closed.
 
     Args:
         listening: The socket, see `listen`; closed with the server.
         answer: The application, called in the thread of the server.
-        failed: Told why when a request could not be answered for a fault of our own.
+        failed: Called with the reason when an error of the application prevents an answer.
 
     Attributes:
         answered: The number of requests so far that were answered with 200.
-        refused: The number of requests so far that were refused, or that a fault left unanswered.
-        dropped: The number of connections so far that were hung up on: one too many, one that
-            asked for nothing, or one that did not take its answer.
+        refused: The number of requests so far that were refused, or prevented by an error.
+        dropped: The number of connections so far that were cut off: one too many, one without a
+            request, or one that did not take its answer.
     """
 
     def __init__(
@@ -160,31 +160,31 @@ class HttpServer:
         self._limits, self._headers = limits, headers
         self.answered = self.refused = self.dropped = 0
         self._tasks: dict[asyncio.Task[None], asyncio.StreamWriter] = {}  # the oldest first
-        self._asking: set[asyncio.Task[None]] = set()  # those whose request is not there yet
+        self._asking: set[asyncio.Task[None]] = set()  # those whose request is incomplete
         self._over = asyncio.Event()
         self._loop = asyncio.new_event_loop()
-        # A descriptor that is missing: told here, and not by a traceback on stderr.
-        self._loop.set_exception_handler(lambda loop, context: self._drop())
+        # If file descriptors run out, count that, without a traceback on stderr.
+        self._loop.set_exception_handler(lambda loop, context: self._count_drop())
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     @property
     def alive(self) -> bool:
-        """Whether it still answers."""
+        """True if it still answers."""
         return self._thread.is_alive()
 
     @property
     def connections(self) -> int:
-        """How many there are now; from any thread."""
+        """Number of connections now; from any thread."""
         return len(self._tasks)
 
     @property
     def full(self) -> bool:
-        """Whether whoever comes now is turned away; from any thread."""
+        """True if a further connection would be dropped; from any thread."""
         return self.connections >= self._limits.connections and not self._limits.newest_first
 
     def call(self, function: Callable[..., object], *arguments: Any) -> None:
-        """Call something in the thread of the server, soon.
+        """Call a function in the thread of the server, soon.
 
         Raises:
             RuntimeError: The server has ended.
@@ -192,7 +192,7 @@ class HttpServer:
         self._loop.call_soon_threadsafe(function, *arguments)
 
     def close(self) -> None:
-        """Listen no more, give streams their end, and hang up on all others."""
+        """Stop listening, let streams end, and close all other connections."""
         with suppress(RuntimeError):  # it has ended already
             self.call(self._over.set)
         self._thread.join(JOIN_S)
@@ -206,21 +206,21 @@ class HttpServer:
 
     async def _serve(self) -> None:
         server = await asyncio.start_server(
-            self._meet, sock=self._listening, backlog=BACKLOG, limit=self._limits.head_bytes
+            self._accept, sock=self._listening, backlog=BACKLOG, limit=self._limits.head_bytes
         )
         await self._over.wait()
         server.close()
-        for _ in range(TURNS):  # who has been accepted is met, and turned away
+        for _ in range(TURNS):  # accepted connections reach `_accept` and are dropped
             await asyncio.sleep(0.002)
         for task in self._asking:
             task.cancel()
         if self._tasks:
             await asyncio.wait(self._tasks, timeout=END_S)
-        # The runner cancels those that are left.
+        # The runner cancels the remaining tasks.
 
-    def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._tasks) >= self._limits.connections or self._over.is_set():
-            self._drop()
+            self._count_drop()
             if not self._limits.newest_first or self._over.is_set():
                 writer.transport.abort()
                 return
@@ -232,10 +232,10 @@ class HttpServer:
         self._asking.add(task)
         task.add_done_callback(lambda task: self._tasks.pop(task, None))
         task.add_done_callback(self._asking.discard)
-        # A task that is cancelled before it has begun does not even come to its end.
+        # A task that is cancelled before it begins never reaches its `finally`.
         task.add_done_callback(lambda _: writer.transport.abort())
 
-    def _drop(self) -> None:
+    def _count_drop(self) -> None:
         self.dropped += 1
 
     async def _connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -244,24 +244,24 @@ class HttpServer:
             writer.close()
             async with asyncio.timeout(self._limits.send_s):
                 await writer.wait_closed()
-        except (OSError, TimeoutError):  # gone, silent, or it takes nothing
-            self._drop()
+        except (OSError, TimeoutError):  # the peer is gone, silent, or takes nothing
+            self._count_drop()
         finally:
             writer.transport.abort()
 
     async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         request: Request | None = None
         try:
-            request = await self._read(reader, writer)
+            request = await self._receive(reader, writer)
             answer = await self._answer(request)
-            # Until its first piece is there, a stream can still be refused.
+            # A stream can still be refused before its first piece.
             first = answer.body if isinstance(answer.body, bytes) else await anext(answer.body)
         except Refused as refused:
             self.refused += 1
             first = refused.reason.encode()
             answer = Response(refused.status, first, headers=refused.headers)
         except Exception as error:
-            if request is None:  # the connection's, not ours
+            if request is None:  # the connection failed, not the application
                 raise
             self.refused += 1
             self._failed(f"{request.path:.40}: {type(error).__name__}: {error}")
@@ -269,7 +269,7 @@ class HttpServer:
             answer = Response(500, first)
         self.answered += answer.status == 200
         stream = None if isinstance(answer.body, bytes) else answer.body
-        # Proxies ask in HTTP/1.0, which knows no chunks: there the end of the line is the end.
+        # Proxies use HTTP/1.0, which has no chunks: the end of the connection ends the body.
         chunked = stream is not None and request is not None and request.version != "HTTP/1.0"
         headers = {**self._headers, "connection": "close", "content-type": answer.kind}
         if chunked:
@@ -284,19 +284,19 @@ class HttpServer:
         if request is not None and request.method == "HEAD":
             first = b""
         try:
-            await self._send(writer, head + (_chunk(first) if chunked else first))
+            await self._send(writer, head + (_encode_chunk(first) if chunked else first))
             if stream is not None:
-                await self._pour(stream, reader, writer, chunked)
+                await self._send_stream(stream, reader, writer, chunked)
         finally:
             if stream is not None:
                 await stream.aclose()
 
-    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Request:
-        """The head of a request.
+    async def _receive(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Request:
+        """Read the head of a request.
 
         Raises:
-            Refused: It is none, or too long.
-            TimeoutError: Nothing at all has come, as of browsers that connect in advance.
+            Refused: It is malformed or too long.
+            TimeoutError: Nothing at all has come, as from browsers that connect in advance.
         """
         data, most = b"", self._limits.head_bytes
         try:
@@ -321,21 +321,21 @@ class HttpServer:
         request.begun, request.reader = begun, reader
         return request
 
-    async def _pour(
+    async def _send_stream(
         self,
         pieces: AsyncGenerator[bytes, None],
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
         chunked: bool,
     ) -> None:
-        """Send a stream until it is over, the peer is gone, or the server ends."""
+        """Send a stream until it ends, the peer is gone, or the server ends."""
 
         async def send_all() -> None:
             async for piece in pieces:
-                await self._send(writer, _chunk(piece) if chunked else piece)
+                await self._send(writer, _encode_chunk(piece) if chunked else piece)
 
         sending = asyncio.ensure_future(send_all())
-        # Whoever says more than its request is no longer one who listens.
+        # A peer that sends more than its request counts as gone.
         gone = asyncio.ensure_future(reader.read(1))
         over = asyncio.ensure_future(self._over.wait())
         tasks: list[asyncio.Future[Any]] = [sending, gone, over]
@@ -357,11 +357,11 @@ class HttpServer:
 
 
 def listen(host: str, port: int, *, both: bool = False) -> socket.socket:
-    """A socket that waits for others.
+    """Open a socket that listens for connections.
 
     Args:
-        host: The address, or a name that means one; IPv6 with or without brackets.
-        both: Whether an IPv6 address takes IPv4, too, and a name means its IPv4 address.
+        host: The address, or a name for it; IPv6 with or without brackets.
+        both: Whether an IPv6 address accepts IPv4, too, and a name means its IPv4 address.
 
     Raises:
         SourceError: The port is taken, or the address is not of this computer.
@@ -380,13 +380,13 @@ def listen(host: str, port: int, *, both: bool = False) -> socket.socket:
 
 
 def parse_head(head: bytes) -> Request:
-    """The first line and the headers of a request, without the empty line at their end.
+    """Parse the head of a request, without the empty line at its end.
 
-    Strict, as proxies and we must read the same: no folded lines, no bare line ends, no blanks in
-    names, nothing twice that may stand there once.
+    Parsing is strict, so that a proxy reads the same: no folded lines, no bare line ends, no blanks
+    in names, no repetition of headers that may occur once.
 
     Raises:
-        Refused: 400, it is none.
+        Refused: 400, the head is malformed.
     """
     first, *lines = head.decode("latin-1").split("\r\n")
     words = first.split(" ")
@@ -413,6 +413,6 @@ def parse_head(head: bytes) -> Request:
     return Request(words[0], path, query, words[2], headers)
 
 
-def _chunk(data: bytes) -> bytes:
-    """A piece of a stream; an empty one would be its end."""
+def _encode_chunk(data: bytes) -> bytes:
+    """Encode a piece of a stream. An empty piece gives nothing, as it would end the stream."""
     return b"%x\r\n%b\r\n" % (len(data), data) if data else b""

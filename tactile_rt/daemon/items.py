@@ -1,7 +1,7 @@
-"""What moves between the parts of the daemon: few, frozen, in the order in which it happened.
+"""Items that move between the parts of the daemon, frozen, in the order of events.
 
-Each names its source and model as the configuration does, and `frame`, the array's mount frame.
-Times are host CLOCK_MONOTONIC, ns, where nothing else stands; `utc_offset_ns` is UTC less that.
+An item names its source and model as the configuration does; `frame` is the array's mount frame.
+Times are host CLOCK_MONOTONIC, ns, unless stated otherwise; `utc_offset_ns` is UTC less that.
 """
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 @dataclass(frozen=True)
 class Opened:
-    """A source has been opened, or opened again; samples and packets of it follow.
+    """A source has been opened, or opened again; its samples and packets follow.
 
     Attributes:
-        stream: The opened source, for `health`, `stats` and what it is; never read or close it.
-        accepted: Whether it is the array that the source began with; models hear of no other.
-        prelude: The (packet, arrival in ns) pairs that came of a device while it was started, in
-            which it describes itself. The same packets also come as `Packet` items.
+        stream: The opened source, for `health`, `stats` and description; never read or close it.
+        accepted: Whether it is the array that the source began with; models receive no other.
+        prelude: The (packet, arrival in ns) pairs that a device sent while it was started, in which
+            it describes itself. The same packets also come as `Packet` items.
     """
 
     source: str
@@ -34,7 +34,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Closed:
-    """A source has been closed: it broke, is over, or is no longer configured."""
+    """A source has been closed: it broke, has ended, or is no longer configured."""
 
     source: str
     t_ns: int
@@ -42,7 +42,7 @@ class Closed:
 
 @dataclass(frozen=True)
 class SourceChunk:
-    """A chunk of a source as it came, calibrated, and when it was read."""
+    """A calibrated chunk of a source, with the time at which it was read."""
 
     source: str
     spec: ArraySpec
@@ -54,7 +54,7 @@ class SourceChunk:
 
 @dataclass(frozen=True)
 class Packet:
-    """What came over a device's line: bytes or CAN frames; None when the line was opened."""
+    """A packet from a device's line: bytes or CAN frames; None: the line was opened."""
 
     source: str
     packet: Any
@@ -68,8 +68,8 @@ class Decision:
     Attributes:
         decision: The label, probabilities and step; its times are the stream's.
         sample_ns: The host time of the sample that completed the step.
-        made_ns: The host time at which the decision was there.
-        deadline_ns: The age of that sample from which the decision is late, ns; 0: there is none.
+        made_ns: The host time at which the decision was made.
+        deadline_ns: The age of that sample from which the decision is late, ns; 0: no deadline.
     """
 
     source: str
@@ -96,13 +96,13 @@ class Contact:
 
 @dataclass(frozen=True)
 class Skipped:
-    """A model skipped a stretch of its stream: it was behind, and goes on at the newest sample.
+    """A model that was behind skipped a stretch of its stream.
 
     Attributes:
         from_ns, until_ns: The stream times of the first sample that was skipped, and of the first
-            one that was not, ns.
-        lost: The number of samples of the stretch that did not even reach the model's contact
-            detector: they were dropped from its mailbox.
+            sample after the stretch, ns.
+        lost: The number of samples of the stretch that were dropped from the model's mailbox, so
+            that they did not even reach its contact detector.
     """
 
     source: str
@@ -117,7 +117,7 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Event:
-    """A part of the daemon, or a device, changed its state; or something worth a line in the log.
+    """A change of state of a part or a device, or another fact worth logging.
 
     Attributes:
         part: ``source.NAME``, ``model.NAME``, ``publisher.NAME``, ``recorder``, ``page``,
@@ -137,7 +137,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Control:
-    """Asked of one consumer by another, as by the page of the recorder.
+    """A request from one consumer to another, such as from the page to the recorder.
 
     The recorder knows ``start``, ``stop``, ``trigger`` and ``rotate``.
     """

@@ -1,5 +1,5 @@
-"""What became of a source's samples: which are recorded, which a power cut would take, which are
-lost, over all files and as often as the source comes and goes."""
+"""The account of a source's samples: recorded, at risk in a power cut, or lost, over all files and
+however often the source comes and goes."""
 
 import time
 
@@ -10,42 +10,42 @@ Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
 
 
 class Ledger:
-    """Keeps the account of a source; written by the recorder's thread, read by any."""
+    """The account of a source; written by the recorder's thread, read by any thread."""
 
     def __init__(self) -> None:
-        self._now: tuple[Sums, tuple[RecordingWriter, ...]] = (0, 0, 0), ()  # done; the others
+        self._now: tuple[Sums, tuple[RecordingWriter, ...]] = (0, 0, 0), ()  # finished; open files
         self._lost = (0, 0, "")
 
     def begin(self, file: RecordingWriter) -> None:
-        """Another file is open."""
+        """Add a file that has been opened."""
         past, files = self._now
         self._now = past, (*files, file)
 
     def lose(self, samples: int, why: str) -> None:
-        """So many samples are not recorded."""
+        """Count samples that are not recorded, with the reason."""
         if samples:
             self._lost = self._lost[0] + samples, time.monotonic_ns(), why
 
     def settle(self) -> list[tuple[RecordingWriter, int, int]]:
-        """Files that are done and whose last sync failed, with the samples and packets that it
-        lost; these are counted by who calls."""
+        """Settle finished files; return those whose last sync failed, and what each lost. The
+        caller counts these samples and packets."""
         past, files = self._now
         done = tuple(file for file in files if file.done)
         failed = [(f, *f.disown(f.synced)) for f in done if f.failed is not None]
         if done:
-            self._now = _sum(past, done), tuple(file for file in files if file not in done)
+            self._now = _add_files(past, done), tuple(file for file in files if file not in done)
         return failed
 
     def on_disk(self, open: bool, meant_ns: int, slow_s: float) -> OnDisk:
-        """All of it; from any thread."""
+        """Return the whole account; from any thread."""
         past, files = self._now
-        samples, written_ns, synced_ns = _sum(past, files)
+        samples, written_ns, synced_ns = _add_files(past, files)
         waits_ns = min((ns for file in files if (ns := file.unsynced_ns)), default=0)
         return OnDisk(written_ns, synced_ns, samples, *self._lost, open, meant_ns, waits_ns, slow_s)
 
 
-def _sum(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:
-    """Of these files, too."""
+def _add_files(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:
+    """Add the figures of files to earlier sums."""
     samples, written_ns, synced_ns = past
     return (
         samples + sum(file.stats.samples for file in files),

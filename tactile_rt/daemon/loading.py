@@ -1,7 +1,7 @@
-"""Read a configuration: one file, and what the command line sets.
+"""Loading of a configuration: one file, and the settings of the command line.
 
-Every mistake is one line that names file and line (or the ``--set``), the key, and the nearest
-valid name.
+Every error is one line that names file and line (or the ``--set``), the key, and the nearest valid
+name.
 """
 
 import re
@@ -24,11 +24,11 @@ FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
 
 @dataclass(frozen=True)
 class Loaded:
-    """A configuration, and where each value of it came from.
+    """A configuration, with the origin of each of its values.
 
     Attributes:
         config: The configuration, with all names filled in and all paths absolute.
-        nodes: The tree that the configuration was made of, which knows the lines.
+        nodes: The tree of settings that the configuration was made from, with their lines.
     """
 
     config: Config
@@ -41,31 +41,31 @@ class Loaded:
 
 
 def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
-    """Read a file; whatever is wrong with it is a `ConfigError`.
+    """Read a configuration from a file, with settings that override it.
 
     Args:
-        sets: ``a.b=value``, of which ``source.NAME.url=...`` names an item of a list.
+        sets: ``a.b=value``; ``source.NAME.url=...`` selects an item of a list by its name.
 
     Raises:
-        ConfigError: one line with file and line.
+        ConfigError: anything is wrong; one line with file and line.
     """
     try:
-        with suppress(FileNotFoundError, ValueError):  # `read_toml` tells
-            open_regular(path).close()  # a pipe could keep who reads it for ever
+        with suppress(FileNotFoundError, ValueError):  # `read_toml` reports these
+            open_regular(path).close()  # reading a pipe could block for ever
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     nodes = read_toml(path, LARGEST)
     for text in sets:
         nodes = set_key(nodes, text, Config)
     _check_version(nodes)
-    _absolute(nodes)
+    _resolve_paths(nodes)
     config = convert(nodes, Config)
     loaded = Loaded(config, nodes, path)
-    return Loaded(_filled(loaded), nodes, path)
+    return Loaded(_fill_names(loaded), nodes, path)
 
 
-def _absolute(nodes: SettingNode) -> None:
-    """Relative paths from the folder of the file that they stand in."""
+def _resolve_paths(nodes: SettingNode) -> None:
+    """Make relative paths absolute, from the folder of the file that states them."""
     for path, node in nodes.walk():
         if not isinstance(node.value, str) or not node.value or "\0" in node.value:
             continue
@@ -77,18 +77,18 @@ def _absolute(nodes: SettingNode) -> None:
             and "options" in path
             and (last in ("file", "folder") or str(last).endswith("_file"))
         ):
-            node.value = str(_from(node, node.value))
-        elif top == ("source", "calibration") and _is_file(_from(node, node.value)):
-            node.value = str(_from(node, node.value))
+            node.value = str(_resolve_path(node, node.value))
+        elif top == ("source", "calibration") and _is_file(_resolve_path(node, node.value)):
+            node.value = str(_resolve_path(node, node.value))
         elif top == ("source", "url"):
             scheme, colon, rest = node.value.partition(":")
             target, question, options = rest.partition("?")
             shipped = (scheme, target) == ("replay", "demo")
             if colon and scheme in FILES_IN and target and not shipped:
-                node.value = f"{scheme}:{_from(node, target)}{question}{options}"
+                node.value = f"{scheme}:{_resolve_path(node, target)}{question}{options}"
 
 
-def _from(node: SettingNode, value: str) -> Path:
+def _resolve_path(node: SettingNode, value: str) -> Path:
     path = Path(value)
     if value.startswith("~"):
         try:
@@ -105,8 +105,8 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _filled(loaded: Loaded) -> Config:
-    """Names that may be left out."""
+def _fill_names(loaded: Loaded) -> Config:
+    """Fill in the names that a file may omit."""
     config = loaded.config
     sources = [s.name for s in config.source]
     models, publishers = [], []
@@ -119,17 +119,17 @@ def _filled(loaded: Loaded) -> Config:
                     ["model", i], f"which source? source = one of {', '.join(sources) or 'none'}"
                 )
             (source,) = sources
-        name = _free(model.name or source, taken, bool(model.name), loaded, ["model", i])
+        name = _assign(model.name or source, taken, bool(model.name), loaded, ["model", i])
         models.append(msgspec.structs.replace(model, source=source, name=name))
     taken = {"recorder", "page", "metrics", "systemd", "log"}
     for i, publisher in enumerate(config.publisher):
         base = publisher.name or re.sub(r"[^A-Za-z0-9_-]", "-", publisher.kind)
-        name = _free(base, taken, bool(publisher.name), loaded, ["publisher", i])
+        name = _assign(base, taken, bool(publisher.name), loaded, ["publisher", i])
         publishers.append(msgspec.structs.replace(publisher, name=name))
     return msgspec.structs.replace(config, model=tuple(models), publisher=tuple(publishers))
 
 
-def _free(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]) -> str:
+def _assign(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]) -> str:
     made, n = name, 1
     while made in taken:
         if given:

@@ -1,4 +1,4 @@
-"""One line per event, on stderr or in a file; a storm of the same line is counted instead."""
+"""The log: one line per event, on stderr or in a file; repeated lines are counted instead."""
 
 import logging
 import os
@@ -28,44 +28,44 @@ class _Seen:
 
 
 class Log(Consumer):
-    """Writes events. Of those that say the same of the same part, the first is written at once,
-    the others are counted and told together when `repeat_s` is over. A file that was moved or
-    deleted is begun anew. Lines that nothing takes are dropped and counted, and that is told."""
+    """A consumer that logs events. The first of equal events of a part is written at once; the
+    others are counted and reported together after `repeat_s`. A file that was moved or deleted is
+    begun anew. Lines that cannot be written are dropped, counted and reported."""
 
     wants = frozenset({Event})
     tick_s = 1.0
 
     def __init__(self, name: str, config: LogConfig) -> None:
         self._config = config
-        self._out: FileIO | None = None  # has no buffer, which at the end would be tried again
+        self._out: FileIO | None = None  # unbuffered: closing would write a buffer again
         self._seen: OrderedDict[tuple[str, str, str], _Seen] = OrderedDict()
         self._lines = self._repeated = self._dropped = 0
         self._why = ""  # why lines are dropped now
-        self._unwritten: tuple[Event, int] | None = None  # the newest, and how many
+        self._unwritten: tuple[Event, int] | None = None  # the newest, and their number
 
     def open(self, view: View) -> None:
         file = self._config.file
         self._out = FileIO(file, "ab") if file else FileIO(2, "wb", closefd=False)
 
     def handle(self, items: list[Item]) -> None:
-        self._follow_name()
+        self._reopen_if_moved()
         if self._unwritten is not None:
             last, count = self._unwritten
             why = f"{count} lines: {self._why}"
-            told = Event("log", "dropped", why, "warning", last.t_ns, last.utc_offset_ns)
-            if self._pass_on(self._form(told, 0)):
+            notice = Event("log", "dropped", why, "warning", last.t_ns, last.utc_offset_ns)
+            if self._write_line(self._format_line(notice, 0)):
                 self._unwritten, self._why = None, ""
         for item in items:
             if isinstance(item, Event) and _rank(item.level) >= _rank(self._config.level):
-                self._note(item)
+                self._log_event(item)
         now = time.monotonic()
         for key in [k for k, seen in self._seen.items() if seen.until <= now]:
-            self._sum_up(key)
+            self._write_repeats(key)
 
     def close(self) -> None:
         if self._out is not None:
             for key in list(self._seen):
-                self._sum_up(key)
+                self._write_repeats(key)
             self._out.close()
             self._out = None
 
@@ -78,13 +78,13 @@ class Log(Consumer):
     def diagnose(self) -> str:
         return self._why
 
-    def _follow_name(self) -> None:
-        """Open the file anew if it is no longer the one of that name."""
+    def _reopen_if_moved(self) -> None:
+        """Reopen the file if its name no longer leads to it."""
         file, out = self._config.file, self._out
         if not file:
             return
         if out is not None:
-            with suppress(OSError):  # there is none of that name, or one may not look
+            with suppress(OSError):  # no such file, or no permission
                 if os.path.samestat(os.fstat(out.fileno()), os.stat(file)):
                     return
             out.close()
@@ -94,7 +94,7 @@ class Log(Consumer):
         except OSError as error:
             self._out, self._why = None, f"{file}: {error.strerror or error}"
 
-    def _note(self, event: Event) -> None:
+    def _log_event(self, event: Event) -> None:
         key = (event.part, event.state, event.reason)
         seen = self._seen.get(key)
         if seen is not None:
@@ -103,25 +103,25 @@ class Log(Consumer):
             self._repeated += 1
             return
         while len(self._seen) >= REMEMBERED:
-            self._sum_up(next(iter(self._seen)))
+            self._write_repeats(next(iter(self._seen)))
         self._seen[key] = _Seen(event, time.monotonic() + self._config.repeat_s)
         self._write(event, 0)
 
-    def _sum_up(self, key: tuple[str, str, str]) -> None:
+    def _write_repeats(self, key: tuple[str, str, str]) -> None:
         seen = self._seen.pop(key)
         if seen.again:
-            now_ns = round(1e9 * time.monotonic())  # lines are in the order of their times
+            now_ns = round(1e9 * time.monotonic())  # so that lines stay in the order of time
             self._write(replace(seen.event, t_ns=now_ns), seen.again)
 
     def _write(self, event: Event, repeated: int) -> None:
-        if self._unwritten is None and self._pass_on(self._form(event, repeated)):
+        if self._unwritten is None and self._write_line(self._format_line(event, repeated)):
             self._lines += 1
         else:
             self._dropped += 1
             self._unwritten = event, self._unwritten[1] + 1 if self._unwritten else 1
 
-    def _pass_on(self, line: str) -> bool:
-        """Write a line; whether it was taken whole."""
+    def _write_line(self, line: str) -> bool:
+        """Write a line; return whether all of it was written."""
         data = (line.replace("\n", " ") + "\n").encode(errors="backslashreplace")
         try:
             if self._out is not None and self._out.write(data) == len(data):
@@ -131,7 +131,7 @@ class Log(Consumer):
             self._why = f"{self._config.file or 'stderr'}: {error.strerror or error}"
         return False
 
-    def _form(self, event: Event, repeated: int) -> str:
+    def _format_line(self, event: Event, repeated: int) -> str:
         utc_ns = event.t_ns + event.utc_offset_ns
         when = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%S")
         when += f".{utc_ns // 1_000_000 % 1000:03d}Z"
@@ -141,13 +141,13 @@ class Log(Consumer):
                 "reason": event.reason, "repeated": repeated, "t_ns": event.t_ns,
             }  # fmt: skip
             return msgspec.json.encode(fields).decode()
-        said = f": {event.reason}" if event.reason else ""
+        reason = f": {event.reason}" if event.reason else ""
         again = f" (repeated {repeated} times since)" if repeated else ""
-        return f"{when} {event.level} {event.part} {event.state}{said}{again}"
+        return f"{when} {event.level} {event.part} {event.state}{reason}{again}"
 
 
 class EventHandler(logging.Handler):
-    """Makes an event of each warning of a Python logger, for `Daemon.report`."""
+    """A logging handler that makes an event of each warning, for `Daemon.report`."""
 
     def __init__(self, report: Callable[[str, str, str, str], None]) -> None:
         super().__init__(logging.WARNING)

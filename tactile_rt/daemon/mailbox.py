@@ -1,4 +1,4 @@
-"""Who gets what, and where it waits: every item goes into the mailboxes of those who want it."""
+"""Mailboxes of the daemon's parts, and the hub that distributes items to them."""
 
 import threading
 from collections.abc import Iterable, Mapping
@@ -6,16 +6,16 @@ from collections.abc import Iterable, Mapping
 from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.daemon.items import Closed, Decision, Item, Opened, Packet, SourceChunk
 
-AROUND_BYTES = 500  # what Python needs around an item
-FRAME_BYTES = 200  # and around a CAN frame
+AROUND_BYTES = 500  # Python's overhead for an item
+FRAME_BYTES = 200  # and for a CAN frame
 
 
 class Mailbox(BoundedQueue[Item]):
     """The queue of items for one part, counted as samples, packets, decisions and events.
 
     Args:
-        wants: classes of items that it takes; the others are left out uncounted.
-        gather_s: how long samples and packets may wait for more of them; all else is urgent.
+        wants: classes of items that it takes; others are ignored and not counted.
+        gather_s: how long samples and packets may wait for more of them; other items are urgent.
         source: only items of this source, and of the array that it began with; empty: of all.
     """
 
@@ -32,10 +32,10 @@ class Mailbox(BoundedQueue[Item]):
             kinds=("samples", "packets", "decisions", "events"),
         )  # fmt: skip
         self.wants, self._source = frozenset(wants), source
-        self.taking = False  # until its part is there
+        self.taking = False  # until its part runs
 
     def _measure(self, item: Item) -> tuple[str, int, int] | None:
-        """Class, count and bytes of an item that is wanted."""
+        """Return class, count and bytes of an item, or None if it is not wanted."""
         if type(item) not in self.wants:
             return None
         if self._source and getattr(item, "source", self._source) != self._source:
@@ -54,7 +54,8 @@ class Mailbox(BoundedQueue[Item]):
 
 
 class Hub:
-    """Fan-out; any thread may post. Posting takes no lock but those of the mailboxes."""
+    """The distribution of items to mailboxes; any thread may post. Posting takes only the locks of
+    mailboxes, except for `Opened` and `Closed`."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -63,23 +64,23 @@ class Hub:
         self._streams: dict[str, Opened] = {}
 
     def join(self, name: str, box: Mailbox) -> None:
-        """From now on this mailbox gets what it wants; first the streams that are open."""
+        """Add a mailbox, which first receives the streams that are open."""
         with self._lock:
             for opened in self._streams.values():
                 box.put(opened)
-            self._arrange({**self._boxes, name: box})
+            self._set_boxes({**self._boxes, name: box})
 
     def leave(self, name: str, box: Mailbox) -> None:
-        """No more for this mailbox; if the name has another one by now, that stays."""
+        """Remove a mailbox; if its name has another by now, keep that."""
         with self._lock:
             if self._boxes.get(name) is box:
-                self._arrange({k: b for k, b in self._boxes.items() if k != name})
+                self._set_boxes({k: b for k, b in self._boxes.items() if k != name})
 
     def post(self, item: Item) -> None:
-        """To all who want it."""
+        """Put an item into all mailboxes that want it."""
         kind = type(item)
         if kind is Opened or kind is Closed:
-            with self._lock:  # else one who joins just now might hear of it twice, or never
+            with self._lock:  # else a mailbox that joins now might get it twice, or never
                 if isinstance(item, Opened):
                     self._streams = {**self._streams, item.source: item}
                 elif isinstance(item, Closed):
@@ -91,20 +92,20 @@ class Hub:
             box.put(item)
 
     def box(self, name: str) -> Mailbox | None:
-        """The mailbox of this name."""
+        """Return the mailbox of this name, if any."""
         return self._boxes.get(name)
 
     def wanted(self, kind: type) -> tuple[Mailbox, ...]:
-        """Mailboxes that want items of a class."""
+        """Return the mailboxes that want items of a class."""
         return self._by_type.get(kind, ())
 
     def streams(self) -> Mapping[str, Opened]:
-        """Sources that are open now."""
+        """Return the sources that are open now, by name."""
         return self._streams
 
-    def _arrange(self, boxes: dict[str, Mailbox]) -> None:
+    def _set_boxes(self, boxes: dict[str, Mailbox]) -> None:
         kinds = {kind for box in boxes.values() for kind in box.wants}
-        # New objects, so that who posts just now goes through what it has.
+        # New objects, so that a thread that posts now goes on with the old.
         self._by_type = {
             kind: tuple(b for b in boxes.values() if kind in b.wants) for kind in kinds
         }

@@ -1,9 +1,9 @@
-"""What publishers send: one schema for all of them, JSON, versioned.
+"""Messages of publishers: one versioned JSON schema for all of them.
 
 Every message is one object with ``type``, ``version``, ``t_ns`` (host CLOCK_MONOTONIC) and
 ``utc_ns`` (the same moment in UTC); all but ``health`` and ``state`` also with the ``source`` and
-its mount ``frame``. A field is never renamed and never changes its unit within a version; new ones
-may come.
+its mount ``frame``. A field is never renamed and never changes its unit within a version; fields
+may be added.
 """
 
 import time
@@ -27,9 +27,9 @@ from tactile_rt.daemon.states import Snapshot
 
 MESSAGE_VERSION = 1
 DIGITS = 4  # of probabilities
-# Of float32s, see `shortest`.
-MOST = 9  # digits tell any float32 from all others; 6 and fewer always survive it
-FEWEST = 6
+# Decimal digits of float32s, see `shortest`.
+MOST = 9  # distinguish any float32 from all others
+FEWEST = 6  # always survive a conversion to float32
 SMALLEST, LARGEST = 1e-13, 1e8  # where powers of ten and products with them are exact enough
 
 
@@ -59,28 +59,28 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
         t_ns: The stream time of the last sample used, ns.
         onset_ns: The stream time at which contact began, ns: with `source` and `model` it names
             the episode.
-        step: The number of the step since onset, from 1; `final` is the last one of its episode.
-        label: The most probable class, of some models a shape, or a refusal to name one, such as
+        step: The number of the step since onset, from 1; `final` is the last of its episode.
+        label: The most probable class, which for some models is a shape, or a refusal, such as
             "unknown".
         probabilities: The probability of each class, and of each refusal, by its label.
-        latency_ms: The time from the sample that completed the step until the decision was there,
+        latency_ms: The time from the sample that completed the step until the decision was made,
             ms.
-        age_ms: The age of that sample when the message was written, ms: what reads the message may
-            add the time since, by the computer's own monotonic clock.
-        late: Whether the step took longer than it may, or the sample was older than that when the
+        age_ms: The age of that sample when the message was written, ms: a reader on this computer
+            may add the time since, by the monotonic clock.
+        late: Whether the step took longer than allowed, or the sample was older than that when the
             message was written.
         prediction_set: The classes that are still possible, the most probable first; empty if the
-            model has no rule of it.
-        coverage: The share of touches of known kinds of which the true class is in the prediction
-            set of every step; null without one.
+            model has no rule for it.
+        coverage: The share of touches of known kinds whose true class is in the prediction set of
+            every step; null without a set.
         names: The kinds of the label's class that are still possible, the most probable first;
-            empty if the model tells none apart.
-        names_coverage: The share of touches of things of that class of which the true kind is among
-            the names of every step; null without any.
-        object: The enrolled object that it is, or "none of these", in the decision of a touch's
-            last step; empty before, and where none is enrolled.
-        object_margin: By how much its likeness is above what is needed; null without objects.
-        object_touches: The number of touches that it rests on.
+            empty if the model distinguishes none.
+        names_coverage: The share of touches of that class whose true kind is among the names of
+            every step; null without names.
+        object: The enrolled object, or "none of these", in the decision of a touch's last step;
+            empty before, and if none is enrolled.
+        object_margin: The object's score less its threshold; null without objects.
+        object_touches: The number of touches that `object` rests on.
     """
 
     topic: ClassVar[str] = "decision"
@@ -112,9 +112,9 @@ class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
 
 
 class SkipMessage(_FromSource, frozen=True, tag="skip", kw_only=True):
-    """A model was behind its stream and skipped to the newest sample; it decides nothing about what
-    is between `from_ns` and `until_ns`, the stream times of the first sample that was skipped and
-    of the first one that was not. `lost` samples of them did not even reach its contact detector.
+    """A model that was behind its stream skipped to the newest sample. It decides nothing between
+    `from_ns` and `until_ns`, the stream times of the first sample that was skipped and of the first
+    that was not. Of the skipped samples, `lost` did not even reach its contact detector.
     """
 
     topic: ClassVar[str] = "skip"
@@ -140,8 +140,8 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
     Attributes:
         elements, channels, units: The axes of `values`, and the SI unit of each channel.
         seq, times_ns: (n,) The sequence numbers and stream times of the samples.
-        values: (n, element, channel) The numbers, each written as the shortest one that reads back
-            as the same float32; null where the element has no trustworthy value.
+        values: (n, element, channel) The values, each written as the shortest decimal that reads
+            back as the same float32; null where the element has no trustworthy value.
     """
 
     topic: ClassVar[str] = "samples"
@@ -154,7 +154,7 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
 
 
 class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
-    """Everything; see `states.Snapshot`."""
+    """The state of all parts; see `states.Snapshot`."""
 
     topic: ClassVar[str] = "state"
     snapshot: Snapshot
@@ -171,16 +171,16 @@ Message: TypeAlias = (
 )
 
 _encoder = msgspec.json.Encoder()
-_now_ns = time.monotonic_ns  # to be stopped by a test
+_now_ns = time.monotonic_ns  # tests replace it
 
 
 def encode(message: Message) -> bytes:
-    """One line of JSON, without the end of the line."""
+    """Encode a message as one line of JSON, without the end of the line."""
     return _encoder.encode(message)
 
 
 def topic_of(message: Message, prefix: str = "tactile") -> str:
-    """Where a message belongs: ``tactile/SOURCE/decision``, ``tactile/health``, ``tactile/state``.
+    """Return a message's topic: ``tactile/SOURCE/decision``, ``tactile/health``, ``tactile/state``.
 
     Letters, digits and ``-._~`` of a source's name stay, all else is percent-encoded.
     """
@@ -189,17 +189,17 @@ def topic_of(message: Message, prefix: str = "tactile") -> str:
 
 
 def state_message(snapshot: Snapshot) -> StateMessage:
-    """A snapshot as a message."""
+    """Make a message of a snapshot."""
     return StateMessage(t_ns=snapshot.t_ns, utc_ns=snapshot.utc_ns, snapshot=snapshot)
 
 
 def message_of(item: Item) -> Message | None:
-    """What is published of an item; None: it is of no concern outside (`Closed` is told by an
-    `Event`, `Packet` and `Control` are not published)."""
+    """Return the message that publishes an item, or None. Instead of `Closed`, an `Event` is
+    published; `Packet` and `Control` are not published."""
     if isinstance(item, Decision):
-        return _decision(item)
+        return _make_decision(item)
     if isinstance(item, SourceChunk):
-        return _samples(item)
+        return _make_samples(item)
     if isinstance(item, Event):
         utc_ns = item.t_ns + item.utc_offset_ns
         return HealthMessage(
@@ -225,7 +225,7 @@ def message_of(item: Item) -> Message | None:
     return None
 
 
-def _decision(item: Decision) -> DecisionMessage:
+def _make_decision(item: Decision) -> DecisionMessage:
     d = item.decision
     age_ns = _now_ns() - item.sample_ns
     return DecisionMessage(
@@ -245,7 +245,7 @@ def _decision(item: Decision) -> DecisionMessage:
     )  # fmt: skip
 
 
-def _samples(item: SourceChunk) -> SamplesMessage:
+def _make_samples(item: SourceChunk) -> SamplesMessage:
     chunk, spec = item.chunk, item.spec
     values: list[list[list[float] | None]] = shortest(chunk.values).tolist()
     if not chunk.valid.all():
@@ -261,17 +261,17 @@ def _samples(item: SourceChunk) -> SamplesMessage:
     )  # fmt: skip
 
 
-# By the bits of a float32's exponent: the power of ten that leaves 9 digits before the point; or 10
+# By the exponent bits of a float32: the power of ten that leaves 9 or 10 digits before the point.
 _DECIMAL = np.floor((np.arange(256) - 127) * np.log10(2.0)).astype(int)
 SCALES = np.array([10.0 ** min(max(MOST - 1 - e, 0), 22) for e in _DECIMAL])
 
 
 def shortest(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """The same numbers in double precision, each moved to the decimal with the fewest digits that
-    is nearer to it than to any other float32: what is written of it is short, and no less exact.
+    """Round float32 numbers, as doubles, to the shortest decimals that identify them.
 
-    The encoder of JSON takes no float32, and of the double that it is it writes all digits: 0.1 as
-    0.10000000149011612.
+    Such a decimal is nearer to its number than to any other float32, so it is short to write and no
+    less exact. The JSON encoder takes doubles only and would write all digits of the same number:
+    0.1 as 0.10000000149011612.
 
     Args:
         values: Numbers in any shape; NaN and infinities stay.
@@ -282,7 +282,7 @@ def shortest(values: NDArray[np.float32]) -> NDArray[np.float64]:
     within = (size >= SMALLEST) & (size < LARGEST)
     scale = SCALES[singles.view(np.uint32) >> 23 & 0xFF]
     # Whole numbers below 2^53 and powers of ten up to 10^22 are exact in double precision, so that
-    # their quotient is the very double that the decimal is read as.
+    # their quotient is the very double as which the decimal is read.
     found = np.rint(exact * scale) / scale
     found[~within] = exact[~within]
     for n in range(1, MOST - FEWEST + 1):

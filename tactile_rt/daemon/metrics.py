@@ -1,8 +1,8 @@
 """Metrics, health and state over HTTP: ``/metrics`` for Prometheus, ``/health``, ``/state``.
 
-The text is Prometheus' exposition format 0.0.4; names and units are as its conventions ask for:
-base units, ``_total`` for what only grows. Only GET; at most 8 KiB a request, in two seconds, 16
-at a time, of which the newest are answered.
+The text is Prometheus' exposition format 0.0.4; names and units follow its conventions: base units,
+``_total`` for counters. Only GET; at most 8 KiB a request, within two seconds, 16 at a time, where
+a further one replaces the oldest.
 """
 
 import resource
@@ -36,7 +36,7 @@ Row = tuple[str, str, str, Callable[[Any, int], Any]]
 
 
 class Metrics(Consumer):
-    """Answers those who ask at the address of the table ``[metrics]``."""
+    """A consumer that answers requests at the address of the table ``[metrics]``."""
 
     wants = frozenset()
     tick_s = 1.0
@@ -50,7 +50,7 @@ class Metrics(Consumer):
         self._view = view
         listening = listen(host, port, both=True)
         self._server = HttpServer(
-            "tactile-rt metrics server", listening, self._answer, LIMITS, HEADERS, self._failed
+            "tactile-rt metrics server", listening, self._answer, LIMITS, HEADERS, self._log_error
         )
         if not is_loopback(host):
             view.report(
@@ -76,8 +76,8 @@ class Metrics(Consumer):
     async def _answer(self, request: Request) -> Response:
         if request.method != "GET":
             raise Refused(405, "only GET", {"allow": "GET"})
-        # A page of a foreign site may have its name resolve to us, and then ask from a browser.
-        if is_loopback(self._config.host) and not _local(request.headers.get("host", "localhost")):
+        # DNS rebinding: a foreign site may point its name at this address, and query from its page.
+        if is_loopback(self._config.host) and not _is_own(request.headers.get("host", "localhost")):
             raise Refused(403, "this is served to its own computer, under localhost, only")
         if request.path == "/metrics":
             return Response(200, exposition(self._view.snapshot()), EXPOSITION)
@@ -97,11 +97,11 @@ class Metrics(Consumer):
             return Response(status, msgspec.json.encode(body), JSON)
         raise Refused(404, "there are /metrics, /state and /health")
 
-    def _failed(self, reason: str) -> None:
+    def _log_error(self, reason: str) -> None:
         self._view.report(self._name, "request", reason, "error")
 
 
-def _local(host: str) -> bool:
+def _is_own(host: str) -> bool:
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
     except ValueError:
@@ -131,24 +131,24 @@ def exposition(snapshot: Snapshot) -> bytes:
 
 
 def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labels, Any]]]]:
-    """Yield each table of metrics, with the things that it is about and their labels."""
+    """Yield each table of metrics, with the things that it describes and their labels."""
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]
     yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
     yield SOON, [({"part": t.part, "what": t.what}, t) for t in s.soon]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
-    yield SOURCE, [({"source": _short(x)}, x) for x in s.sources]
-    yield MODEL, [({"model": _short(x), "source": x.source}, x) for x in s.models]
+    yield SOURCE, [({"source": _short_name(x)}, x) for x in s.sources]
+    yield MODEL, [({"model": _short_name(x), "source": x.source}, x) for x in s.models]
     yield CONSUMER, [({"consumer": x.part.name, "kind": x.kind}, x) for x in s.consumers]
     yield DISK, [({"source": n}, d) for c in s.consumers for n, d in c.on_disk.items()]
 
 
-def _short(thing: SourceState | ModelState) -> str:
+def _short_name(thing: SourceState | ModelState) -> str:
     return thing.part.name.partition(".")[2]
 
 
 def _since(t_ns: int, now_ns: int) -> float | None:
-    """Return the time since a moment, s; None for 0, which is none."""
+    """Return the time since a moment, s, or None if the moment is 0."""
     return (now_ns - t_ns) / 1e9 if t_ns else None
 
 
@@ -168,8 +168,8 @@ def _list_queue_rows(name: str) -> tuple[Row, ...]:
     )  # fmt: skip
 
 
-# Of each kind of thing: name, the label that tells several values apart, help, and its value at a
-# time of the host in ns: a number, a `Latency`, or numbers by that label; None: there is none.
+# For each kind of thing: name, the label that distinguishes several values, help, and its value at
+# a host time in ns: a number, a `Latency`, numbers by that label, or None without a value.
 DAEMON: tuple[Row, ...] = (
     ("build_info", "version", "Version of tactile_rt.", lambda s, _: {s.version: 1}),
     ("start_time_seconds", "", "When the daemon started, Unix time.",
@@ -265,7 +265,7 @@ DISK: tuple[Row, ...] = (
 
 
 def _write_histogram(name: str, labels: Labels, latency: Latency) -> Iterator[str]:
-    """Yield a histogram's lines: Prometheus' buckets are cumulative, those of a `Latency` not."""
+    """Yield a histogram's lines, with the cumulative buckets that Prometheus expects."""
     below = 0
     edges = [*(f"{e:g}" for e in latency.edges_s), "+Inf"]
     for edge, count in zip(edges, latency.buckets or (0,), strict=True):

@@ -1,4 +1,4 @@
-"""A classifier in a thread of its own, fed from a mailbox."""
+"""The part of a model: a classifier in a thread of its own, fed from a mailbox."""
 
 import math
 import time
@@ -27,13 +27,13 @@ from tactile_rt.daemon.states import LatencyMeter, ModelState
 
 MODEL_BYTES = 64 << 20
 WAKE_S, LOOK_S = 0.25, 0.02
-LONGEST_S = 10.0  # a touch that lasts longer does not keep a new model waiting
-STOP_SHARE = 0.35  # of the time in which all parts are to end
-BEGINNING_NS = 60 * NS_PER_S  # more than waits for a model that is still being loaded
+LONGEST_S = 10.0  # a touch that lasts longer does not delay a new model
+STOP_SHARE = 0.35  # of the time in which all parts must end
+BEGINNING_NS = 60 * NS_PER_S  # longer than samples wait for a model that is still being loaded
 
 
 class ModelPart(Part):
-    """Posts `Decision`, `Contact` and `Skipped` of one model."""
+    """The part that posts `Decision`, `Contact` and `Skipped` of one model."""
 
     def __init__(
         self, config: ModelConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
@@ -49,27 +49,27 @@ class ModelPart(Part):
         self._opened: Opened | None = None
         self._classifier: Classifier | None = None
         self._refused: tuple[object, TactileError] | None = None
-        self._trial: tuple[tuple[int, ...], Trial | None] = (), None  # of which file
-        self._wanted: deque[ModelConfig] = deque()  # what is to take the place of this one
+        self._trial: tuple[tuple[int, ...], Trial | None] = (), None  # file's stamp and trial
+        self._wanted: deque[ModelConfig] = deque()  # replacements that were requested
         self._next: Admission | None = None
         self._ready_at = 0.0
-        self._until = math.inf  # once it is to end: so long it still decides about what waits
-        self.refused = ""  # why the newest one that was to do so did not
+        self._until = math.inf  # once it must end: until then, waiting samples are classified
+        self.refused = ""  # why the newest replacement was refused
         self._half_ns = 0  # half the resampler's kernel
         self._deadline_ns = 0
         self._ahead_ns = 0  # host time less stream time
         self._last_ns: int | None = None  # stream time of the newest sample that was taken
-        self._dropped = self._hole = 0  # samples that the mailbox has dropped; since that one
-        self._missed = 0  # events that it has dropped
+        self._dropped = self._hole = 0  # samples that the mailbox dropped, ever and since that one
+        self._missed = 0  # events that the mailbox dropped
         self._sha256 = ""
-        with suppress(ConfigError):  # loading tells if it is none
-            self._sha256 = hash_of(self.file)  # a recording tells it from its first byte
+        with suppress(ConfigError):  # loading reports it
+            self._sha256 = hash_of(self.file)  # a recording states it from its first byte
         self._labels: tuple[str, ...] = ()
-        self.sensor: SensorSpec | None = None  # what the model was made for, if it tells
-        self.changes = 0.0  # share of readings at rest, likewise
+        self.sensor: SensorSpec | None = None  # that the model was made for, if known
+        self.changes = 0.0  # share of readings that change at rest, likewise
         self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
-        self._object = ""  # that the touch of the newest decision is of
+        self._object = ""  # the enrolled object of the newest decision's touch
         self._touching = False
         self._latency, self._step = LatencyMeter(), LatencyMeter()
         self._skips, self._age_s, self._bad_steps = 0, 0.0, 0
@@ -77,7 +77,7 @@ class ModelPart(Part):
 
     @property
     def model_state(self) -> ModelState:
-        """For the snapshot."""
+        """State for the snapshot."""
         newest, queue, classifier = self._newest, self.box.state, self._classifier
         opened = self._opened
         return ModelState(
@@ -99,27 +99,27 @@ class ModelPart(Part):
         self.box.close()
 
     def may_exchange(self, config: ModelConfig, limits: LimitsConfig) -> bool:
-        """Whether another model can take the place of this one while it decides."""
+        """Return whether another model can replace this one while it decides."""
         running = self.state.state == "running"
         return running and config.source == self.config.source and limits == self.limits
 
     def exchange(self, config: ModelConfig) -> None:
-        """Let another model, or the same one decided by otherwise, take the place of this one as
-        soon as it is admitted; from any thread. Asked again before that, the newest counts."""
+        """Replace this model, or its options, as soon as the new one is admitted. Any thread may
+        call it; of several requests before that, the newest counts."""
         self._wanted.append(config)
 
     def _work(self) -> None:
         self.box.taking = True  # a source that waits for its reader waits for the trial, too
         self._load()
-        self._up()
+        self._report_running()
         while True:
             items = self.box.take(WAKE_S)
             if not items and self.box.closed:
                 return
             self._busy_ns = time.monotonic_ns()
             try:
-                self._take(items)
-                self._look_after(bool(items))
+                self._handle(items)
+                self._advance_exchange(bool(items))
             finally:
                 self._busy_ns = 0
             if time.monotonic() > self._until:
@@ -131,35 +131,35 @@ class ModelPart(Part):
         self.box.taking = False
         self._classifier = None
         if self._next is not None and self._stop.is_set():
-            self._next.give_up()  # else the process would wait for it
-        self._touch(False, time.monotonic_ns())
+            self._next.give_up()  # otherwise the process would wait for it
+        self._set_contact(False, time.monotonic_ns())
 
-    def _mended(self) -> bool:
-        """Whether the source is of another array by now, or the model another file."""
+    def _may_retry(self) -> bool:
+        """Return whether the source's array or the model's file has changed."""
         opened = self._hub.streams().get(self.config.source)
         tried = None if opened is None else (opened.spec, file_stamp(self.file))
         return self._refused is None or tried not in (None, self._refused[0])
 
     def _load(self) -> None:
-        """Make the classifier; without a source, at least see whether the model is admitted."""
+        """Load the classifier; without a source, check at least whether it is admitted."""
         self._opened = opened = self._hub.streams().get(self.config.source)
         if opened is not None:
-            self._make(opened)
+            self._make_classifier(opened)
         else:
-            self._admitted(None)
+            self._await_admission(None)
 
-    def _make(self, opened: Opened) -> None:
-        # Anew for every stream: what was touched before need not be what is touched now.
+    def _make_classifier(self, opened: Opened) -> None:
+        # New for every stream: another object may be touched now.
         self._classifier = None
         if self._next is not None and self._next.finished.is_set() and self._next.error is None:
             self.config, self.file = self._next.config, self._next.file
             self._next = None
         tried = (opened.spec, file_stamp(self.file))
         if self._refused is not None and self._refused[0] == tried:
-            raise self._refused[1]  # as long as nothing has changed, loading it again is in vain
+            raise self._refused[1]  # loading it again would fail until something changes
         self._refused = None
         try:
-            admission = self._admitted(opened)
+            admission = self._await_admission(opened)
         except SpecMismatch as error:
             self._refused = (tried, SpecMismatch(f"source {opened.source}: {error}"))
             raise self._refused[1] from None
@@ -169,17 +169,17 @@ class ModelPart(Part):
         if admission is not None:
             self._install(opened, admission)
 
-    def _admitted(self, opened: Opened | None) -> Admission | None:
-        """The model, once it is there; None: the part is to end.
+    def _await_admission(self, opened: Opened | None) -> Admission | None:
+        """Admit the model and wait for it; return None if the part must end.
 
         Raises:
-            TactileError: It is refused.
+            TactileError: The model is refused.
         """
         if self._stop.is_set() and (opened is None or time.monotonic() > self._until):
             return None
-        admission = self._admit(self.config, opened)
+        admission = self._start_admission(self.config, opened)
         while not admission.finished.wait(LOOK_S):
-            # what waits of a recording is still to be decided about
+            # waiting samples of a recording are still to be classified
             live = opened is None or opened.stream.live
             if time.monotonic() > self._until or (self._stop.is_set() and live):
                 admission.give_up()
@@ -189,13 +189,13 @@ class ModelPart(Part):
         self._trial = admission.stamp, admission.trial
         return admission
 
-    def _admit(self, config: ModelConfig, opened: Opened | None) -> Admission:
+    def _start_admission(self, config: ModelConfig, opened: Opened | None) -> Admission:
         known, trial = self._trial
         same = known == file_stamp(model_path(config)) and config.mode == self.config.mode
         return Admission(config, self.limits, opened, self._age, trial if same else None)
 
     def _install(self, opened: Opened, admission: Admission) -> None:
-        """From now on this one decides."""
+        """Put an admitted model into use."""
         assert admission.classifier is not None and admission.trial is not None
         self._classifier = admission.classifier
         self.config, self.file = admission.config, admission.file
@@ -209,12 +209,12 @@ class ModelPart(Part):
         self._deadline_ns = round(1e6 * self.config.deadline_ms) or step_ns
         self._last_ns = None
 
-    def _look_after(self, came: bool) -> None:
-        """See to it that a model that is to take the place of this one does."""
+    def _advance_exchange(self, came: bool) -> None:
+        """Begin a requested exchange, or complete it once the new model is ready."""
         if self._wanted:
             if self._next is not None:
                 self._next.give_up()
-            self._next = self._admit(self._wanted[-1], self._opened)
+            self._next = self._start_admission(self._wanted[-1], self._opened)
             self._wanted.clear()
         new = self._next
         if new is None or not new.finished.is_set():
@@ -226,11 +226,11 @@ class ModelPart(Part):
         self._trial = new.stamp, new.trial
         self._ready_at = self._ready_at or time.monotonic()
         waited = time.monotonic() - self._ready_at
-        if new.classifier is None:  # there is no stream: it is loaded when there is one
+        if new.classifier is None:  # no stream: it is loaded when one opens
             self.config, self.file, self.refused = new.config, new.file, ""
             assert new.trial is not None
             self._sha256 = new.trial.sha256
-        elif self._opened is None or not self._settled(new.classifier, came, waited):
+        elif self._opened is None or not self._can_take_over(new.classifier, came, waited):
             return
         else:
             self._install(self._opened, new)
@@ -242,8 +242,8 @@ class ModelPart(Part):
         )
         self._report(self.name, "admitted", f"{new.words}{late}")
 
-    def _settled(self, new: Classifier, came: bool, waited: float) -> bool:
-        """Whether a new model may take over: nothing is under way, and it knows the baseline."""
+    def _can_take_over(self, new: Classifier, came: bool, waited: float) -> bool:
+        """Return whether a new model, with a baseline, may take over between touches."""
         old = self._classifier
         if old is None:
             return True
@@ -251,8 +251,8 @@ class ModelPart(Part):
             return False
         return new.go_on_from(old) or not came or new.detector.ready or waited > LONGEST_S
 
-    def _prepare(self, new: Classifier, old: Classifier, chunk: Chunk) -> None:
-        """Let a new model that hears otherwise find its baseline, while nothing is touched."""
+    def _warm_up(self, new: Classifier, old: Classifier, chunk: Chunk) -> None:
+        """Let a new model measure its own baseline while nothing is touched."""
         if old.deciding:
             new.forget()
         else:
@@ -260,13 +260,13 @@ class ModelPart(Part):
             new.skips.found.clear()
             new.touches.clear()
 
-    def _take(self, items: list[Item]) -> None:
+    def _handle(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
-        dropped = self.box.dropped  # the oldest: they came before all these
+        dropped = self.box.dropped  # the oldest go first, so these came before all of `items`
         self._hole, self._dropped = dropped["samples"] - self._dropped, dropped["samples"]
         opened = self._hub.streams().get(self.config.source)
         if dropped["events"] > self._missed and opened is not None:
-            items = [opened, *items]  # it may have been that one
+            items = [opened, *items]  # it may have been dropped
         self._missed = dropped["events"]
         for item in items:
             if isinstance(item, SourceChunk):
@@ -275,12 +275,12 @@ class ModelPart(Part):
                 self._classify(run)
                 run = []
                 if self._opened is None or item.t_ns > self._opened.t_ns:
-                    self._make(item)
+                    self._make_classifier(item)
         self._classify(run)
 
     def _classify(self, run: list[SourceChunk]) -> None:
         opened, classifier = self._opened, self._classifier
-        # What is left of a stream before this one is of no use to its classifier.
+        # Samples left from an earlier stream are of no use to this classifier.
         run = [s for s in run if opened is not None and s.arrived_ns >= opened.t_ns]
         if not run or classifier is None or opened is None:
             return
@@ -288,15 +288,15 @@ class ModelPart(Part):
         before = replace(classifier.stats)
         arrived, newest = run[-1].arrived_ns, int(chunk.t_ns[-1])
         self._ahead_ns = 0 if keeps_host_time(opened.stream) else arrived - newest
-        lost = self._lost(classifier, int(chunk.t_ns[0]))
+        lost = self._skip_hole(classifier, int(chunk.t_ns[0]))
         offset = run[-1].utc_offset_ns
         frame = opened.spec.frame
         for decision in classifier.decide(chunk):
-            self._tell(decision, run, opened, offset)
+            self._post(decision, run, opened, offset)
             if time.monotonic() > self._until:
                 return
         if self._next is not None and self._next.classifier is not None:
-            self._prepare(self._next.classifier, classifier, chunk)
+            self._warm_up(self._next.classifier, classifier, chunk)
         self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples
@@ -313,18 +313,18 @@ class ModelPart(Part):
         classifier.skips.found.clear()
         while classifier.touches:
             t_ns, touching = classifier.touches.popleft()
-            self._touch(touching, t_ns, frame, offset)
-        self._touch(classifier.detector.contact, newest, frame, offset)
+            self._set_contact(touching, t_ns, frame, offset)
+        self._set_contact(classifier.detector.contact, newest, frame, offset)
         if not opened.stream.live:
             for box in self._hub.wanted(Decision):
                 box.wait_for_room(1.0)
 
-    def _tell(self, d: Classification, run: list[SourceChunk], opened: Opened, offset: int) -> None:
-        """Publish a decision, at once: what else is in the chunk may take its time."""
+    def _post(self, d: Classification, run: list[SourceChunk], opened: Opened, offset: int) -> None:
+        """Post a decision at once, before the rest of the chunk is classified."""
         made = time.monotonic_ns()
-        sample = self._completed(d, run, opened.stream)
+        sample = self._find_sample_ns(d, run, opened.stream)
         if d.object or self._newest is None or d.onset_ns != self._newest.onset_ns:
-            self._object = d.object  # also while windows of the same touch follow
+            self._object = d.object  # kept while windows of the same touch follow
         self._newest = d
         self._decisions += 1
         self._final += d.final
@@ -338,9 +338,9 @@ class ModelPart(Part):
                 Decision(config.source, config.name, frame, d, sample, made, offset, deadline_ns)
             )
 
-    def _lost(self, classifier: Classifier, t_ns: int) -> int:
-        """How many samples the mailbox dropped before this one: a stream with a hole, which no
-        network is fed."""
+    def _skip_hole(self, classifier: Classifier, t_ns: int) -> int:
+        """Skip the hole before a sample; return how many samples the mailbox dropped in it. No
+        network is fed a stream with a hole."""
         lost, self._hole = self._hole, 0
         if lost:
             first = t_ns - BEGINNING_NS if self._last_ns is None else self._last_ns + 1
@@ -348,12 +348,12 @@ class ModelPart(Part):
         return lost
 
     def _age(self, t_ns: int) -> float:
-        """How old the step is whose newest resampled sample has this stream time, s."""
+        """Return the age of a step, s, from its newest resampled sample's stream time."""
         end = t_ns + self._half_ns + self._ahead_ns
         return max(0, time.monotonic_ns() - end) / 1e9
 
-    def _completed(self, d: Classification, run: list[SourceChunk], stream: Source) -> int:
-        """Host time of the sample that completed a step."""
+    def _find_sample_ns(self, d: Classification, run: list[SourceChunk], stream: Source) -> int:
+        """Return the host time of the sample that completed a step, ns."""
         end = d.t_ns + self._half_ns
         for samples in run:
             t_ns = samples.chunk.t_ns
@@ -366,7 +366,7 @@ class ModelPart(Part):
             return min(taken, arrived)
         return run[-1].arrived_ns
 
-    def _touch(self, touching: bool, t_ns: int, frame: str = "", offset: int = 0) -> None:
+    def _set_contact(self, touching: bool, t_ns: int, frame: str = "", offset: int = 0) -> None:
         if touching == self._touching:
             return
         self._touching = touching
@@ -376,7 +376,7 @@ class ModelPart(Part):
 
 
 def _find_drift(classifier: Classifier, spec: ArraySpec) -> str:
-    """Say which reading moves most, untouched; empty: none by its noise in 1 s."""
+    """Describe the fastest drift at rest; empty: none exceeds its noise in 1 s."""
     detector, period_s = classifier.detector, classifier.card.period_ns / NS_PER_S
     moves = np.abs(detector.drift) / detector.sigma / period_s
     at = np.unravel_index(moves.argmax(), moves.shape)

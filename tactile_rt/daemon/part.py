@@ -1,7 +1,7 @@
-"""A supervised thread: it starts, works, breaks, waits and starts again, and always says why.
+"""A supervised thread: it starts, works, breaks, waits and starts again, and always reports why.
 
-What no further try can mend, an array that is another than the one that was asked for, is not tried
-again: the part has failed, until what it failed of has changed.
+A failure that no retry can mend, such as another array than configured, is not retried: the part
+has failed until the cause of the failure changes.
 """
 
 import abc
@@ -15,17 +15,17 @@ from tactile_rt.core.errors import SpecMismatch, TactileError
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.states import PartState
 
-STEADY_S = 10.0  # whoever has worked so long begins with the shortest pause again
+STEADY_S = 10.0  # a part that has worked so long restarts after the shortest pause again
 
 
 class Report(Protocol):
-    """Puts an event into the log and to all consumers."""
+    """A function that puts an event into the log and to all consumers."""
 
     def __call__(self, part: str, state: str, reason: str, level: str = "info") -> None: ...
 
 
 class Part(abc.ABC):
-    """Something that works in a thread of its own and is restarted when it breaks."""
+    """A part of the daemon: work in its own thread, restarted when it breaks."""
 
     def __init__(self, name: str, report: Report, limits: LimitsConfig) -> None:
         self.name, self.limits = name, limits
@@ -33,13 +33,13 @@ class Part(abc.ABC):
         self._stop = threading.Event()
         self._state, self._reason, self._since_ns = "starting", "", time.monotonic_ns()
         self._starts = self._failures = 0
-        self._busy_ns = 0  # since when it is in a turn that may not end; 0: it waits for work
+        self._busy_ns = 0  # start of its turn, which may hang; 0: it waits for work
         self._stalled = False
         self._pause_s = limits.retry_first_s
         self._thread = threading.Thread(target=self._run, name=f"tactile-rt {name}", daemon=True)
 
     def start(self) -> None:
-        """Begin, in a thread."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -47,14 +47,14 @@ class Part(abc.ABC):
         self._stop.set()
 
     def join(self, until: float) -> bool:
-        """Wait for its end until so much CLOCK_MONOTONIC, s; whether it came."""
+        """Wait for its end until a CLOCK_MONOTONIC time, s; return whether it came."""
         if self._thread.ident is not None:
             self._thread.join(max(0.0, until - time.monotonic()))
         return not self._thread.is_alive()
 
     @property
     def state(self) -> PartState:
-        """Now; from any thread."""
+        """State now; from any thread."""
         state, reason, since = self._state, self._reason, self._since_ns
         silent = self.silent_s
         if state in ("starting", "running") and silent > self.limits.stall_s:
@@ -64,12 +64,12 @@ class Part(abc.ABC):
 
     @property
     def silent_s(self) -> float:
-        """How long one turn of its work has taken by now, s; 0: it has nothing to do."""
+        """Duration of its current turn of work, s; 0: it has nothing to do."""
         busy = self._busy_ns
         return (time.monotonic_ns() - busy) / 1e9 if busy else 0.0
 
     def watch(self) -> None:
-        """Tell when it stalls, and when it goes on; called now and then by the daemon."""
+        """Report when it stalls, and when it goes on; the daemon calls it regularly."""
         stalled = self.state.state == "stalled"
         if stalled == self._stalled:
             return
@@ -84,25 +84,25 @@ class Part(abc.ABC):
 
     @abc.abstractmethod
     def _work(self) -> None:
-        """Work until `_stop` is set; what it raises is the reason of a restart. To return before
-        that says that there is nothing left to do."""
+        """Work until `_stop` is set. An error is the reason of a restart; an earlier return means
+        that no work is left."""
 
     def _release(self) -> None:  # noqa: B027
-        """Let go of everything; after every `_work`."""
+        """Release all resources; called after every `_work`."""
 
-    def _mended(self) -> bool:
-        """Whether what it failed of has changed, so that it is worth another try."""
+    def _may_retry(self) -> bool:
+        """Return whether the cause of the failure has changed, so a retry is worthwhile."""
         return False
 
-    def _up(self, where: str = "") -> None:
+    def _report_running(self, where: str = "") -> None:
         """Report that it works, and where it can be reached."""
-        self._turn("running", where)
+        self._change_state("running", where)
 
     def _run(self) -> None:
         while not self._stop.is_set():
             self._starts += 1
             began = time.monotonic()
-            self._set("starting", self._reason)
+            self._set_state("starting", self._reason)
             why, state = "", "waiting"
             try:
                 self._work()
@@ -110,7 +110,7 @@ class Part(abc.ABC):
                 why = reason_of(error)
                 if isinstance(error, SpecMismatch):
                     state = "failed"
-                error.__traceback__ = None  # it holds everything that was at hand
+                error.__traceback__ = None  # it would keep all local variables
             self._busy_ns = time.monotonic_ns()
             try:
                 self._release()
@@ -123,26 +123,26 @@ class Part(abc.ABC):
             if time.monotonic() - began > STEADY_S:
                 self._pause_s = self.limits.retry_first_s
             if not self._stop.is_set():
-                self._turn(state, why)
+                self._change_state(state, why)
                 self._stop.wait(self._pause_s)
-                while state == "failed" and not (self._stop.is_set() or self._mended()):
+                while state == "failed" and not (self._stop.is_set() or self._may_retry()):
                     self._stop.wait(self.limits.retry_last_s)
                 self._pause_s = min(2 * self._pause_s, self.limits.retry_last_s)
-        self._turn("stopped" if self._stop.is_set() else "ended", "")
+        self._change_state("stopped" if self._stop.is_set() else "ended", "")
 
-    def _turn(self, state: str, reason: str) -> None:
-        self._set(state, reason)
+    def _change_state(self, state: str, reason: str) -> None:
+        self._set_state(state, reason)
         level = {"waiting": "warning", "failed": "error"}.get(state, "info")
         self._report(self.name, state, reason, level)
 
-    def _set(self, state: str, reason: str) -> None:
+    def _set_state(self, state: str, reason: str) -> None:
         if state != self._state:
             self._since_ns = time.monotonic_ns()
         self._state, self._reason = state, reason
 
 
 def reason_of(error: BaseException) -> str:
-    """An error in one line; one that nobody foresaw with the place where it came from."""
+    """Return an error in one line, with its source location if it is unexpected."""
     text = " ".join(str(error).split())
     if isinstance(error, TactileError):
         return text

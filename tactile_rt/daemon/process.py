@@ -1,8 +1,8 @@
-"""The daemon as a process's only work: signals, exit codes, one instance.
+"""The daemon as a process: signals, exit codes, one instance.
 
-A process is a daemon from its first line on. Until it can obey a signal it has to import for a good
-part of a second; so `note_signals` comes first, before anything heavy, and `run_daemon` looks at
-what was noted before it starts anything. That is why this module imports next to nothing itself.
+A process must obey signals from its first line on, but its imports take a good part of a second. So
+`note_signals` comes first, before anything heavy, and `run_daemon` looks at the noted signals
+before it starts anything. That is why this module itself imports almost nothing.
 """
 
 import os
@@ -26,44 +26,45 @@ if TYPE_CHECKING:
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
-TURN_S = 0.25  # how often the main loop tells that it goes on
+TURN_S = 0.25  # longest time between turns of the main loop
 READ_S = 2.0  # for a configuration to be read
 LOADED_S = 0.5  # for a model to be loaded, or given up
-SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
+SWITCH_S = 0.001  # how long a thread that computes may delay the threads that acquire
 
-Calls = SimpleQueue[int]  # what a signal handler may put into
+Calls = SimpleQueue[int]  # a queue that a signal handler may use
 
-_noted: Calls = SimpleQueue()  # before anybody ran a daemon
+_noted: Calls = SimpleQueue()  # signals from before `run_daemon`
 
 
 class ExitCode(IntEnum):
-    """What the process tells at its end.
+    """The exit code of the process.
 
-    After `CONFIG` and `RUNNING` nothing has been started, and to start again changes nothing.
+    After `CONFIG` and `RUNNING` nothing has been started, and a restart changes nothing.
     """
 
-    STOPPED = 0  # by a signal, or all streams were over; everything is closed
+    STOPPED = 0  # by a signal, or all streams have ended; everything is closed
     CONFIG = 2  # the configuration is wrong
     RUNNING = 3  # another process has the configuration, or a device
     ABANDONED = 4  # stopped, but a part did not end in time and may not have written everything
 
 
 def note_signals() -> None:
-    """From now on let no signal end the process but through `run_daemon`, which obeys those that
-    have come by then; for good, so that none ends it while Python winds down, either."""
+    """Note signals from now on, so that only `run_daemon` obeys them, earlier ones included.
+
+    This stays so to the end, lest a signal ends the process while Python shuts down."""
     for number in SIGNALS:
         signal.signal(number, lambda number, frame: _noted.put(number))
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # log rotators send it; see `Log`
 
 
 def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = None) -> ExitCode:
-    """Run until SIGTERM or SIGINT, until all streams are over, or for so many seconds.
+    """Run the daemon until SIGTERM, SIGINT, the end of all streams, or `seconds`.
 
     SIGHUP reads the configuration again.
 
     Raises:
         ConfigError: The configuration is wrong.
-        AlreadyRunning: Another process has it, or a device.
+        AlreadyRunning: Another process has the configuration, or a device.
     """
     calls: Calls = SimpleQueue()  # signals, and the end of all streams
 
@@ -73,9 +74,9 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
     before = [signal.signal(number, note) for number in SIGNALS]
     switch = sys.getswitchinterval()
     try:
-        if _asked_to_end(_noted):
+        if _must_end(_noted):
             return ExitCode.STOPPED
-        # Late, as all this takes its time.
+        # Imported late, as this takes time.
         from tactile_rt.core.locks import Locks
         from tactile_rt.daemon.checks import check_config
         from tactile_rt.daemon.daemon import Daemon
@@ -83,10 +84,10 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
 
         loaded = load_config(path, sets)
         check_config(loaded)
-        if _asked_to_end(calls):
+        if _must_end(calls):
             return ExitCode.STOPPED
         sys.setswitchinterval(SWITCH_S)
-        _want_descriptors()
+        _raise_file_limit()
         daemon = Daemon(loaded, locks=Locks(), freeze=True, on_over=lambda: calls.put(OVER))
         try:
             daemon.start()
@@ -100,17 +101,17 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
     return ExitCode.ABANDONED if late else ExitCode.STOPPED
 
 
-def _want_descriptors() -> None:
-    """Let the process open as much as it may: when a thousand connect at once, what it opens
-    itself finds a descriptor until they are shut down."""
+def _raise_file_limit() -> None:
+    """Raise the limit of open files to its maximum. When a thousand clients connect at once, the
+    process still finds descriptors for its own files until they are disconnected."""
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     with suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
-def _asked_to_end(calls: Calls) -> bool:
-    """Whether any signal but SIGHUP has come. One that has is left for later: between the file's
-    last line and now it may have been written anew."""
+def _must_end(calls: Calls) -> bool:
+    """Return whether a signal other than SIGHUP has come. A SIGHUP stays queued: the file may have
+    been rewritten since it was read."""
     numbers = [calls.get_nowait() for _ in range(calls.qsize())]
     if any(number != signal.SIGHUP for number in numbers):
         return True
@@ -153,20 +154,20 @@ def _serve(
 
 
 class _Reload(threading.Thread):
-    """Reads the configuration again, in a thread of its own.
+    """A thread that reads the configuration again.
 
-    Whatever it takes, signals are obeyed meanwhile; another one may take its place."""
+    Signals are obeyed meanwhile, however long it takes; another reload may replace it."""
 
     def __init__(self, daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
         super().__init__(name="tactile-rt reload", daemon=True)
         self._for, self._path, self._sets = daemon, path, sets
         self._read_by = time.monotonic() + READ_S
         self._read = False
-        self.wanted = True  # none has taken its place
+        self.wanted = True  # no other reload has replaced it
         self.late = False
 
     def hangs(self) -> bool:
-        """Tell, once, that it takes too long to read."""
+        """Return True, once, if reading takes too long."""
         before, self.late = self.late, not self._read and time.monotonic() > self._read_by
         return self.late and not before
 
@@ -181,15 +182,15 @@ class _Reload(threading.Thread):
             self._read = True
             if self.wanted:
                 self._for.reload(loaded)
-        except Exception as error:  # else nobody would know that it was not done
+        except Exception as error:  # otherwise the failure would go unnoticed
             self._read = True
             if self.wanted:
                 self._for.refuse(reason_of(error))
 
 
 def leave(code: ExitCode) -> None:
-    """End the process; past threads that hang, which would otherwise keep it, or, being torn out
-    of the loading of a model, abort it."""
+    """End the process, even if threads hang. A thread that hangs would keep it running; a thread
+    that is interrupted while it loads a model would abort it."""
     loading = [t for t in threading.enumerate() if t.name == ADMISSION]
     until = time.monotonic() + LOADED_S
     for thread in loading:

@@ -1,7 +1,7 @@
-"""How fast a device measures: the rate of the newest second, whatever is lost on the way.
+"""The rate at which a device measures, over the newest second, lost samples included.
 
-The newest second is cut into stretches of a fifth each, every one of them as exact as its times. A
-device is slow if they are together, and most of them: a hiccup or a reconnection is in one of them.
+The newest second is cut into stretches of a fifth of a second. A device is slow if it is so in all
+of them together, and in most: a hiccup or a reconnection affects only one stretch.
 """
 
 import itertools
@@ -11,13 +11,13 @@ from statistics import median
 from tactile_rt.core.stream import NS_PER_S
 
 STRETCH_NS = NS_PER_S // 5
-LONGEST_NS = 60 * NS_PER_S  # longer: the device's clock has begun anew
-FEWEST = 5  # stretches, so that two hiccups are fewer than the others
+LONGEST_NS = 60 * NS_PER_S  # a longer stretch means that the device's clock was restarted
+FEWEST = 5  # stretches, so that two hiccups are a minority
 SLOW = 0.9  # of the nominal rate: a cheap oscillator is within a twentieth of it
 
 
 class RateMeter:
-    """Measures a rate from a count that grows with what was measured.
+    """A meter of the rate at which a count of measurements grows.
 
     Args:
         stretch_ns: Length of a stretch, ns; five of them are judged together.
@@ -25,7 +25,7 @@ class RateMeter:
 
     def __init__(self, stretch_ns: int = STRETCH_NS) -> None:
         self._stretch_ns = stretch_ns
-        self._marks: deque[tuple[int, int]] = deque()  # where stretches begin: time, count
+        self._marks: deque[tuple[int, int]] = deque()  # beginnings of stretches: time, count
         self.hz = self.typical_hz = 0.0  # over all stretches, and their median; 0: unknown
 
     def add(self, count: int, t_ns: int) -> None:
@@ -46,8 +46,8 @@ class RateMeter:
             self.hz = NS_PER_S * (count - marks[0][1]) / (t_ns - marks[0][0])
 
     def judge(self, nominal_hz: float, silent_s: float) -> tuple[float, bool]:
-        """Return the rate, Hz, and whether it is slow; 0 after a silence, s."""
+        """Return the rate, Hz, or 0 after a silence, and whether it is slow."""
         if silent_s > max(1.0, 3 / max(self.hz, 1e-9)):
             return 0.0, False
-        hz = min(self.hz, max(self.typical_hz, nominal_hz))  # a backlog is in one stretch
+        hz = min(self.hz, max(self.typical_hz, nominal_hz))  # a backlog shows in one stretch only
         return hz, 0 < max(self.hz, self.typical_hz) < SLOW * nominal_hz

@@ -2,11 +2,11 @@
 
     FOLDER/whiskers-20261121T170512Z.mcap
 
-A file is begun with a source's first sample or packet: one that fails again and again leaves none.
+A file begins with a source's first sample or packet, so a source that fails repeatedly leaves none.
 It holds samples, raw packets, decisions, health and events of one source, and in its metadata
-the configuration in force and the hash of every model. Whatever ends the process, `tactile-rt
-recover` gets back all but the last moment, and after a power cut all but the last second or so;
-files that were left so are named when the recorder begins.
+the configuration in force and the hash of every model. However the process ends, `tactile-rt
+recover` restores all but the last moment, and after a power cut all but the last second or so;
+the recorder names such files when it starts.
 """
 
 import time
@@ -48,10 +48,10 @@ from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.recording.writer import RecordingWriter
 
-FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
+FLUSH_S = 0.4  # with the gathering, well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
-PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # after a failure, and another; then all is well
-SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
+PAUSE_S, PAUSES, STEADY_S = 0.4, 2, 10.0  # per failure, at most; for a file to be steady
+SLOW_S = 2.0  # beyond two sync periods, after which a medium is slow, not just briefly busy
 RING_BYTES = 64 << 20  # of each source, before a trigger
 EVER_NS = 1 << 62
 KEEPS = "`tactile-rt recover` keeps what is in it"
@@ -59,26 +59,26 @@ MB, NS = 1e6, 1e9
 
 
 class _Track:
-    """A source, the file that is open for it, and what is kept for a trigger."""
+    """A source, its open file, and the messages kept for a trigger."""
 
     def __init__(self, opened: Opened, rotation: Rotation, ledger: Ledger) -> None:
         self.opened, self.rotation, self.ledger = opened, rotation, ledger
         self.wire = describe(opened.stream).wire
         self.prelude_ns = opened.prelude[-1][1] if opened.prelude else -1
         self.file: RecordingWriter | None = None
-        self.came = False  # a sample, or a packet: before, there is nothing to record
+        self.came = False  # a sample or packet has come: before, there is nothing to record
         self.ring: deque[Raw] = deque()
         self.ring_bytes = 0
-        self.since_ns = time.monotonic_ns()  # it was opened, recording was started, or a trigger
-        self.until_ns = 0  # of a trigger; 0: none
+        self.since_ns = time.monotonic_ns()  # opening, start of recording, or trigger
+        self.until_ns = 0  # end of a trigger's recording; 0: no trigger
         self.closed_ns = 0  # when its source ended; 0: it has not
         self.lost = (0, 0)  # samples and packets since the last file was begun
         self.diagnostic = ""  # why there is no file, or was none before this one
-        self.failures = 0  # files that failed soon after they were begun, running
-        self.retry_ns = 0  # no file is begun before
+        self.failures = 0  # successive files that failed soon after they were begun
+        self.retry_ns = 0  # earliest time to begin a file
 
     def keep(self, message: Raw, before_ns: int) -> list[Raw]:
-        """Into the ring, from which the oldest goes: these."""
+        """Add a message to the ring; return the oldest ones that it drops."""
         self.ring.append(message)
         self.ring_bytes += len(message.data)
         gone = []
@@ -90,7 +90,7 @@ class _Track:
         return gone
 
     def empty(self) -> list[Raw]:
-        """All of the ring."""
+        """Empty the ring; return its messages."""
         kept = list(self.ring)
         self.ring.clear()
         self.ring_bytes = 0
@@ -98,12 +98,12 @@ class _Track:
 
 
 class Recorder(Consumer):
-    """Records every source of the daemon.
+    """The consumer that records every source of the daemon.
 
     It knows the controls ``start``, ``stop``, ``trigger`` (as if something had happened) and
-    ``rotate`` (begin new files). When the disk has less room than ``min_free_mb`` the files are
-    closed, what is not recorded is counted, and it goes on when there is room again. So it does
-    when the folder is deleted, moved or may not be written any more.
+    ``rotate`` (begin new files). When the disk has less room than ``min_free_mb``, it closes the
+    files, counts what it does not record, and resumes when there is room again. It does the same
+    when the folder is deleted, moved or no longer writable.
     """
 
     wants = frozenset(
@@ -134,33 +134,33 @@ class Recorder(Consumer):
             how = "`tactile-rt recover` makes whole ones of them"
             self._warn(f"{self._folder.path}: cut short: {some}; {how}", "warning")
         for opened in view.streams().values():
-            self._begin(opened)
+            self._begin_track(opened)
 
     def _warn(self, why: str, level: str = "error") -> None:
         self._view.report(self._name, "running", why, level)
 
     def handle(self, items: list[Item]) -> None:
         for item in items:
-            self._take(item)
+            self._handle_item(item)
         now, sync_s = time.monotonic(), self._config.sync_s
         sync = sync_s > 0 and now >= self._sync_at
         if sync:
             self._sync_at = now + sync_s
         if sync or now >= self._flush_at:
             self._flush_at = now + FLUSH_S
-            self._look_after(sync)
+            self._maintain_files(sync)
 
     def close(self) -> None:
         try:
             for name in list(self._tracks):
-                self._end(name)
+                self._end_track(name)
         finally:
             self._tracks.clear()
             self._syncer.close()
-            self._settle()
+            self._count_unsynced()
 
     def on_disk(self) -> Mapping[str, OnDisk]:
-        """What of each source that was ever open is on the disk; from any thread, at once."""
+        """Return what is on disk of each source that was ever open; from any thread."""
         return {name: self._on_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
 
     def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
@@ -204,11 +204,11 @@ class Recorder(Consumer):
                 return track.diagnostic
         return ""
 
-    def _take(self, item: Item) -> None:
+    def _handle_item(self, item: Item) -> None:
         if isinstance(item, Opened):
             known = self._tracks.get(item.source)
             if known is None or known.opened.t_ns != item.t_ns:
-                self._begin(item)
+                self._begin_track(item)
         elif isinstance(item, Closed):
             if (track := self._tracks.get(item.source)) is not None:
                 track.closed_ns = time.monotonic_ns()
@@ -217,35 +217,35 @@ class Recorder(Consumer):
                 self._add(track, Raw(SAMPLES, item.arrived_ns, encode_samples(item.chunk)))
         elif isinstance(item, Packet):
             track = self._tracks.get(item.source)
-            # what described the device stands at the head of every file
+            # packets that describe the device are at the head of every file
             if track is not None and track.wire and item.t_ns > track.prelude_ns:
                 self._add(track, Raw(WIRE, item.t_ns, encode_packet(item.packet, track.wire)))
         elif isinstance(item, Control):
             self._obey(item)
         else:
-            self._tell(item)
+            self._record(item)
 
-    def _tell(self, item: Decision | Contact | Skipped | Event) -> None:
-        """A decision, contact or skip goes to its source's file, an event to all."""
+    def _record(self, item: Decision | Contact | Skipped | Event) -> None:
+        """Add a decision, contact or skip to its source's file, an event to all."""
         message = message_of(item)
         if message is None:
             return
         if isinstance(item, Event) and item.state == "admitted":
-            self._exchanged(item.part)
+            self._follow_exchange(item.part)
         topic = DECISIONS if isinstance(item, Decision) else EVENTS
         at = item.made_ns if isinstance(item, Decision) else item.t_ns
-        told = Raw(topic, at, encode(message))
+        raw = Raw(topic, at, encode(message))
         mine = getattr(item, "source", None)
         happened = item.level != "info" if isinstance(item, Event) else isinstance(item, Contact)
         for name, track in self._tracks.items():
             if mine not in (None, name):
                 continue
-            self._add(track, told)
+            self._add(track, raw)
             if happened and getattr(item, "part", "") != self._name:
                 self._trigger(track)
 
-    def _exchanged(self, model: str) -> None:
-        """Another model decides from here on: a file says of which model its decisions are."""
+    def _follow_exchange(self, model: str) -> None:
+        """Begin new files after an exchange of a model, as a file names its models."""
         for state in self._view.snapshot().models:
             if state.part.name == model and state.source in self._tracks:
                 self._rotate(self._tracks[state.source])
@@ -260,7 +260,7 @@ class Recorder(Consumer):
             if self._on:
                 before_ns = EVER_NS if always else round(self._config.before_s * NS)
                 gone = track.keep(message, before_ns)
-                if track.until_ns and track.came:  # there is a trigger, and no file can be begun
+                if track.until_ns and track.came:  # triggered, but no file can be begun
                     self._lose(track, *gone)
             return
         if track.file is None:
@@ -271,7 +271,7 @@ class Recorder(Consumer):
             track.file.add(message.topic, message.data, message.t_ns)
         except OSError as error:
             self._lose(track, message)
-            self._no_room(track, error)
+            self._leave_file(track, error)
 
     def _lose(self, track: _Track, *messages: Raw) -> None:
         self._count_lost(
@@ -312,14 +312,14 @@ class Recorder(Consumer):
             for track in self._tracks.values():
                 act(track)
 
-    def _begin(self, opened: Opened) -> None:
-        self._end(opened.source)
+    def _begin_track(self, opened: Opened) -> None:
+        self._end_track(opened.source)
         config = self._config
         rotation = Rotation(self._folder.path, opened.source, config.rotate_mb, config.rotate_s)
         ledger = self._ledgers.setdefault(opened.source, Ledger())
         self._tracks[opened.source] = _Track(opened, rotation, ledger)
 
-    def _end(self, source: str) -> None:
+    def _end_track(self, source: str) -> None:
         track = self._tracks.pop(source, None)
         if track is not None:
             self._finish_file(track)
@@ -345,7 +345,7 @@ class Recorder(Consumer):
                 syncer=self._syncer,
             )  # fmt: skip
         except OSError as error:
-            self._no_room(track, error)
+            self._leave_file(track, error)
             return
         track.lost = (0, 0)
         track.ledger.begin(track.file)
@@ -354,16 +354,16 @@ class Recorder(Consumer):
             try:
                 track.file.add(message.topic, message.data, message.t_ns)
             except OSError as error:
-                self._no_room(track, error)
+                self._leave_file(track, error)
                 self._lose(track, *kept[n:])
                 return
         self._files += 1
         self._newest = track.file.path.name
-        # At once: so a power cut hardly ever leaves a name without what the file is of.
+        # Sync at once, so that a power cut hardly ever leaves a file without its description.
         if self._config.sync_s == 0 or self._sync(track):
             track.diagnostic = ""
 
-    def _finish_file(self, track: _Track, finish: bool = True, told: bool = False) -> None:
+    def _finish_file(self, track: _Track, finish: bool = True, reported: bool = False) -> None:
         file, track.file = track.file, None
         if file is None:
             return
@@ -372,11 +372,11 @@ class Recorder(Consumer):
             samples, packets = file.disown(Extent())
             self._count_lost(track, samples, packets, why)
             self._warn(f"{why}: {samples} samples are lost")
-            finish, told = False, True
+            finish, reported = False, True
         try:
             file.close(finish)
         except OSError as error:
-            if not told:
+            if not reported:
                 why = f"{file.path}: not finished ({error.strerror or error})"
                 self._warn(f"{why}; {KEEPS}")
             why = words(self._folder.path, error)
@@ -388,11 +388,11 @@ class Recorder(Consumer):
             self._finish_file(track)
             self._start_file(track)
 
-    def _look_after(self, sync: bool) -> None:
-        """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
+    def _maintain_files(self, sync: bool) -> None:
+        """Flush, rotate and finish files as they are due, and check the disk."""
         self._folder.has_room()
         self._soon = self._folder.foresee(self._written_mb())
-        self._settle()
+        self._count_unsynced()
         now = time.monotonic_ns()
         closed = [
             n for n, t in self._tracks.items() if t.closed_ns and now > t.closed_ns + LINGER_NS
@@ -401,7 +401,7 @@ class Recorder(Consumer):
             deciding = {m.source for m in self._view.snapshot().models if m.queue.waiting_bytes}
             for name in closed:
                 if name not in deciding:
-                    self._end(name)
+                    self._end_track(name)
         for track in self._tracks.values():
             over = 0 < track.until_ns < now
             if over:
@@ -428,7 +428,7 @@ class Recorder(Consumer):
                 self._rotate(track)  # decisions after a source's end go into its last file
 
     def _sync(self, track: _Track, sync: bool = True) -> bool:
-        """Flush, at least; whether that could be done, and the sync before."""
+        """Flush or sync a file; return False if that, or the sync before, failed."""
         file = track.file
         assert file is not None
         try:
@@ -436,12 +436,12 @@ class Recorder(Consumer):
                 raise file.failed
             file.sync() if sync else file.flush()
         except OSError as error:
-            self._no_room(track, error)
+            self._leave_file(track, error)
             return False
         return True
 
-    def _settle(self) -> None:
-        """Count what files lost that were closed, and could not be synced thereafter."""
+    def _count_unsynced(self) -> None:
+        """Count what was lost in closed files whose last sync failed."""
         for name, ledger in self._ledgers.items():
             for file, samples, packets in ledger.settle():
                 assert file.failed is not None
@@ -453,9 +453,9 @@ class Recorder(Consumer):
                 if track is not None:
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
-    def _no_room(self, track: _Track, error: OSError) -> None:
-        """The file cannot be written: it is left as it is, and tried anew at a next look, with
-        pauses where one file after another fails. The reason names no file, and so stays the same.
+    def _leave_file(self, track: _Track, error: OSError) -> None:
+        """Leave a file that cannot be written as it is. A new file is tried later, with pauses if
+        one after another fails. The reason names no file, so that it stays the same.
         """
         file, why = track.file, words(self._folder.path, error)
         if file is None:
@@ -472,4 +472,4 @@ class Recorder(Consumer):
         track.diagnostic = why
         kept = file.flushed if file.failed is None else file.synced
         self._count_lost(track, *file.disown(kept), why)
-        self._finish_file(track, finish=file.failed is None, told=True)
+        self._finish_file(track, finish=file.failed is None, reported=True)

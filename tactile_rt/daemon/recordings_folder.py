@@ -1,4 +1,4 @@
-"""The folder that recordings are written to: whether it is there, with room."""
+"""The folder of the recordings: its existence and its free space."""
 
 import os
 import shutil
@@ -13,23 +13,23 @@ from tactile_rt.core.files import sync_folder
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.recording.writer import PART
 
-STALE_S = 3600.0  # a file that is begun has its name long before
+STALE_S = 3600.0  # a file that is being begun gets its name long before
 MB = 1e6
-EVERY_S, POINTS, LEAST_S = 5.0, 120, 60.0  # of the newest ten minutes: how fast it fills
+EVERY_S, POINTS, LEAST_S = 5.0, 120, 60.0  # the rate of filling, over ten minutes at most
 HOURS = (0.25, 0.5, 1, 2, 3, 6, 12, 24)
 
 
 class RecordingsFolder:
-    """Made where it is not there, and again when it is deleted.
+    """The folder of the recordings, created if missing, and again if deleted.
 
     Args:
         min_free_mb: The room that its disk must have, MB.
-        later: does something without being waited for.
-        tell: is told of every change: state, words and level.
+        later: runs a job without waiting for it.
+        tell: called at every change with state, words and level.
 
     Attributes:
-        state: What can be said of it: ``on``, ``no folder`` or ``disk full``.
-        why: Why nothing can be recorded, with the figures of now; empty if it can.
+        state: The folder's state: ``on``, ``no folder`` or ``disk full``.
+        why: The reason why nothing can be recorded, with present figures; empty if there is none.
     """
 
     def __init__(
@@ -46,34 +46,34 @@ class RecordingsFolder:
 
     @property
     def full(self) -> bool:
-        """Whether it has no room."""
+        """True if its disk has no room."""
         return self.state == "disk full"
 
     def open(self) -> list[str]:
-        """Make it; the names of files that were cut short.
+        """Create the folder; return the names of files that were cut short.
 
         Raises:
-            OSError: it cannot be made or read.
+            OSError: it cannot be created or read.
         """
-        self._make(parents=True)
+        self._create(parents=True)
         self._disk = self.path.stat().st_dev
         with os.scandir(self.path) as found:  # a pipe or a dead mount is not even looked at
             files = sorted(f.name for f in found if f.is_file(follow_symlinks=False))
-        for name in files:  # of one who was killed as it began a file
+        for name in files:  # left by a process that was killed as it began a file
             left = self.path / name
             with suppress(OSError):
                 if not (name.startswith(".") and name.endswith(PART)):
                     continue
-                if time.time() - left.stat().st_mtime > STALE_S:  # else it is just being begun
+                if time.time() - left.stat().st_mtime > STALE_S:  # else it may be just being begun
                     left.unlink()
         return [f for f in files if f.endswith(".mcap") and not is_finished(self.path / f)]
 
     def has_room(self) -> bool:
-        """Whether it is there, with room; told when that changes."""
+        """Return whether the folder exists and has room; report a change."""
         state, why = "on", ""
         try:
-            # Deleted, perhaps; a parent that is gone, too, may be the place of a medium that is.
-            self._make(parents=False)
+            # It may be deleted. If its parent is gone, too, a removable medium may be missing.
+            self._create(parents=False)
             disk = self.path.stat().st_dev
             if self._disk not in (0, disk) and disk == os.stat("/").st_dev:
                 raise OSError("its disk is gone, and this is the system's: mount it again")
@@ -95,10 +95,10 @@ class RecordingsFolder:
         return not why
 
     def foresee(self, written_mb: float) -> str:
-        """Say within how many hours it is full; empty: not in a day.
+        """Describe within how many hours it will be full; empty: not within a day.
 
         Args:
-            written_mb: All that has been written so far, MB.
+            written_mb: The total that has been written so far, MB.
         """
         now = time.monotonic()
         if not self._written or now - self._written[-1][0] >= EVERY_S:
@@ -111,18 +111,18 @@ class RecordingsFolder:
         within = f"it is full within {hours:g} h at the rate of now, unless files are deleted"
         return within if hours else ""
 
-    def _make(self, parents: bool) -> None:
+    def _create(self, parents: bool) -> None:
         made = [f for f in (self.path, *self.path.parents) if not f.exists()]
         self.path.mkdir(parents=parents, exist_ok=True)
         for folder in made:
-            self._later(partial(_sync_name, folder))  # a power cut does not take it then
+            self._later(partial(_sync_name, folder))  # so that a power cut does not remove it
 
 
 def _sync_name(folder: Path) -> None:
-    with suppress(OSError):  # what is wrong with the disk, its files will tell
+    with suppress(OSError):  # its files will report what is wrong with the disk
         sync_folder(folder.parent)
 
 
 def words(path: Path, error: OSError) -> str:
-    """An error of a file, in a line."""
+    """Describe an error of a file in a line."""
     return f"{path}: {error.strerror or error}"

@@ -1,7 +1,7 @@
 """The daemon as a service of systemd: the unit, and the script that installs it.
 
-What installs the service is root, so it must not be able to hurt: the service writes into folders
-that systemd makes for it, and nowhere else.
+The installer runs as root, so the service must not be able to do harm: it writes into folders that
+systemd makes for it, and nowhere else.
 """
 
 import os
@@ -15,14 +15,14 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.loading import Loaded
 
-# Where systemd makes a folder for the service.
+# The folders that systemd makes for the service.
 MADE = {
     "StateDirectory": Path("/var/lib/tactile-rt"),
     "LogsDirectory": Path("/var/log/tactile-rt"),
     "RuntimeDirectory": Path("/run/tactile-rt"),
 }
 WATCHDOG_S = 15
-# Kinds of device that a sensor may be: see /proc/devices.
+# Kinds of devices that sensors use: see /proc/devices.
 DEVICES = ("char-ttyACM", "char-ttyUSB", "char-ttyS", "char-ttyAMA", "char-ttyTHS", "char-pts")
 
 UNIT = """\
@@ -149,7 +149,7 @@ def unit_text(command: Sequence[str], config: Config, user: str) -> str:
         if key == "StateDirectory" or any(f.is_relative_to(base) for f in folders)
     ]
     return UNIT.format(
-        command=" ".join(map(_quoted, command)), user=user, watchdog=f"{WATCHDOG_S:g}",
+        command=" ".join(map(_quote, command)), user=user, watchdog=f"{WATCHDOG_S:g}",
         home="read-only" if home else "yes", made="\n".join(made),
         devices="\n".join(f"DeviceAllow={d} rw" for d in DEVICES),
     )  # fmt: skip
@@ -160,19 +160,19 @@ def install_script(unit: str, again: Sequence[str], user: str) -> str:
 
     Args:
         again: The command that writes the unit once more, into the folder added as ``--out``.
-        user: The name of the service's user, made if there is none.
+        user: The name of the service's user, which is created if missing.
     """
     return SCRIPT.format(unit=unit, again=shlex.join(again), user=user)
 
 
 def check_folders(loaded: Loaded, user: str) -> None:
-    """Refuse a folder that systemd does not make for the service, or that is another's.
+    """Refuse an output folder that systemd does not make, or that another user owns.
 
     Args:
-        user: The name of the service's user, who need not be there yet.
+        user: The name of the service's user, who need not exist yet.
 
     Raises:
-        ConfigError: The folder, whose it is, and what to do; one line.
+        ConfigError: One line with the folder, its owner, and what to do.
     """
     names = " or ".join(map(str, MADE.values()))
     read = _list_inputs(loaded)
@@ -183,7 +183,7 @@ def check_folders(loaded: Loaded, user: str) -> None:
         inside = next((file for file in read if file.is_relative_to(base)), None)
         if inside is not None:
             raise ConfigError(f"the service would own {inside}, which it reads: not in {base}")
-        if os.path.lexists(base) and base.lstat().st_uid != _uid(user):
+        if os.path.lexists(base) and base.lstat().st_uid != _find_uid(user):
             raise ConfigError(f"folder {base}: user {user} must own it: give it to {user}")
 
 
@@ -200,7 +200,7 @@ def _list_outputs(config: Config) -> Iterator[tuple[list[str | int], Path]]:
 
 
 def _list_inputs(loaded: Loaded) -> list[Path]:
-    """Return what decides what the service does, and which it therefore may not write."""
+    """List the files that determine what the service does, which it must not write."""
     config = loaded.config
     names = [
         *(node.file for _, node in loaded.nodes.walk()),
@@ -211,15 +211,15 @@ def _list_inputs(loaded: Loaded) -> list[Path]:
     return [Path(os.path.realpath(n)) for n in dict.fromkeys(names) if os.path.isabs(n)]
 
 
-def _uid(user: str) -> int | None:
+def _find_uid(user: str) -> int | None:
     try:
         return pwd.getpwnam(user).pw_uid
     except KeyError:
         return None
 
 
-def _quoted(word: str) -> str:
-    """A word of ExecStart: % and $ mean something there, see systemd.service(5)."""
+def _quote(word: str) -> str:
+    """Quote a word of ExecStart, where % and $ are special, see systemd.service(5)."""
     word = word.replace("%", "%%").replace("$", "$$")
     if word and all(c.isalnum() or c in "-_./=:@+,%$" for c in word):
         return word

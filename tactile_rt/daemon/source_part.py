@@ -1,9 +1,9 @@
-"""A source in a thread of its own: opened, read, closed, and opened again when it broke.
+"""The part of a source: opened, read, closed, and opened again after a failure.
 
     lines --> Acquisition (one thread) --> SourcePart --> hub
 
-A source's own thread opens it, waits for what has no line, and opens a lost line again; as long as
-there is a line it lends the source to the thread that reads the lines of all.
+A source's own thread opens it, reads it if it has no line, and opens a lost line again; as long as
+there is a line, it lends the source to the thread that reads all lines.
 """
 
 import dataclasses
@@ -55,28 +55,28 @@ class _Lent:
 
 
 class Acquisition:
-    """Reads what is lent to it; the thread is there while anything is."""
+    """The reader of lent sources, in a thread that runs while any source is lent."""
 
     def __init__(self) -> None:
         self._reader = Reader()
         self._new: deque[_Lent] = deque()
         self._lent: dict[Source, _Lent] = {}
-        self._lock = threading.Lock()  # of the thread's beginning and end
+        self._lock = threading.Lock()  # guards the thread's beginning and end
         self._running = False
 
     def attend(
         self, source: Source, take: Callable[[Chunk | None], None], wanted: Callable[[], bool]
     ) -> None:
-        """Read a source until its line is lost, or it is not wanted any more.
+        """Read a source until its line is lost, or it is no longer wanted.
 
         Args:
-            take: Called in the thread that reads with what comes; several times a second with
-                None, if nothing does.
-            wanted: Tells whether to go on.
+            take: Called in the reading thread with each chunk; several times a second with None,
+                if none comes.
+            wanted: Returns whether to go on.
         """
         lent = _Lent(source, take, wanted)
         with self._lock:
-            if not self._running:  # a start that fails is tried again with the source
+            if not self._running:  # a start that fails is retried with the source
                 threading.Thread(target=self._run, name="tactile-rt lines", daemon=True).start()
                 self._running = True
             self._new.append(lent)
@@ -96,9 +96,9 @@ class Acquisition:
                     self._running = False
                     return
             for source in self._reader.wait():
-                self._read(self._lent[source])
+                self._read_lent(self._lent[source])
 
-    def _read(self, lent: _Lent) -> None:
+    def _read_lent(self, lent: _Lent) -> None:
         try:
             if lent.wanted():
                 lent.take(lent.source.read(0.0))
@@ -112,7 +112,7 @@ class Acquisition:
 
 
 class SourcePart(Part):
-    """Posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source."""
+    """The part that posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source."""
 
     def __init__(
         self,
@@ -137,19 +137,19 @@ class SourcePart(Part):
         self._repeats, self._restarts, self._restarted = LossWindow(), LossWindow(), 0
         self._rate, self._clock_rate = RateMeter(), RateMeter(CLOCK_NS)
         self.accepted: Identity | None = None  # the array that it began with
-        self.another = ""  # why the one that is there now is not that one
+        self.another = ""  # how the present array differs from that one
         self._offset_ns = 0
         self._look_ns = self._pause_ns = 0
-        self._told: tuple[Any, ...] = ()
+        self._reported: tuple[Any, ...] = ()
         self._opening = self._announced = self._left = False
-        self._telling = threading.Lock()  # of the stream's end
+        self._closing = threading.Lock()  # guards the report of the stream's end
         self._stopped_s = 0.0  # CLOCK_MONOTONIC
 
     @property
     def source_state(self) -> SourceState:
-        """For the snapshot."""
+        """State for the snapshot."""
         spec, stream, device = self._spec, self._stream, self._device
-        stats = self._before if stream is None else _sum(self._before, stream.stats)
+        stats = self._before if stream is None else _add_stats(self._before, stream.stats)
         about = SourceState(
             self.state, self.config.url, device=device.health if device else None, stats=stats,
             samples=self._samples, newest_ns=self._newest_ns, read_ns=self._read_ns,
@@ -176,16 +176,16 @@ class SourcePart(Part):
 
     @property
     def late_s(self) -> float:
-        """How old the newest sample was when it was read, s; 0 where nothing tells."""
+        """Age of the newest sample when it was read, s; 0 if unknown."""
         return max(0, self._read_ns - self._newest_ns) / NS_PER_S
 
     @property
     def silent_s(self) -> float:
-        """As of every part; but to wait for a device that is away is no silence."""
+        """As of every part, but 0 while it waits for a device that is away."""
         return 0.0 if self._away else super().silent_s
 
     def expect(self, sensor: SensorSpec | None, changes: float) -> None:
-        """Take what the model on this source tells of its sensor, see `StuckAtDetector.expect`."""
+        """Set the limits of stuck-at faults, see `StuckAtDetector.expect`."""
         judge, given_s = self._stuck_at, self.config.stuck_at_s
         if self._spec is None or self._device is None:
             judge.after_s, judge.each_after_s = given_s or math.inf, math.inf
@@ -197,28 +197,28 @@ class SourcePart(Part):
         super().stop()
 
     def join(self, until: float) -> bool:
-        """As of every part; but one that waits for its device owes nothing to anyone: it is left
-        to end by itself, which may take as long as that device is given to answer."""
+        """Wait for its end as any part, except while it waits for its device. Then nothing is lost,
+        and its thread is left to end by itself, once the device's time to answer is over."""
         if super().join(min(until, self._stopped_s + AWAY_S) if self._stopped_s else until):
             return True
         if self._away:
             if not self._left:
-                self._turn("stopped", "while it waited for its device")
-                self._left = True  # what its thread still does is no longer told
-                self._tell_closed()
+                self._change_state("stopped", "while it waited for its device")
+                self._left = True  # what its thread still does is no longer reported
+                self._post_closed()
             return True
         return super().join(until)
 
     @property
     def _away(self) -> bool:
-        """Whether it waits for a device that does not answer, or has not begun to send."""
+        """True if it waits for a device that does not answer or send yet."""
         device = self._device
         return self._opening or (
             device is not None and device.health.state in (State.CONNECTING, State.LOST)
         )
 
     def _work(self) -> None:
-        while self._wanted():
+        while self._should_run():
             try:
                 self._serve()
             except ArrayChanged as error:
@@ -228,7 +228,7 @@ class SourcePart(Part):
                 return
 
     def _serve(self) -> None:
-        """Open the source, and read it until it is over."""
+        """Open the source, and read it until it ends."""
         try:
             stream = self._open()
         except SpecMismatch as error:
@@ -239,7 +239,7 @@ class SourcePart(Part):
         if self._device is not None:
             found = self._device.identity
             known = self.accepted or found
-            if not self._device.describes:  # then its file is what may have changed
+            if not self._device.describes:  # its array is from a file, which may have changed
                 known = dataclasses.replace(known, spec=found.spec)
             self.another = found.difference(known)
             self.accepted = found if found.serial_number and not self.another else known
@@ -250,35 +250,35 @@ class SourcePart(Part):
         self._announced = True
         self._busy_ns = time.monotonic_ns()
         self._announce(stream)
-        self._up()
+        self._report_running()
         self._pause_ns = round(NS_PER_S * oldest_s(self.limits, stream.spec.rate_hz))
-        take = partial(self._take, stream)
+        take = partial(self._take_chunk, stream)
         with suppress(EndOfStream):
-            while self._wanted():
+            while self._should_run():
                 self._busy_ns = time.monotonic_ns()
                 if stream.fileno() >= 0:
-                    self._lines.attend(stream, take, self._wanted)
+                    self._lines.attend(stream, take, self._should_run)
                 else:
                     take(stream.read(POLL_S))
 
-    def _wanted(self) -> bool:
+    def _should_run(self) -> bool:
         return not (self._stop.is_set() or self._left)
 
-    def _take(self, stream: Source, chunk: Chunk | None) -> None:
-        """What has been read, in whichever thread."""
+    def _take_chunk(self, stream: Source, chunk: Chunk | None) -> None:
+        """Take what has been read, in the thread that has read it."""
         now = self._busy_ns = time.monotonic_ns()
         if now >= self._look_ns:
-            self._look(now)
+            self._check_device(now)
         if chunk is None or self._left:
             return
         self._samples += len(chunk)
         if now - self._read_ns > self._pause_ns:
             self._flowing_ns = now
-        # A host's time that is ahead of the host would hide for how long nothing came.
+        # A sample time ahead of the host's clock would hide a silence.
         self._read_ns, taken = now, int(chunk.t_ns[-1])
         self._newest_ns = min(now, taken) if stream.live and keeps_host_time(stream) else now
         good, bad = without_bad_samples(chunk)
-        useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
+        useless = ~chunk.valid.any(axis=1)  # as the device or its codec reports
         self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
         self._held.append(good)
         count, t_ns = self._device.measured if self._device else (self._samples, now)
@@ -297,21 +297,21 @@ class SourcePart(Part):
         try:
             stream.close()
         finally:
-            self._before = _sum(self._before, stream.stats)
-            self._told = ()
+            self._before = _add_stats(self._before, stream.stats)
+            self._reported = ()
             self._rate, self._clock_rate = RateMeter(), RateMeter(CLOCK_NS)
-            self._tell_closed()
+            self._post_closed()
 
-    def _tell_closed(self) -> None:
-        """Once: by the time its thread ends, another part may have opened a stream of that name."""
-        with self._telling:
+    def _post_closed(self) -> None:
+        """Post `Closed` only once: another part may have opened that source since."""
+        with self._closing:
             if self._announced:
                 self._announced = False
                 self._hub.post(Closed(self.config.name, time.monotonic_ns()))
 
-    def _turn(self, state: str, reason: str) -> None:
-        if not self._left:  # else its end has been told
-            super()._turn(state, reason)
+    def _change_state(self, state: str, reason: str) -> None:
+        if not self._left:  # else its end has been reported
+            super()._change_state(state, reason)
 
     def _open(self) -> Source:
         self._opening = True
@@ -335,15 +335,15 @@ class SourcePart(Part):
         )  # fmt: skip
         if self._device is not None:
             for packet, t_ns in prelude:
-                self._packet(packet, t_ns)
-            self._device.tap(self._packet)
+                self._post_packet(packet, t_ns)
+            self._device.tap(self._post_packet)
 
-    def _packet(self, packet: Any, t_ns: int) -> None:
+    def _post_packet(self, packet: Any, t_ns: int) -> None:
         if self._hub.wanted(Packet) and not self._left:
             self._hub.post(Packet(self.config.name, packet, t_ns))
 
-    def _look(self, now: int) -> None:
-        """Tell what has changed about the device."""
+    def _check_device(self, now: int) -> None:
+        """Check for stuck-at faults, and report changes of the device."""
         self._look_ns = now + LOOK_NS
         if self._held:
             self._stuck_at.add(*self._held)
@@ -352,43 +352,43 @@ class SourcePart(Part):
         if self._device is None:
             return
         health = self._device.health
-        told = (health.state, health.connections, health.clock_steps, health.counter_resets,
-                health.status, health.faults)  # fmt: skip
-        if told == self._told:
+        facts = (health.state, health.connections, health.clock_steps, health.counter_resets,
+                 health.status, health.faults)  # fmt: skip
+        if facts == self._reported:
             return
-        before, self._told = self._told, told
-        # a line that was away may bring a device that was, too: that is no silent restart
-        if before and told[1] == before[1] and now - self._flowing_ns > NS_PER_S:
-            self._restarted += told[3] != before[3]
+        before, self._reported = self._reported, facts
+        # a counter that begins anew after a reconnection is no silent restart
+        if before and facts[1] == before[1] and now - self._flowing_ns > NS_PER_S:
+            self._restarted += facts[3] != before[3]
         well = health.state in (State.STREAMING, State.CONNECTING) and not health.faults
         level = "info" if well else "warning"
-        self._report(self.name, f"device:{health.state}", _told(health, before), level)
+        self._report(self.name, f"device:{health.state}", _describe_changes(health, before), level)
 
     def _await_room(self) -> None:
-        """A source that waits for its reader is read no faster than all can take."""
+        """Wait for room in all mailboxes, for a source that waits for its reader."""
         for box in self._hub.wanted(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))
 
 
 def keeps_host_time(stream: Source) -> bool:
-    """Whether a stream's times are host CLOCK_MONOTONIC, and not those of a device's own clock."""
+    """Return whether a stream's times are host CLOCK_MONOTONIC, not a device's own clock."""
     device = device_of(stream)
     return device is None or device.options.clock == "host"
 
 
-def _told(health: Health, before: tuple[Any, ...]) -> str:
-    said = [health.reason] if health.reason else []
+def _describe_changes(health: Health, before: tuple[Any, ...]) -> str:
+    texts = [health.reason] if health.reason else []
     if before and health.connections != before[1]:
-        said.append(f"connected for the {health.connections}. time")
+        texts.append(f"connected for the {health.connections}. time")
     if before and health.clock_steps != before[2]:
-        said.append("its clock jumped")
+        texts.append("its clock jumped")
     if before and health.counter_resets != before[3]:
-        said.append("its counter began anew")
+        texts.append("its counter began anew")
     if words := tuple(dict.fromkeys((*health.faults, *health.status))):
-        said.append(f"it says: {', '.join(words)}")
-    return "; ".join(said)
+        texts.append(f"it says: {', '.join(words)}")
+    return "; ".join(texts)
 
 
-def _sum(a: SourceStats, b: SourceStats) -> SourceStats:
+def _add_stats(a: SourceStats, b: SourceStats) -> SourceStats:
     return SourceStats(*(getattr(a, f.name) + getattr(b, f.name) for f in dataclasses.fields(a)))

@@ -1,9 +1,9 @@
-"""How the daemon is: all states, counts, ages and latencies at one moment.
+"""The state of the daemon: all states, counts, ages and latencies at one moment.
 
 A `Snapshot` is frozen, and `msgspec.json.encode` takes it as it is: the page, the metrics and the
-``state`` message all tell it. Its counts only ever grow while the daemon runs, also over restarts
-of a part. What does not work follows from it, see `tactile_rt.daemon.diagnostics`; `LatencyMeter`
-measures what takes time.
+``state`` message all show it. Its counts only ever grow while the daemon runs, also over restarts
+of a part. Diagnostics are derived from it, see `tactile_rt.daemon.diagnostics`; `LatencyMeter`
+measures durations.
 """
 
 import bisect
@@ -33,13 +33,13 @@ EDGES_S = (
     0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.045, 0.07, 0.1, 0.2,
     0.5, 1.0, 5.0,
 )  # fmt: skip
-NEWEST = 1000  # measurements that percentiles are taken of
-BREAKS = ("fails", "has failed", "stalls")  # what a part does, not what is the matter with it
+NEWEST = 1000  # measurements for percentiles
+BREAKS = ("fails", "has failed", "stalls")  # reasons whose subject is the part
 
 
 @dataclass(frozen=True)
 class Latency:
-    """Of a repeated thing: since the start, and of the newest 1000 measurements (`p50_ms` ...)."""
+    """Durations of an action: since the start, and of the newest 1000 (`p50_ms` ...)."""
 
     count: int = 0
     sum_s: float = 0.0
@@ -52,7 +52,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Losses:
-    """How much was lost within the newest second and minute of what is counted beside."""
+    """Losses within the newest second and minute."""
 
     second: int = 0
     minute: int = 0
@@ -64,8 +64,8 @@ class PartState:
 
     Attributes:
         state: ``starting``; ``running``; ``stalled``: in a call that does not return, also while it
-            starts; ``waiting``: it broke and is tried again after a pause; ``failed``: it cannot
-            work as it is configured, and is not tried again; ``ended``: its stream is over;
+            starts; ``waiting``: it broke and is restarted after a pause; ``failed``: it cannot
+            work as it is configured, and is not restarted; ``ended``: its stream has ended;
             ``stopped``.
         reason: The reason why the part is not running, in words.
         since_ns: The time at which the part came into this state, host CLOCK_MONOTONIC, ns.
@@ -81,10 +81,10 @@ class PartState:
 
 @dataclass(frozen=True)
 class SourceState:
-    """A source: `part`, where it is, its array, and what came of it.
+    """A source: its part, address, array and samples.
 
-    Times are host CLOCK_MONOTONIC, ns; 0: not yet. What is of the array is empty before the source
-    was first opened.
+    Times are host CLOCK_MONOTONIC, ns; 0: not yet. The fields of the array are empty before the
+    source is first opened.
     """
 
     part: PartState
@@ -95,31 +95,31 @@ class SourceState:
     elements: tuple[str, ...] = ()
     channels: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    device: Health | None = None  # None: there is none, or it is not open
+    device: Health | None = None  # None: no device, or not open
     stats: SourceStats = field(default_factory=SourceStats)  # over all times that it was opened
     samples: int = 0
-    newest_ns: int = 0  # of the newest sample; of a device whose own clock is kept: when it came
+    newest_ns: int = 0  # of the newest sample; its arrival if the device's own clock is kept
     read_ns: int = 0  # when the newest sample was read
     flowing_ns: int = 0  # since when samples have come without a pause
-    live: bool = False  # samples come whether or not anyone reads them, so that they can be too old
+    live: bool = False  # samples come even if nothing reads them, so that they can be too old
     losses: Losses = field(default_factory=Losses)  # corrupt, missing or dropped
     repeats: Losses = field(default_factory=Losses)  # samples that came again
     restarts: Losses = field(default_factory=Losses)  # of the device's counter, its line in place
     clock_off: bool = False  # the device's clock runs at another speed than the host's
-    bad_samples: int = 0  # of one element, no number or an absurd one, though not marked invalid
+    bad_samples: int = 0  # of one element, NaN or absurdly large, though not marked invalid
     bad: Losses = field(default_factory=Losses)
-    stuck_at_s: float = 0.0  # for so long no value has changed, though noise should change some
+    stuck_at_s: float = 0.0  # time without a change of any value, though noise should change some
     stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
-    zeros: bool = False  # nothing else has come
-    another: str = ""  # why the array is another one than the source began with
-    # what the device measured within the newest second, lost or not; 0: unknown
+    zeros: bool = False  # no other values have come
+    another: str = ""  # how the array differs from the one that the source began with
+    # rate of measurements within the newest second, lost or not; 0: unknown
     measured_hz: float = 0.0
-    slow: bool = False  # that is, most of the time, less than nine tenths of `rate_hz`
+    slow: bool = False  # it is, most of the time, less than nine tenths of `rate_hz`
 
 
 @dataclass(frozen=True)
 class ModelState:
-    """A model: its source and file, and what it decided."""
+    """A model: its source, file and decisions."""
 
     part: PartState
     source: str
@@ -134,66 +134,66 @@ class ModelState:
     probability: float = 0.0
     latency: Latency = field(default_factory=Latency)  # from the sample that completed a step
     step: Latency = field(default_factory=Latency)  # of the network alone
-    late: int = 0  # steps that took longer than they may, or whose samples were too old
-    bad_samples: int = 0  # no numbers, and left out
-    decision_age_ms: float = 0.0  # of the newest decision's newest sample when that was there
+    late: int = 0  # steps that took longer than allowed, or whose samples were too old
+    bad_samples: int = 0  # not numbers, and ignored
+    decision_age_ms: float = 0.0  # of the newest decision's newest sample when it was made
     behind_s: float = 0.0  # how long the oldest samples wait to be classified
     skipped: int = 0  # times that it skipped to the newest sample
     skips: Losses = field(default_factory=Losses)
     lost: Losses = field(default_factory=Losses)  # samples that were dropped from its mailbox
-    refused: str = ""  # why the model that was to take the place of this one does not
+    refused: str = ""  # why the newest replacement is refused
     implausible: bool = False  # the newest touch has loads far beyond those that it learnt from
-    object: str = ""  # enrolled one that the newest decision's touch is of, or "none of these"
-    bad_steps: int = 0  # whose answer was no number, so that there was no decision
-    undecided: bool = False  # the newest step was one of them
-    drift: str = ""  # which reading moves while nothing is touched, and how fast
+    object: str = ""  # the enrolled object of the newest decision's touch, or "none of these"
+    bad_steps: int = 0  # whose answer was not finite, so that there was no decision
+    undecided: bool = False  # the newest step was a bad one
+    drift: str = ""  # the reading that moves fastest at rest, and how fast
 
 
 @dataclass(frozen=True)
 class OnDisk:
-    """What of a source is on the disk. Times are host CLOCK_MONOTONIC, ns; 0: none."""
+    """A source's samples on disk. Times are host CLOCK_MONOTONIC, ns; 0: none."""
 
     written_ns: int = 0  # of the newest sample that outlives the process: the system has it
     synced_ns: int = 0  # of the newest sample that outlives a power cut: the medium has it
     samples: int = 0
-    lost_samples: int = 0  # beside those that did not reach the recorder: see its queue
-    lost_ns: int = 0  # when samples were lost last
+    lost_samples: int = 0  # without those that did not reach the recorder: see its queue
+    lost_ns: int = 0  # when samples were last lost
     lost_why: str = ""
     open: bool = False
-    meant_ns: int = 0  # since when it is to be recorded; 0: closed, stopped, or without a trigger
-    waits_ns: int = 0  # since when something that the system has waits for the medium
-    slow_s: float = 0.0  # for how long that may wait; 0: for ever
+    meant_ns: int = 0  # since when it should be recorded; 0: closed, stopped, or without a trigger
+    waits_ns: int = 0  # since when data that the system has waits for the medium
+    slow_s: float = 0.0  # for how long data may wait; 0: no limit
 
 
 @dataclass(frozen=True)
 class ConsumerState:
-    """A consumer: its queue, what it tells of itself, and how late it is."""
+    """A consumer: its queue, its details, and its delay."""
 
     part: PartState
     kind: str  # such as jsonl or recorder
     queue: QueueState = field(default_factory=QueueState)
-    latency: Latency = field(default_factory=Latency)  # to the decision having been published
+    latency: Latency = field(default_factory=Latency)  # until the decision was published
     details: dict[str, str | int | float] = field(default_factory=dict)
     decision_age_ms: float = 0.0  # of the newest decision's newest sample when it was published
     behind_s: float = 0.0  # how long the oldest item waits to be handled
     losses: Losses = field(default_factory=Losses)  # items dropped from its mailbox, or by itself
-    diagnostic: str = ""  # what keeps it from its work now, in words
+    diagnostic: str = ""  # what prevents its work now, in words
     on_disk: dict[str, OnDisk] = field(default_factory=dict)  # of the recorder alone, by source
-    soon: str = ""  # what will keep it from its work if it goes on so, in words
+    soon: str = ""  # what will soon prevent its work, in words
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """One diagnostic: a thing that does not work.
+    """A diagnostic: something that does not work.
 
     Attributes:
         part: The name of the part that does not do its work: ``source.NAME``, ``model.NAME``,
             ``publisher.NAME``, ``recorder``, ``page``, ``metrics``, ``log``, or ``daemon``.
         what: What is missing, in a few words.
-        why: The reason in words; of a part that breaks what it does, such as ``fails: no port``.
-        still: What goes on all the same; may be empty.
+        why: The reason in words; for a part that breaks, what it does, such as ``fails: no port``.
+        still: What goes on nevertheless; may be empty.
         since_ns: The time at which it was first found, host CLOCK_MONOTONIC, ns.
-        says: All of it in a sentence, with the time in UTC; empty before it is explained.
+        says: The whole diagnostic as a sentence, with the time in UTC; empty before `explain`.
         do: What to do.
     """
 
@@ -207,7 +207,7 @@ class Diagnostic:
 
     @property
     def line(self) -> str:
-        """All of it in one line."""
+        """The whole diagnostic in one line."""
         gap = " " if self.why.startswith(BREAKS) else ": "
         return f"{self.what}: {self.part}{gap}{self.why}{f'; {self.still}' if self.still else ''}"
 
@@ -230,12 +230,12 @@ class Snapshot:
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
-    soon: tuple[Diagnostic, ...] = ()  # what will not work if it goes on so; no fault yet
+    soon: tuple[Diagnostic, ...] = ()  # what will stop working if it goes on so; no fault yet
 
 
 class LatencyMeter:
-    """How long a thing takes: a histogram for ever, percentiles of the newest. Add seconds from any
-    thread; `state` is a frozen `Latency`."""
+    """A meter of durations: a histogram of all, percentiles of the newest. Any thread may add
+    seconds; `state` is a frozen `Latency`."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -244,7 +244,7 @@ class LatencyMeter:
         self._count, self._sum = 0, 0.0
 
     def add(self, seconds: float) -> None:
-        """One more."""
+        """Add a duration."""
         with self._lock:
             self._newest.append(seconds)
             self._buckets[bisect.bisect_left(EDGES_S, seconds)] += 1
@@ -253,7 +253,7 @@ class LatencyMeter:
 
     @property
     def state(self) -> Latency:
-        """What was measured."""
+        """Result of all measurements so far."""
         with self._lock:
             ordered = sorted(self._newest)
             count, total, buckets = self._count, self._sum, tuple(self._buckets)
@@ -266,5 +266,5 @@ class LatencyMeter:
 
 
 def _rank(ordered: list[float], share: float) -> float:
-    """The smallest value that at least this share of all are not above."""
+    """Find the smallest value that at least this share of all values do not exceed."""
     return ordered[max(0, -(-len(ordered) * round(1000 * share) // 1000) - 1)]

@@ -1,12 +1,13 @@
-"""Stuck-at faults: a device hangs on one value; its samples come, in time, and say nothing.
+"""Stuck-at faults: a device hangs, so that its samples come in time, but no value changes.
 
-A sensor whose noise is above its resolution cannot give the same values twice; one that is coarse
-gives the same ones for as long as it rests. So equal samples are a fault only where the noise is
-known, or somebody says for how long is too long.
+A sensor whose noise is above its resolution cannot give the same values twice; a coarse sensor
+gives the same values for as long as it rests. So equal samples are a fault only if the noise is
+known, or if a limit of time is configured.
 
-Where no description tells it, readings do that differ from the one before in three cases of four,
-in the tare, at rest before a lesson or in each half minute of the stream: noise above a step does
-so, and a quarter of it, once motors stop, still changes one of ten at any level.
+Without a description, noise is inferred if readings differ from the one before in three cases of
+four, in the tare, at rest before a lesson or in each half minute of the stream. Noise above a step
+of the resolution does so. A quarter of it, once motors stop, still changes one reading of ten at
+any level.
 """
 
 import math
@@ -17,8 +18,8 @@ from numpy.typing import NDArray
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 
-LEAST_S = 0.25  # a hiccup of a driver that repeats a sample is no device that hangs
-LEAST_EACH_S = 2.0  # of one element: a firm touch may hold it at the end of its range
+LEAST_S = 0.25  # a shorter repetition is a hiccup of a driver, and no fault
+LEAST_EACH_S = 2.0  # for one element: a firm touch may hold it at the end of its range
 LEAST_PAIRS = 3
 IMPOSSIBLE = 1e-12  # probability
 OFTEN, SELDOM = 0.75, 0.1  # shares of readings that differ from the one before: see above
@@ -26,13 +27,13 @@ WINDOW_S, WINDOW_SAMPLES = 30.0, 2000  # in which they are counted, at least
 
 
 class StuckAtDetector:
-    """Measures for how long the values have been the same.
+    """The detector of stuck-at faults, which measures how long values stay the same.
 
     Attributes:
-        after_s: The time for which they may be, s; infinite: for ever.
-        each_after_s: The same of one element, while others change.
-        noisy: Whether some values change often, at rest, too, as the stream says.
-        seconds: The time for which no value has changed, s; 0 unless that is longer than it may be.
+        after_s: The longest time without a change of any value, s; infinite: no limit.
+        each_after_s: The same for one element, while others change.
+        noisy: Whether some values of the stream change often, also at rest.
+        seconds: The time without a change of any value, s; 0 unless it exceeds the limit.
         elements: The numbers of elements of which no value has changed for too long.
         zeros: Whether all values have been 0 since the first sample, for two seconds or more.
     """
@@ -48,25 +49,25 @@ class StuckAtDetector:
     def expect(
         self, spec: ArraySpec, sensor: SensorSpec | None, changes: float, after_s: float = 0.0
     ) -> None:
-        """Derive for how long readings may be equal from what is known of the sensor.
+        """Derive for how long readings may be equal, from what is known of the sensor.
 
         Args:
-            changes: share of readings at rest that differ from the one before, where an element
-                repeats most; 0: not known.
-            after_s: what somebody says of all together, s; 0: nobody does.
+            changes: share of readings at rest that differ from the one before, for the element
+                that repeats most; 0: unknown.
+            after_s: the configured limit for all elements together, s; 0: none.
         """
         noisy = changes > OFTEN and not self._rested
         self.after_s = after_s or derive_stuck_at_s(spec, sensor, noisy=noisy or self.noisy)
         self.each_after_s = derive_stuck_at_s(spec, sensor, each=True, noisy=noisy)
 
     def add(self, *chunks: Chunk) -> None:
-        """Take the next samples of the stream; those without any valid element say nothing."""
+        """Take the next samples of the stream; ignore those without any valid element."""
         chunk = concatenate(list(chunks))
         values = (chunk.values + 0.0).view(np.uint32)  # bits: NaN is equal to NaN, and -0 to 0
         last, self._last = self._last, values[-1]
         if last is None or last.shape != values[0].shape:
             self._began_ns, last = int(chunk.t_ns[0]), ~values[0]
-            self._each_ns = np.zeros(len(last), np.int64)  # since when, of each element
+            self._each_ns = np.zeros(len(last), np.int64)  # time of each element's last change
             self._differed, self._changes = np.zeros(last.shape, np.int64), np.ones(last.shape)
         differs = (values != np.concatenate([last[None], values[:-1]])) & chunk.valid[..., None]
         moved, useful = differs.any(axis=2), chunk.valid.any(axis=1)
@@ -89,18 +90,18 @@ class StuckAtDetector:
         if self._counted >= self._window and not self.seconds:
             self._changes = np.minimum(self._changes, self._differed / self._counted)
             self.noisy = bool((self._changes > OFTEN).any())
-        if self._counted >= self._window or self.seconds:  # a fault says nothing of the noise
+        if self._counted >= self._window or self.seconds:  # a fault tells nothing about the noise
             self._counted, self._differed[:] = 0, 0
 
 
 def derive_stuck_at_s(
     spec: ArraySpec, sensor: SensorSpec | None, each: bool = False, noisy: bool = False
 ) -> float:
-    """Derive from the noise for how long samples may be equal, s; infinite: for ever.
+    """Derive from the noise for how long samples may be equal, s; infinite: no limit.
 
     Args:
-        each: of one element, not of all together.
-        noisy: whether some values change often, where no sensor tells more.
+        each: for one element, not for all together.
+        noisy: whether some values change often; used without a sensor.
 
     Two readings of a channel with white noise of standard deviation s, rounded to steps of q, are
     equal with a probability of about q / (2 s sqrt(pi)), and at most 1; channels are independent.

@@ -1,5 +1,4 @@
-"""What the running daemon tells systemd: READY, STATUS, RELOADING, STOPPING, WATCHDOG; see
-sd_notify(3)."""
+"""Notifications to systemd: READY, STATUS, RELOADING, STOPPING, WATCHDOG; see sd_notify(3)."""
 
 import os
 import socket
@@ -13,13 +12,13 @@ from tactile_rt.daemon.items import Event, Item
 from tactile_rt.daemon.states import Snapshot
 
 TICK_S = 1.0
-SEND_S = 0.2  # a manager that does not read must not keep us
-LEAST_S = 1.0  # a busy host may keep a thread from its turn for less
+SEND_S = 0.2  # a manager that does not read must not block the daemon
+LEAST_S = 1.0  # on a busy host, a thread may be without a turn for less
 LONGEST = 400  # characters of a status
 
 
 class Systemd(Consumer):
-    """Sends to $NOTIFY_SOCKET; pings the watchdog while nothing is `hanging`.
+    """The consumer that notifies systemd; it pings the watchdog while nothing is `hanging`.
 
     Raises:
         ConfigError: $NOTIFY_SOCKET or $WATCHDOG_USEC is not what systemd sets.
@@ -34,7 +33,7 @@ class Systemd(Consumer):
         if path[:1] not in ("/", "@"):
             raise ConfigError(f"systemd: NOTIFY_SOCKET is {path!r}, not a path or @name")
         self._address = "\0" + path[1:] if path[0] == "@" else path
-        self._watchdog_s = _watchdog_s(environment)
+        self._watchdog_s = _read_watchdog_s(environment)
         # systemd asks for a ping at half of the time; twice as often misses none.
         self.tick_s = min(TICK_S, self._watchdog_s / 4) if self._watchdog_s else TICK_S
         self._socket: socket.socket | None = None
@@ -52,13 +51,13 @@ class Systemd(Consumer):
     def handle(self, items: list[Item]) -> None:
         for item in items:
             if isinstance(item, Event) and item.part == "daemon":
-                self._daemon(item.state)
+                self._notify_state(item.state)
         if self._watchdog_s:
-            # First: what asks more of the daemon may wait for the very thread that hangs.
-            self._feed(self._view)
+            # Before the snapshot, which may wait for the very thread that hangs.
+            self._ping_watchdog(self._view)
         snapshot = self._view.snapshot()
         if not self._ready and snapshot.state in ("running", "degraded"):
-            self._daemon(snapshot.state)
+            self._notify_state(snapshot.state)
         status = status_of(snapshot)
         if status != self._status:
             self._send(f"STATUS={status}")
@@ -77,9 +76,9 @@ class Systemd(Consumer):
             "withheld": self._withheld,
         }
 
-    def _daemon(self, state: str) -> None:
+    def _notify_state(self, state: str) -> None:
         if state in ("running", "degraded", "reloaded", "refused"):
-            # A device that is not plugged in is no reason not to have started.
+            # The daemon counts as ready even if a device is not plugged in.
             self._send("READY=1")
             self._ready = True
         elif state == "reloading":
@@ -87,7 +86,7 @@ class Systemd(Consumer):
         elif state == "stopping":
             self._send("STOPPING=1")
 
-    def _feed(self, view: View) -> None:
+    def _ping_watchdog(self, view: View) -> None:
         limit = max(LEAST_S, self._watchdog_s / 2)
         found = hanging(view.silent(), limit)
         if found:
@@ -108,12 +107,11 @@ class Systemd(Consumer):
 
 
 def hanging(silent: Mapping[str, float], limit: float) -> tuple[str, ...]:
-    """Threads that the daemon cannot do without, and that have not turned for so long, s.
+    """Return the critical threads without a turn for longer than a limit, s.
 
-    A part that broke is tried again; but a thread in a call that does not return can only be
-    ended with its process. That is worth it for the main loop, the watch and every source; and for
-    models once none works. Consumers count for nothing here: the samples matter more than who
-    looks at them.
+    A part that broke is restarted; but a thread in a call that does not return can only be ended
+    with its process. That is worthwhile for the main loop, the watch and every source; and for
+    models once none works. Consumers do not count here: the samples matter more than their use.
     """
     late = [name for name, seconds in silent.items() if seconds > limit]
     models = [name for name in silent if name.startswith("model.")]
@@ -123,7 +121,7 @@ def hanging(silent: Mapping[str, float], limit: float) -> tuple[str, ...]:
 
 
 def status_of(snapshot: Snapshot) -> str:
-    """One line: the state, what does not work, and how much there is."""
+    """Describe in one line the state, the diagnostics or the number of parts."""
     if snapshot.degraded:
         return f"{snapshot.state}: {'; '.join(snapshot.degraded)}"[:LONGEST]
     counts = (
@@ -131,13 +129,13 @@ def status_of(snapshot: Snapshot) -> str:
         (len(snapshot.models), "model"),
         (sum(c.part.name.startswith("publisher.") for c in snapshot.consumers), "publisher"),
     )
-    said = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts)
+    parts = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts)
     recording = any(c.kind == "recorder" for c in snapshot.consumers)
-    return f"{snapshot.state}: {said}{', recorder' if recording else ''}"
+    return f"{snapshot.state}: {parts}{', recorder' if recording else ''}"
 
 
-def _watchdog_s(environment: Mapping[str, str]) -> float:
-    """How soon systemd takes us for dead, s; 0: it does not look."""
+def _read_watchdog_s(environment: Mapping[str, str]) -> float:
+    """Read the watchdog's time limit, s; 0: no watchdog."""
     text = environment.get("WATCHDOG_USEC", "")
     if not text or environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0.0

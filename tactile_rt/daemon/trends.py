@@ -1,4 +1,4 @@
-"""Trends: what will not work soon, if it goes on as it does, and is no fault yet."""
+"""Trends: what will soon stop working if it goes on so, and is no fault yet."""
 
 import os
 from collections import deque
@@ -9,9 +9,9 @@ from statistics import median
 
 from tactile_rt.daemon.states import Diagnostic
 
-EVERY_S, KEPT, FEWEST = 20.0, 90, 10  # of half an hour; in a third of it
+EVERY_S, KEPT, FEWEST = 20.0, 90, 10  # per value; for half an hour; in a third of it
 SOON_H = 24.0
-LATER, LATE_MS = 3.0, 5.0  # times as late as before, and at least so late
+LATER, LATE_MS = 3.0, 5.0  # times the earlier delay, and least delay
 MB = 1e6
 
 
@@ -45,7 +45,7 @@ class Trend:
 
 
 def read_resident_bytes() -> int | None:
-    """Read how much memory this process has; None where the system does not tell."""
+    """Read how much memory this process has, bytes; None if unknown."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
@@ -53,7 +53,7 @@ def read_resident_bytes() -> int | None:
 
 
 def read_free_bytes() -> float:
-    """Read how much memory is free; infinite where the system does not tell."""
+    """Read how much memory is free, bytes; infinite if unknown."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -63,21 +63,21 @@ def read_free_bytes() -> float:
 
 
 class Trends:
-    """Those of a daemon: its memory, and how late the samples of each source come."""
+    """The trends of a daemon: its memory, and the delay of each source's samples."""
 
     def __init__(self, free_bytes: Callable[[], float] = read_free_bytes) -> None:
         self._free_bytes = free_bytes
         self._memory, self._late = Trend(), dict[str, Trend]()
 
     def look(self, at_s: float, resident_bytes: int, late_s: Mapping[str, float]) -> None:
-        """Take what is measured now; sources that are not named are forgotten."""
+        """Take the present measurements; forget sources that are not named."""
         self._memory.add(at_s, resident_bytes / MB)
         self._late = {name: self._late.get(name, Trend()) for name in late_s}
         for name, seconds in late_s.items():
             self._late[name].add(at_s, 1e3 * seconds)
 
     def foresee(self) -> list[Diagnostic]:
-        """Say what will not work soon."""
+        """Return diagnostics of what will soon stop working."""
         found = []
         if growth := self._memory.growth():
             free_mb = self._free_bytes() / MB

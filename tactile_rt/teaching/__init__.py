@@ -1,8 +1,8 @@
-"""Few-shot teaching: some touches of each class, on any sensor, become a model, on the robot.
+"""Few-shot teaching: a few touches of each class, on any sensor, become a model on the robot.
 
     Source --> Classifier(features.onnx) --> Lesson --> model.onnx     (`tactile-rt teach`)
 
-`lesson` keeps touches and what each was; `features` and `head` are what is learnt with; `model` and
-`onnx_bytes` write the file, that of a network with enrolled objects too; `teacher` and `page` lead
-whoever touches. Nothing here needs torch, or the package onnx.
+`lesson` keeps touches with their labels; `features` computes features and `head` learns classes;
+`model` and `onnx_bytes` write the file, also of a network with enrolled objects; `teacher` and
+`page` guide the user. Nothing here needs torch, or the package onnx.
 """

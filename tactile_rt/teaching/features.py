@@ -1,13 +1,13 @@
-"""What a touch is like, whatever sensor feels it: a network of nothing that is learnt.
+"""Features of touches on any sensor: a network of random kernels, in which nothing is learnt.
 
-An array's loads become a few signals: of every channel the sum over the elements, and of the
-loads of a unit where they are and how far they spread. Random temporal kernels follow them. Of
-each kernel three numbers are kept: how often since the onset its output was above a threshold, its
-mean, and its largest value (Dempster et al. 2021, doi:10.1145/3447548.3467231; Tan et al. 2022,
+An array's loads are reduced to a few signals: for every channel the sum over the elements, and for
+the loads of a unit their centre and spread. Random temporal kernels filter the signals. Each kernel
+gives three features: the share of time since the onset with an output above a threshold, the mean,
+and the largest value (Dempster et al. 2021, doi:10.1145/3447548.3467231; Tan et al. 2022,
 doi:10.1007/s10618-022-00844-1). They are so many that a few touches show which of them matter.
 
 Loads are divided by the largest of their unit since the onset: a soft and a firm touch of a kind
-are alike, and how firm it was is a feature of its own. So neither units nor ranges matter, and the
+are alike, and the firmness is a feature of its own. So units and ranges do not matter, and the
 network is the same for every sensor of so many elements and channels.
 """
 
@@ -22,8 +22,8 @@ from tactile_rt.teaching.onnx_bytes import OnnxGraph
 KERNELS = 256
 TAPS = 9
 DILATIONS = (1, 2, 4, 8)  # samples between taps
-MOST_SIGNALS = 3  # that a kernel looks at
-CENTRED = 0.7  # of the kernels do not see a constant
+MOST_SIGNALS = 3  # that a kernel filters
+CENTRED = 0.7  # share of the kernels that ignore a constant
 QUIET = 2.5  # standard deviations of an element's noise that count as no load
 FAINT = 6.0  # standard deviations of the noise: fainter loads are not magnified further
 LEAST = 1e-30  # below any output
@@ -33,7 +33,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FeatureNetwork:
-    """Features of a stream of an array, step by step."""
+    """The network that computes features of an array's stream, step by step."""
 
     spec: ArraySpec
     substeps: int
@@ -43,9 +43,9 @@ class FeatureNetwork:
 
     @classmethod
     def drawn(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":
-        """The network of an array: the same one every time, everywhere."""
+        """Draw the network of an array from a seed, the same on every machine."""
         rng = np.random.default_rng(seed)
-        signals = sum(cls._signals(spec, unit) for unit in dict.fromkeys(spec.units))
+        signals = sum(cls._count_signals(spec, unit) for unit in dict.fromkeys(spec.units))
         reach = [d for d in DILATIONS if d * (TAPS - 1) < 0.8 * steps * substeps] or [1]
         dilations = np.sort(rng.choice(reach, KERNELS))
         kernels = np.zeros((KERNELS, signals, TAPS))
@@ -59,10 +59,10 @@ class FeatureNetwork:
         return cls(spec, substeps, kernels.astype(f), dilations, thresholds.astype(f))
 
     @staticmethod
-    def _axes(spec: ArraySpec) -> Floats:
-        """(element, axis) where the elements are, along the axes in which they lie, -1 to 1."""
+    def _locate_elements(spec: ArraySpec) -> Floats:
+        """Compute coordinates (element, axis) along the axes that the array extends in, -1 to 1."""
         places = np.array(spec.positions)
-        if np.ptp(places, axis=0).max() == 0:  # not said
+        if np.ptp(places, axis=0).max() == 0:  # no positions given
             places = np.array(spec.grid, dtype=float)
         places = places - (places.max(axis=0) + places.min(axis=0)) / 2
         extent = np.abs(places).max()
@@ -70,23 +70,23 @@ class FeatureNetwork:
         return np.asarray((places[:, lies] / max(extent, 1e-12)).astype(np.float32))
 
     @classmethod
-    def _signals(cls, spec: ArraySpec, unit: str) -> int:
-        """How many signals the loads of a unit become."""
-        of_places = 1 + 2 * cls._axes(spec).shape[1] if len(spec.elements) > 1 else 0
+    def _count_signals(cls, spec: ArraySpec, unit: str) -> int:
+        """Count the signals of the loads of a unit."""
+        of_places = 1 + 2 * cls._locate_elements(spec).shape[1] if len(spec.elements) > 1 else 0
         return spec.units.count(unit) + of_places
 
     @property
     def past(self) -> int:
-        """How many earlier samples a step looks at."""
+        """Number of earlier samples that a step needs."""
         return int(self.dilations.max()) * (TAPS - 1)
 
     @property
     def size(self) -> int:
-        """The number of features."""
+        """Number of features."""
         return 3 * len(self.kernels) + len(set(self.spec.units))
 
     def state(self) -> dict[str, tuple[int, ...]]:
-        """The shape of every state, by name."""
+        """Return the shape of every state, by name."""
         n, signals = self.kernels.shape[:2]
         kept = {"count": (1,), "high": (n,), "total": (n,), "largest": (n,)}
         return {"past": (self.past, signals), "peak": (len(set(self.spec.units)),), **kept}
@@ -95,7 +95,7 @@ class FeatureNetwork:
         """Add the network to a graph.
 
         Returns:
-            The name of the (batch, feature) output, and by name what follows each state.
+            The name of the (batch, feature) output, and the next value of each state, by name.
         """
         elements, channels = self.spec.shape
         samples = g.input("samples", ["batch", self.substeps, elements, channels])
@@ -109,10 +109,10 @@ class FeatureNetwork:
         for unit in dict.fromkeys(self.spec.units):
             at = g.integers(*(i for i, u in enumerate(self.spec.units) if u == unit))
             of_unit = g("Gather", load, at, axis=3), g("Gather", noise, at, axis=2)
-            found, peak = self._of_unit(g, *of_unit)
+            found, peak = self._add_signals(g, *of_unit)
             signals.append(found)
             peaks.append(peak)
-            times.append(self._signals(self.spec, unit))
+            times.append(self._count_signals(self.spec, unit))
         units = range(len(peaks))
         peak = g("Max", before["peak"], g("Concat", *peaks, axis=1))  # (batch, unit)
         which = g.integers(*(u for u in units for _ in range(times[u])))
@@ -146,8 +146,8 @@ class FeatureNetwork:
             "largest": largest,
         }  # fmt: skip
 
-    def _of_unit(self, g: OnnxGraph, load: str, noise: str) -> tuple[str, str]:
-        """Signals (batch, sub-step, signal) of the loads of a unit, and the (batch, 1) peak."""
+    def _add_signals(self, g: OnnxGraph, load: str, noise: str) -> tuple[str, str]:
+        """Add signals (batch, sub-step, signal) of a unit's loads; return them and the peak."""
         summed = g("ReduceSum", load, g.integers(2), keepdims=0)  # (batch, sub-step, channel)
         level = g("Sqrt", g("ReduceSum", g("Mul", noise, noise), g.integers(2), keepdims=0))
         faint = g("Mul", g("ReduceMax", level, g.integers(1), keepdims=1), g.constant(FAINT))
@@ -161,12 +161,12 @@ class FeatureNetwork:
         strength = g("Relu", g("Sub", strength, quiet))  # (batch, sub-step, element)
         whole = g("ReduceSum", strength, g.integers(2), keepdims=1)  # (batch, sub-step, 1)
         peak = g("Max", peak, g("ReduceMax", whole, g.integers(1), keepdims=0))
-        axes = self._axes(self.spec)
+        axes = self._locate_elements(self.spec)
         share = g("Div", strength, g("Max", whole, g.constant(LEAST)))
         centre = g("MatMul", share, g.constant(axes))  # (batch, sub-step, axis)
         square = g("MatMul", share, g.constant(axes**2))
         spread = g("Sqrt", g("Relu", g("Sub", square, g("Mul", centre, centre))))
-        # a place counts as far as there is a load; it is divided by the peak as all signals are
+        # Weight places by the load, up to the peak, as all signals are divided by the peak.
         there = g("Unsqueeze", peak, g.integers(1))
         there = g("Min", g("Mul", whole, g.constant(4.0)), there)
         places = g("Mul", g("Concat", centre, spread, axis=2), there)
@@ -174,6 +174,6 @@ class FeatureNetwork:
 
     @property
     def kinds(self) -> tuple[slice, ...]:
-        """Which features are of one kind: shares of time, means, largest values, and peaks."""
+        """Features of one kind each: shares of time, means, largest values, and peaks."""
         n = len(self.kernels)
         return slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n), slice(3 * n, None)

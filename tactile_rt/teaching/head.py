@@ -1,11 +1,11 @@
-"""From a few touches of each class to what tells them apart, and from everything else.
+"""Classes learnt from a few touches each, to distinguish them and to refuse anything else.
 
-At every step, a class is the mean of its touches' features, and all classes share how touches of
-one class differ: a covariance of few directions, and of the same small variance in all others
+At every step, a class is the mean of its touches' features, and all classes share one covariance of
+touches within a class: a few main directions, and the same small variance in all others
 (probabilistic principal components: Tipping & Bishop 1999, doi:10.1111/1467-9868.00196). A
-decision is the nearest mean by that measure; what is far from all of them is unknown. How far a
-touch of a class may be from its mean is learnt leave-one-out, and where there are touches of
-anything else, from these, too.
+decision is the nearest mean by that measure; a touch that is far from all of them is unknown. The
+reach, how far a touch may be from the mean of its class, is learnt leave-one-out and, if there are
+touches of anything else, also from these.
 """
 
 from collections.abc import Sequence
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from tactile_rt.core.errors import ConfigError
 
 FEWEST = 2  # touches of a class
-AXES = 16  # directions in which touches of a class differ
+AXES = 16  # main directions of the covariance
 SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction
 FOLDS = 10
 REFUSED = 0.06  # of the touches, leave-one-out, at most, are taken for unknown
-# Where touches of anything else are known, the reach leaves out so many of them, as long as it
-# refuses no more than this share of the classes' and is no wider than so many times the usual one.
+# If touches of anything else are known, the reach lets in this share of them, as long as it refuses
+# no more than that share of the classes' touches and is at most so many times the usual reach.
 OTHERS_LET_IN, REFUSED_FOR_OTHERS, WIDER = 0.1, 0.12, 1.2
-ENOUGH = 5  # touches of a class, below which they do not tell how far others may be
-MAD, FARTHEST = 1.4826, 2.5  # standard deviations of the logarithm of the distance, at most
-LIMIT = 5.0  # standardised features are limited to, either way: one outlier is not the decision
-# A feature's scale is no less than so many times the median one of its kind, and than this share
-# of its whole spread: what never varied in ten touches may still vary in the eleventh.
+ENOUGH = 5  # touches of a class that suffice to estimate the reach
+MAD, FARTHEST = 1.4826, 2.5  # MAD to standard deviation; of the log distance, at most
+LIMIT = 5.0  # of standardised features, either way, so that one outlier does not decide
+# A feature's scale is at least so many times the median scale of its kind, and this share of its
+# whole spread: a feature that never varied in ten touches may still vary in the eleventh.
 LEAST_OF_KIND, LEAST_OF_SPREAD = 4.0, 0.15
 TEMPERATURES = np.geomspace(1.0, 1e4, 81)
 TINY = 1e-9
@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TouchClasses:
-    """What tells classes apart, step by step.
+    """The learnt classes, step by step.
 
     Standardised features are (f - mean) / scale, limited to 5.
     """
@@ -47,17 +47,17 @@ class TouchClasses:
     mean: Floats  # (step, feature)
     scale: Floats  # (step, feature)
     centres: Floats  # (step, class, feature) means of the classes, standardised
-    # (step, feature, axis) directions in which touches of a class differ, each as long as a unit
-    # along it weighs less than a unit across all
+    # (step, feature, axis) main directions of the covariance; the squared length of each is the
+    # weight that a unit along it loses
     axes: Floats
     rest: Floats  # (step,) variance in all other directions
-    # (class,) of a squared distance: what is left when the part from a mean of few touches is off
+    # (class,) factor of squared distances that corrects for the error of a mean of few touches
     share: Floats
     reach: Floats  # (step,) squared distance from the nearest class beyond which all is unknown
-    temperature: float  # divides half of the squared distances: posteriors mean what they say
+    temperature: float  # divides half of the squared distances, so that posteriors are calibrated
 
     def distances(self, features: Floats) -> Floats:
-        """(touch, step, class) squared distances of touches (touch, step, feature)."""
+        """Compute squared distances (touch, step, class) of touches (touch, step, feature)."""
         found = np.clip((features - self.mean) / self.scale, -LIMIT, LIMIT)
         away = found[:, :, None] - self.centres
         along = np.einsum("tscf,sfa->tsca", away, self.axes)
@@ -67,7 +67,7 @@ class TouchClasses:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """What was made of every touch, leave-one-out: by the others alone."""
+    """The leave-one-out results: every touch is judged by the others alone."""
 
     distances: Floats  # (touch, step, class) squared distances from the classes of the others
     right: NDArray[np.bool_]  # (touch,) whether the nearest class at the last step was its own
@@ -80,14 +80,14 @@ def fit_classes(
     told: LeaveOneOut | None = None,
     others: Floats | None = None,
 ) -> TouchClasses:
-    """Learn classes.
+    """Learn classes from touches.
 
     Args:
         features: (touch, step, feature) of all touches.
         labels: (touch,) the class of each.
-        kinds: which features are of one kind, and so of one scale.
-        told: what `leave_one_out` said of these touches; None: it is asked.
-        others: (touch, step, feature) of touches of anything else; None: there are none.
+        kinds: slices of features of one kind, and so of one scale.
+        told: the result of `leave_one_out` for these touches; None: it is computed.
+        others: (touch, step, feature) of touches of anything else; None: no such touches.
     """
     _check_enough(labels)
     told = told or leave_one_out(features, labels, kinds)
@@ -96,14 +96,14 @@ def fit_classes(
     many = np.bincount(own)[own] >= ENOUGH
     nearest = nearest[many] if many.any() else nearest
     rank = min(len(nearest) - 1, int(np.ceil((1 - REFUSED) * (len(nearest) + 1))) - 1)
-    # A touch under a wrong name is far from its class; it is not to let everything through.
+    # A touch with a wrong label is far from its class; it must not make the reach too wide.
     logs = np.log(nearest + TINY)
     middle = np.median(logs, axis=0)
     spread = MAD * np.median(np.abs(logs - middle), axis=0)
     reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
-    temperature = _temperature(told.distances[:, -1], own)
+    temperature = _fit_temperature(told.distances[:, -1], own)
     names = tuple(str(name) for name in classes)
-    found = TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
+    found = TouchClasses(names, *_fit_shared(features, own, kinds), reach, temperature)
     if others is None or not len(others):
         return found
     far = np.quantile(found.distances(others).min(axis=2), OTHERS_LET_IN, axis=0)
@@ -126,9 +126,9 @@ def count_refused(
 
 
 def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeaveOneOut:
-    """Judge every touch by what is learnt from others: of many, a tenth of each class at a time.
+    """Judge every touch by what is learnt from the others.
 
-    Takes what `fit_classes` takes; at least two touches of each class.
+    Of many touches, a tenth of each class is left out at a time. At least two of each are needed.
     """
     _check_enough(labels)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
@@ -140,37 +140,37 @@ def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice
     for fold in range(turn.max() + 1):
         out = turn == fold
         learnt = TouchClasses(
-            tuple(classes), *_shared(features[~out], own[~out], kinds), np.zeros(0), 1.0
+            tuple(classes), *_fit_shared(features[~out], own[~out], kinds), np.zeros(0), 1.0
         )
         distances[out] = learnt.distances(features[out])
     return LeaveOneOut(distances, distances[:, -1].argmin(axis=1) == own)
 
 
 def _check_enough(labels: Sequence[str]) -> None:
-    """Refuse labels of which one has fewer than two touches."""
+    """Refuse labels if a class has fewer than two touches."""
     for name in dict.fromkeys(labels):
         if list(labels).count(name) < FEWEST:
             raise ConfigError(f"there is one touch of {name!r}; a class needs {FEWEST} at least")
 
 
-def _shared(
+def _fit_shared(
     features: Floats, own: NDArray[np.intp], kinds: Sequence[slice]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """mean, scale, centres, axes, rest and share, as `TouchClasses` has them."""
+    """Compute mean, scale, centres, axes, rest and share of `TouchClasses`."""
     count = int(own.max()) + 1
     share = 1 - 1 / (np.bincount(own) + 1.0)
     freedom = max(1, len(own) - count)
     mean = features.mean(axis=0)
-    scale = np.sqrt(np.square(features - _means(features, own)[own]).sum(axis=0) / freedom)
+    scale = np.sqrt(np.square(features - _compute_means(features, own)[own]).sum(axis=0) / freedom)
     spread = features.std(axis=0)
     for kind in kinds:
         usual = LEAST_OF_KIND * np.median(scale[:, kind], axis=1, keepdims=True)
         least = np.hypot(usual, LEAST_OF_SPREAD * spread[:, kind])
         scale[:, kind] = np.hypot(scale[:, kind], least) + TINY
     found = np.clip((features - mean) / scale, -LIMIT, LIMIT)
-    centres = _means(found, own)
+    centres = _compute_means(found, own)
     apart = np.swapaxes(found - centres[own], 0, 1)  # (step, touch, feature)
-    # The covariance has no more directions than touches: they are found among these.
+    # The covariance has at most as many directions as touches: compute them from inner products.
     values, vectors = np.linalg.eigh(apart @ np.swapaxes(apart, 1, 2) / freedom)
     values, vectors = values[:, ::-1][:, :AXES], vectors[:, :, ::-1][:, :, :AXES]
     average = np.square(apart).sum(axis=(1, 2)) / (freedom * apart.shape[2])  # variance
@@ -182,13 +182,13 @@ def _shared(
     return mean, scale, np.swapaxes(centres, 0, 1), along * less[:, None], rest, share
 
 
-def _means(features: Floats, own: NDArray[np.intp]) -> Floats:
-    """(class, step, feature)."""
+def _compute_means(features: Floats, own: NDArray[np.intp]) -> Floats:
+    """Compute the mean features of each class (class, step, feature)."""
     return np.stack([features[own == k].mean(axis=0) for k in range(int(own.max()) + 1)])
 
 
-def _temperature(distances: Floats, own: NDArray[np.intp]) -> float:
-    """That with the likeliest posteriors of the touches' own classes."""
+def _fit_temperature(distances: Floats, own: NDArray[np.intp]) -> float:
+    """Find the temperature with the likeliest posteriors of the touches' own classes."""
     if distances.shape[1] == 1:
         return float(max(1.0, np.median(distances)))
     least = distances - distances.min(axis=1, keepdims=True)

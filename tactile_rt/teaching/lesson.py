@@ -1,14 +1,14 @@
-"""A lesson: touches of one array, what each of them was, and what is learnt from them.
+"""A lesson: touches of one array, their labels, and the model learnt from them.
 
     Source --> Classifier(features.onnx) --> touches + labels --> model.onnx
 
-A lesson is a folder, so that it can be gone on with, looked at and corrected:
+A lesson is a folder, so that it can be continued, inspected and corrected:
 
-    features.onnx      what is looked at: the array, and its noise when the lesson began; or the
-                       network that objects are enrolled on
-    session-1.mcap     everything that was felt, one recording each time
-    labels.csv         which part of it was which touch; a line is written as a touch ends
-    model.onnx         what was learnt: runs like any other model
+    features.onnx      the features: the array, and its noise when the lesson began; or the network
+                       that objects are enrolled on
+    session-1.mcap     all samples, one recording for each session
+    labels.csv         the interval and the label of each touch, written as the touch ends
+    model.onnx         the model learnt, which runs like any other
 
 `tactile-rt label` makes a sweep set of such a folder, for networks that learn longer.
 """
@@ -32,20 +32,20 @@ from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
 from tactile_rt.teaching.model import TOUCH, Enrolment, FewShot, write_features
 
-ORDERS = ("next", "undo", "done", "list")  # to a teacher; another word is the label from now on
-NAMING = ("forget", "rename")  # those with names after them
+ORDERS = ("next", "undo", "done", "list")  # to a teacher; any other word is the label from now on
+NAMING = ("forget", "rename")  # orders with names after them
 FEATURES, MODEL = "features.onnx", "model.onnx"
 ANYTHING_ELSE = "anything else"  # the label of touches of no class, which are to be refused
-BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
-SAME = 0.65  # share of the touches of two classes that are told apart
-ODD = 3.0  # times as far from its class as its others are, a touch is odd
+BEFORE_NS = 20_000_000  # from the beginning of a touch's interval to its onset
+SAME = 0.65  # if a smaller share of their touches is told apart, two classes feel the same
+ODD = 3.0  # a touch so many times as far from its class as the others is odd
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class TaughtTouch:
-    """One touch."""
+    """A touch of a lesson."""
 
     label: str
     features: NDArray[np.float32]  # (step, feature) what was felt, step by step
@@ -60,16 +60,16 @@ class Lesson:
     folder: Path
     taught: FewShot | Enrolment
     touches: list[TaughtTouch] = field(default_factory=list)  # all touches, in their order
-    # number of touches in the list that are not in the recordings, as their last moment was not
-    # written when the program was killed
+    # number of touches in the list that are not in the recordings, since the last moment of a
+    # recording was not written when the program was killed
     lost: int = 0
-    # labels of those of them that are whole in the list
+    # labels of those lost touches whose line in the list is complete
     unfelt: list[str] = field(default_factory=list)
     _largest: list[NDArray[np.float32]] = field(default_factory=list)  # of each listener
 
     @classmethod
     def begun(cls, folder: Path, taught: FewShot) -> "Lesson":
-        """Begin a lesson of a model of its own, in a folder that is made."""
+        """Begin a few-shot lesson in a folder, which is created if missing."""
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_features(folder / FEATURES, taught)
@@ -80,11 +80,11 @@ class Lesson:
         """Begin a lesson that enrols objects on a network.
 
         Args:
-            folder: where to; made if it is not there.
+            folder: the lesson's folder; created if missing.
             model: the network's file, which is copied.
 
         Raises:
-            ConfigError: there is a lesson already, or the file does not tell what is needed.
+            ConfigError: the folder holds a lesson already, or the file cannot enrol objects.
             ModelError: the file cannot be used.
         """
         _check_free(folder)
@@ -96,7 +96,7 @@ class Lesson:
 
     @classmethod
     def read(cls, folder: Path) -> "Lesson":
-        """A lesson that was begun before, with all its touches."""
+        """Read a lesson that was begun before, with all its touches."""
         path = folder / FEATURES
         if not path.exists():
             raise ConfigError(f"{folder} holds no lesson: there is no {FEATURES}")
@@ -110,11 +110,11 @@ class Lesson:
 
     @classmethod
     def embedded_again(cls, folder: Path, model: Path) -> "Lesson":
-        """Go on with a network's lesson on another one, which feels all recordings again.
+        """Continue a network's lesson on another network, which embeds all recordings again.
 
         Raises:
-            ConfigError: the lesson is of no network, or this one cannot enrol objects.
-            SpecMismatch: the network is of another array than the recordings.
+            ConfigError: the lesson has no network, or the other one cannot enrol objects.
+            SpecMismatch: the network is for another array than the recordings.
         """
         if load_model(folder / FEATURES)[1].labels == (TOUCH,):
             raise ConfigError(f"{folder} holds a lesson without a network: name another folder")
@@ -131,17 +131,17 @@ class Lesson:
         self.lost += labels.drop_torn_label(file)
         if not file.stat().st_size:
             return  # its first line was torn
-        recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
+        recordings = sorted(self.folder.glob("session-*.mcap"), key=_parse_number)
         lines = labels.lines_of(file)
-        told = labels.read_labels(file, [_whole(one) for one in recordings])
+        labelled = labels.read_labels(file, [_repair(one) for one in recordings])
         labels.check_appendable(file)
-        for path, intervals in told.items():
+        for path, intervals in labelled.items():
             if not intervals:
                 continue
-            felt = self._felt(path, model)
+            found = self._find_touches(path, model)
             for interval in intervals:
                 begin, end = interval.start_s, interval.end_s
-                inside = [features for at_s, features in felt if begin <= at_s < end]
+                inside = [features for at_s, features in found if begin <= at_s < end]
                 if not inside:
                     self.lost += 1
                     self.unfelt.append(interval.label)
@@ -149,10 +149,10 @@ class Lesson:
                 line = lines[int(interval.where.rpartition(":")[2]) - 1].rstrip("\r\n")
                 self.touches.append(TaughtTouch(interval.label, inside[0], path.name, line))
 
-    def _felt(self, path: Path, model: Path) -> list[tuple[float, NDArray[np.float32]]]:
-        """Onset, in seconds since the beginning, and features of every touch in a recording."""
+    def _find_touches(self, path: Path, model: Path) -> list[tuple[float, NDArray[np.float32]]]:
+        """Find the touches in a recording: onset, s since its beginning, and features."""
         recording = Recording(path)
-        # which of them counted, the labels tell
+        # the labels say which of them counted
         listener = Listener(model, recording.spec, self.taught.describe, hasty_ns=0)
         self._largest.append(listener.largest)
         found = []
@@ -161,24 +161,25 @@ class Lesson:
         return found
 
     def listener(self, spec: ArraySpec) -> Listener:
-        """That finds touches in a stream of an array."""
+        """Make a listener that finds touches in a stream of an array."""
         listener = Listener(self.folder / FEATURES, spec, self.taught.describe)
         self._largest.append(listener.largest)
         return listener
 
     def next_recording(self) -> Path:
-        """The path of the recording that goes on with the lesson."""
-        numbers = [_number(path) for path in self.folder.glob("session-*.mcap")]
+        """Return the path of the lesson's next recording."""
+        numbers = [_parse_number(path) for path in self.folder.glob("session-*.mcap")]
         return self.folder / f"session-{max(numbers, default=0) + 1}.mcap"
 
     def add(
         self, label: str, features: NDArray[np.float32], recording: str, span_s: tuple[float, float]
     ) -> None:
-        """Take a touch; on return it is on the disk, but for what the recording has not written.
+        """Add a touch; on return its label is on disk.
 
         Args:
             features: (step, feature).
-            span_s: where in it, seconds since its first sample.
+            recording: the recording's name; its newest samples may not be on disk yet.
+            span_s: interval of the touch, seconds since the recording's first sample.
         """
         begin_s, end_s = max(0.0, span_s[0]), span_s[1]
         interval = labels.LabelledInterval(label=label, start_s=begin_s, end_s=end_s)
@@ -186,17 +187,17 @@ class Lesson:
         self.touches.append(TaughtTouch(label, features, recording, line))
 
     def undo(self) -> TaughtTouch | None:
-        """Take the last touch back; None: there is none."""
+        """Remove the last touch and return it; None: no touch is left."""
         if not self.touches:
             return None
         labels.remove_label(self.folder / labels.LABELS, self.touches[-1].line)
         return self.touches.pop()
 
     def rename(self, old: str, new: str) -> None:
-        """Give all touches of a label another one, or forget them if that is empty.
+        """Rename a label, or forget all its touches if the new name is empty.
 
         Raises:
-            ConfigError: there is no such label, or the new one cannot be.
+            ConfigError: the label does not exist, or the new one is invalid.
         """
         if old not in (*self.labels, *self.unfelt):
             raise ConfigError(f"there is no {old!r}: `list` tells the names")
@@ -212,31 +213,31 @@ class Lesson:
         ]
 
     def count(self, label: str) -> int:
-        """How many touches there are of a label."""
+        """Count the touches of a label."""
         return sum(touch.label == label for touch in self.touches)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The names of all classes, in the order in which they came."""
+        """The names of all classes, in order of their first touches."""
         names = (touch.label for touch in self.touches if touch.label != ANYTHING_ELSE)
         return tuple(dict.fromkeys(names))
 
     @property
     def taught_enough(self) -> tuple[str, ...]:
-        """The classes of which there are enough touches to learn from."""
+        """The classes with enough touches to learn from."""
         return tuple(name for name in self.labels if self.count(name) >= FEWEST)
 
     def leave_one_out(self) -> "LessonProgress":
         """Judge every touch by the others alone, at its last step.
 
-        Of one class alone no touch can be wrong, and none is counted as right.
+        With a single class no touch can be wrong, so none is counted as right.
         """
         used, names = self._select_touches()
         if not used:
             return LessonProgress((), (), ())
-        features, others = self._features(used), self._others()
+        features, others = self._stack_features(used), self._stack_others()
         found = self.taught.leave_one_out(features, names)
-        progress = _progress(used, names, found, self.taught.few)
+        progress = _summarise(used, names, found, self.taught.few)
         refused = self.taught.count_refused(features, names, others) if len(others) else 0
         progress = replace(progress, others=(refused, len(others)))
         if isinstance(self.taught, FewShot) and len(set(names)) < 2:
@@ -249,18 +250,18 @@ class Lesson:
         if not used:
             why = f"nothing to learn from: no class has {FEWEST} touches yet"
             raise ConfigError(f"{self.folder}: {why}")
-        told = {
+        provenance = {
             "taught": {name: names.count(name) for name in dict.fromkeys(names)},
             "labels_sha256": hash_of(self.folder / labels.LABELS),
         }
         return self.taught.learn(
             self.folder / MODEL,
-            self._features(used),
+            self._stack_features(used),
             names,
-            self._others(),
+            self._stack_others(),
             np.max(self._largest, axis=0, initial=0.0),
             self.folder.resolve().name,
-            told,
+            provenance,
         )
 
     def _select_touches(self) -> tuple[list[int], list[str]]:
@@ -269,45 +270,45 @@ class Lesson:
         used = [k for k, touch in enumerate(self.touches) if touch.label in enough]
         return used, [self.touches[k].label for k in used]
 
-    def _others(self) -> Floats:
-        """(touch, step, feature) of touches of anything else."""
+    def _stack_others(self) -> Floats:
+        """Return the features (touch, step, feature) of touches of anything else."""
         found = [touch.features for touch in self.touches if touch.label == ANYTHING_ELSE]
         return np.array(found, dtype=float)
 
-    def _features(self, used: Sequence[int]) -> Floats:
+    def _stack_features(self, used: Sequence[int]) -> Floats:
         return np.stack([self.touches[k].features for k in used]).astype(float)
 
 
 @dataclass(frozen=True)
 class LessonProgress:
-    """How well touches are told apart, leave-one-out."""
+    """The leave-one-out results of a lesson."""
 
     # name of each class, the number of its touches, and how many of them were right
     classes: tuple[tuple[str, int, int], ...]
     # touches that are unlike the others of their class: their number, counted from 1, and the class
     # that they are most like
     odd: tuple[tuple[int, str], ...]
-    # pairs of classes that are taken for one another, the most often first
+    # pairs of classes of which the first is taken for the second, the most frequent pair first
     confused: tuple[tuple[str, str], ...]
     # pairs of classes that feel the same: touches of the two are told apart by chance
     same: tuple[tuple[str, str], ...] = ()
-    # how many touches of anything else are refused, and of how many
+    # number of touches of anything else that are refused, and of all of these
     others: tuple[int, int] = (0, 0)
 
     @property
     def right(self) -> tuple[int, int]:
-        """How many touches were right, and of how many."""
+        """Number of touches that were right, and of all touches."""
         return sum(c[2] for c in self.classes), sum(c[1] for c in self.classes)
 
 
-def _progress(
+def _summarise(
     used: Sequence[int], names: Sequence[str], found: LeaveOneOut, few: int
 ) -> LessonProgress:
     classes = np.unique(np.asarray(names))
     own = np.searchsorted(classes, names)
     distances = found.distances[:, -1]
     nearest = distances.argmin(axis=1)
-    squares = distances[np.arange(len(own)), own]  # of a network's classes below 0 well inside
+    squares = distances[np.arange(len(own)), own]  # with a network, below 0 well inside
     mine = np.sqrt(np.maximum(squares, 0))
     odd = []
     for k in range(len(own)):
@@ -317,7 +318,7 @@ def _progress(
     both = zip(classes[own].tolist(), classes[nearest].tolist(), strict=True)
     wrong = [pair for pair in both if pair[0] != pair[1]]
     pairs = sorted(dict.fromkeys(wrong), key=lambda pair: -wrong.count(pair))
-    told = tuple(
+    results = tuple(
         (name, names.count(name), int(found.right[own == np.searchsorted(classes, name)].sum()))
         for name in dict.fromkeys(names)
     )
@@ -328,7 +329,7 @@ def _progress(
         nearer = (distances[both, a] < distances[both, b]) == (own[both] == a)
         if min(counts) >= few and nearer.mean() < SAME:
             alike.append((str(classes[a]), str(classes[b])))
-    return LessonProgress(told, tuple(odd), tuple(pairs), tuple(alike))
+    return LessonProgress(results, tuple(odd), tuple(pairs), tuple(alike))
 
 
 def _check_free(folder: Path) -> None:
@@ -340,7 +341,7 @@ def _check_free(folder: Path) -> None:
 
 
 def check_label(name: str) -> str:
-    """The label itself."""
+    """Check a label, and return it."""
     if why := labels.check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
     if name in ORDERS or name.partition(" ")[0] in NAMING:
@@ -348,13 +349,13 @@ def check_label(name: str) -> str:
     return name
 
 
-def _whole(path: Path) -> Path:
-    """The recording, made whole if it was cut short."""
+def _repair(path: Path) -> Path:
+    """Repair a recording if it was cut short; return its path."""
     if (new := recover(path, force=True)) != path:
         shutil.move(new, path)
     return path
 
 
-def _number(path: Path) -> int:
+def _parse_number(path: Path) -> int:
     digits = path.stem.removeprefix("session-")
     return int(digits) if digits.isdecimal() else 0

@@ -1,4 +1,4 @@
-"""The touches in a stream that somebody teaches: when each was, and its features."""
+"""The touches in the stream of a lesson: onset, end and features of each."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -10,25 +10,25 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
-HASTY_NS = 200_000_000  # after the end of a contact, within which another is not a touch of its own
-FELT = 6.0  # times the noise, for two samples running, is felt
+HASTY_NS = 200_000_000  # after the end of a contact, within which another belongs to that touch
+FELT = 6.0  # times the noise, in two consecutive samples, is felt
 LONG_AGO_NS = 2**62
 # Parts of a rest, and by how many times the noise within them their means differ at most.
 REST_PARTS, MOVED = 8, 10.0
-QUIETEST = 0.25  # share of the parts in which nothing touched, at least
+QUIETEST = 0.25  # share of the parts that are free of touches, at least
 QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
 
 
 class Listener:
-    """Takes a stream, gives the touches in it: onset, end and features of each.
+    """A detector of the touches in a stream.
 
     Args:
         model: ``features.onnx``.
-        felt: makes features of a touch's steps.
-        hasty_ns: how soon after the end of a contact another is taken for its rest, ns.
+        felt: computes features of a touch's steps.
+        hasty_ns: how soon after the end of a contact another counts as its continuation, ns.
 
     Raises:
-        SpecMismatch: the stream is of another array than the lesson.
+        SpecMismatch: the stream is from another array than the lesson.
     """
 
     def __init__(
@@ -38,25 +38,25 @@ class Listener:
         felt: Callable[[Sequence[Classification]], NDArray[np.float32]],
         hasty_ns: int = HASTY_NS,
     ) -> None:
-        self.classifier, self._felt = Classifier(model, spec, embedding=True), felt
+        self.classifier, self._describe = Classifier(model, spec, embedding=True), felt
         self._spec, self._hasty_ns = spec, hasty_ns
-        # samples between two of the classifier's, whose readings can be seen after each of them
+        # input samples for each of the classifier's, after which its readings are inspected
         self._together = max(1, round(spec.rate_hz * self.classifier.card.period_ns / NS_PER_S))
         self._first_ns: int | None = None
-        # (channel,) within a contact, either way from the baseline
+        # (channel,) largest deviation from the baseline within contacts, either way
         self.largest = np.zeros(spec.shape[1], np.float32)
-        self._heard = 0  # samples since the last hint
-        self._strongest, self._where = 0.0, ""  # since then, in units of the noise
+        self._received = 0  # samples since the last hint
+        self._strongest, self._where = 0.0, ""  # reading since then, in units of the noise
         self._steps: list[Classification] = []
         self._released_ns = -LONG_AGO_NS  # stream time
-        self._counts = True  # the touch under way
-        self.hasty = 0  # touches so soon after another that they may be its rest; not given
+        self._counts = True  # whether the current touch counts
+        self.hasty = 0  # contacts so soon after another that they may belong to it; ignored
 
     def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
-        """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
+        """Take samples; yield (onset, end, features (step, feature)) of complete touches."""
         if self._first_ns is None:
             self._first_ns = int(chunk.t_ns[0])
-        self._heard += len(chunk)
+        self._received += len(chunk)
         for k in range(0, len(chunk), self._together):
             yield from self._listen(chunk.select(slice(k, k + self._together)))
 
@@ -80,11 +80,11 @@ class Listener:
                 self.hasty, self._counts = self.hasty + hasty, not hasty
             self._steps.append(decision)
             if decision.final and self._counts:
-                self._heard, self._strongest = 0, 0.0  # it is no touch that was missed
-                yield decision.onset_ns, decision.t_ns, self._felt(self._steps)
+                self._received, self._strongest = 0, 0.0  # this touch was not missed
+                yield decision.onset_ns, decision.t_ns, self._describe(self._steps)
 
     def _released_before(self, onset_ns: int) -> int:
-        """The stream time at which the contact before an onset had ended."""
+        """Return the stream time at which the contact before an onset ended."""
         changes = self.classifier.touches
         while changes and changes[0][0] < onset_ns:
             t_ns, began = changes.popleft()
@@ -93,10 +93,10 @@ class Listener:
         return self._released_ns
 
     def hint(self) -> str:
-        """Why no touch may have been found for a while."""
-        heard, strongest = self._heard, self._strongest
-        self._heard, self._strongest = 0, 0.0
-        if not heard:
+        """Explain why no touch may have been found for a while."""
+        received, strongest = self._received, self._strongest
+        self._received, self._strongest = 0, 0.0
+        if not received:
             return "no sample came for a while: is the device still on?"
         if self.classifier.detector.contact:
             return "it has been touched all the while: let go for a second"
@@ -109,15 +109,15 @@ class Listener:
         )
 
     def seconds(self, t_ns: int) -> float:
-        """Stream time in seconds since the first sample."""
+        """Convert a stream time, ns, to seconds since the first sample."""
         return (t_ns - (self._first_ns or 0)) / NS_PER_S
 
 
 def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
-    """Find a reading that was not at rest: its element and channel, or nothing.
+    """Find a reading that was not at rest; return its element and channel, or "".
 
-    Means of eighths of the time differ by no more than ten times the noise at rest, or by two of
-    the levels that a reading has.
+    At rest, the means of eighths of the time differ by no more than ten times the noise, or by two
+    steps between the levels of a reading.
     """
     values = np.concatenate([c.values for c in chunks]).astype(float) if chunks else np.empty(0)
     if len(values) < 4 * REST_PARTS:
@@ -135,16 +135,16 @@ def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
 
 
 def measure_changes(chunks: Sequence[Chunk]) -> float:
-    """Measure which share of readings differs from the one before, of the steadiest element."""
+    """Measure the share of readings that differ from the one before, for the steadiest element."""
     values = np.concatenate([c.values for c in chunks])
     return float((values[1:] != values[:-1]).mean(axis=0).max(axis=1).min())
 
 
 def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
-    """(channel,) the least noise that a contact detector should assume, from an array at rest.
+    """Estimate the least noise (channel,) for a contact detector, from an array at rest.
 
-    A share of the noise of the median element; of a channel that never changes, the smallest
-    difference between its readings, or a millionth of the largest.
+    It is a share of the noise of the median element; for a channel that hardly changes, it follows
+    from the smallest difference between its readings, or from a millionth of the largest.
     """
     values = np.concatenate([c.values for c in chunks]) if chunks else np.empty((0, 0, 0))
     valid = np.concatenate([c.valid for c in chunks]) if chunks else np.empty((0, 0))

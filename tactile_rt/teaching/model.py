@@ -1,10 +1,10 @@
-"""Model files made of touches, without torch and without the package `onnx`.
+"""Model files learnt from touches, without torch and without the package `onnx`.
 
     features, classes --> an .onnx file that runs like any other
 
-Before anything is learnt, `write_features` writes a model of one class whose embedding are the
-features: run on a stream by an ordinary `Classifier`, it gives for every touch the very numbers
-that the model learnt from it will see.
+Before anything is learnt, `write_features` writes a model of one class whose embedding is the
+features: run on a stream by an ordinary `Classifier`, it gives for every touch the same numbers as
+the model that is learnt later.
 """
 
 import platform
@@ -32,7 +32,7 @@ from tactile_rt.teaching import head
 from tactile_rt.teaching.features import FeatureNetwork
 from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph, with_metadata
 
-FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
+FASTEST_NS = 9_000_000  # sample period of the network; a slower sensor keeps its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
 LARGER, NOISES = 3.0, 1e3  # times the largest load felt, or the noise, that may come later
 MAYBE = 0.5  # posterior of `unknown` above which a touch is unknown
@@ -42,35 +42,35 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FewShot:
-    """What is needed to learn a model few-shot, from a lesson alone."""
+    """The few-shot learning of a model, from a lesson alone."""
 
     spec: ArraySpec
     # (channel,) smallest noise that the contact detector assumes, in the channel's unit
     floor: NDArray[np.float32]
-    # share of readings at rest that differ from the one before, of the element that repeats most;
-    # 0: not known
+    # share of readings at rest that differ from the one before, for the element that repeats most;
+    # 0: unknown
     changes: float = 0.0
     each = 10  # touches of a class that are worth their time
-    few = head.ENOUGH  # fewer are told
+    few = head.ENOUGH  # fewer are reported
     note = ""  # for the user, before the first touch
 
     @property
     def period_ns(self) -> int:
-        """The period of the samples that the network takes, ns."""
+        """Period of the samples that the network takes, ns."""
         return max(FASTEST_NS, round(NS_PER_S / self.spec.rate_hz))
 
     @property
     def timing(self) -> Timing:
-        """How a touch is cut."""
+        """The division of a touch into steps."""
         return Timing.of(self.period_ns)
 
     @property
     def network(self) -> FeatureNetwork:
-        """That gives the features."""
+        """The network that computes the features."""
         return FeatureNetwork.drawn(self.spec, self.timing.substeps, self.timing.steps)
 
     def describe(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
-        """(step, feature) of a touch, from what `write_features`' model said of it."""
+        """Return a touch's features (step, feature), from decisions of `write_features`' model."""
         return np.stack([step.embedding for step in steps if step.embedding is not None])
 
     def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
@@ -95,7 +95,7 @@ class FewShot:
         graph, network = OnnxGraph(), self.network
         classes = head.fit_classes(features, labels, network.kinds, others=others)
         found, after = network.build(graph)
-        logits = _head(graph, found, after["count"], self.timing, classes)
+        logits = _add_head(graph, found, after["count"], self.timing, classes)
         graph.output("logits", logits, ["batch", len(classes.labels) + 1])
         card = {
             "name": name,
@@ -103,20 +103,20 @@ class FewShot:
             "refusals": (UNKNOWN,),
             "unknown": OpenSetRule(POSTERIOR, "logits", (MAYBE,)),
             "temperature": classes.temperature,
-            "provenance": {**_made_by(), **told},
+            "provenance": {**_list_versions(), **told},
         }
         if largest.any():
             believed = np.maximum(LARGER * largest, NOISES * self.floor)
             card["clip"] = tuple(map(float, believed))
-        return _write(path, self, graph, found, after, card)
+        return _write_model(path, self, graph, found, after, card)
 
 
 class Enrolment:
-    """What is needed to enrol objects on a network that tells objects apart.
+    """The enrolment of objects on a network that tells objects apart.
 
     Raises:
-        ModelError: it cannot be used.
-        ConfigError: it was not trained to tell objects apart, or some are enrolled in it already.
+        ModelError: the model cannot be used.
+        ConfigError: it was not trained to tell objects apart, or has enrolled objects already.
     """
 
     each, few = 5, 3
@@ -155,7 +155,7 @@ class Enrolment:
         return head.LeaveOneOut(-above[:, None], (above.argmax(axis=1) == own) & (above[mine] >= 0))
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
-        """Count the touches of anything else that are of none of the objects."""
+        """Count the touches of anything else that match none of the objects."""
         found = self._enrol(features, labels)
         assert self.card.identity is not None
         names = [enrolment.identify(self.card.identity, found, [other[-1]])[0] for other in others]
@@ -175,7 +175,7 @@ class Enrolment:
         card = msgspec.structs.replace(
             self.card,
             name=name,
-            provenance={**self.card.provenance, **_made_by(), **told},
+            provenance={**self.card.provenance, **_list_versions(), **told},
             enrolled=self._enrol(features, labels),
         )
         data = with_metadata(self._data, METADATA_KEY, msgspec.json.encode(card).decode())
@@ -190,18 +190,18 @@ class Enrolment:
 
 
 def write_features(path: Path, taught: FewShot) -> ModelCard:
-    """Write the model of one class, of which the embedding are the features of a touch."""
+    """Write a model of one class, whose embedding is the features of a touch."""
     graph, network = OnnxGraph(), taught.network
     features, after = network.build(graph)
     first = graph("Slice", features, graph.integers(0), graph.integers(1), graph.integers(1))
     graph.output("logits", first, ["batch", 1])
-    return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
+    return _write_model(path, taught, graph, features, after, {"labels": (TOUCH,)})
 
 
-def _head(
+def _add_head(
     g: OnnxGraph, features: str, count: str, timing: Timing, classes: head.TouchClasses
 ) -> str:
-    """(batch, class and unknown) logits: half of each squared distance, and of the reach."""
+    """Add logits (batch, class and unknown): minus half of squared distances and reach."""
     done = g("Div", count, g.constant(float(timing.substeps)))
     step = g("Cast", g("Sub", done, g.constant(1.0)), to=7)
     step = g("Clip", step, g.constant(0, np.int64), g.constant(timing.steps - 1, np.int64))
@@ -222,8 +222,8 @@ def _head(
     return g("Mul", distances, g.constant(-0.5))
 
 
-def _write(
-    path: Path, taught: FewShot, graph: OnnxGraph, features: str, after: dict[str, str], told: Any
+def _write_model(
+    path: Path, taught: FewShot, graph: OnnxGraph, features: str, after: dict[str, str], own: Any
 ) -> ModelCard:
     network, timing = taught.network, taught.timing
     graph.output("embedding", features, ["batch", network.size])
@@ -231,7 +231,7 @@ def _write(
         graph.output(f"{name}_next", after[name], ["batch", *shape])
     floor = tuple(float(value) for value in taught.floor)
     card = ModelCard(
-        **{"name": path.stem, "clip": tuple(1e6 * value for value in floor), **told},
+        **{"name": path.stem, "clip": tuple(1e6 * value for value in floor), **own},
         spec=taught.spec.to_json(),
         period_ns=taught.period_ns,
         substeps=timing.substeps,
@@ -247,9 +247,9 @@ def _write(
 
 
 def write_checked(path: Path, graph: OnnxGraph, card: ModelCard) -> ModelCard:
-    """Write a file that stores its own hash and what it computes here, for `model verify`."""
+    """Write a file with its own hash and probe logits, for `model verify`."""
     whole = path.with_name(f".{path.name}")
-    whole.write_bytes(_bytes(graph, card))
+    whole.write_bytes(_serialise(graph, card))
     try:
         session, _ = load_model(whole)
         probe = tuple(tuple(map(float, row)) for row in probe_logits(session, card))
@@ -257,11 +257,11 @@ def write_checked(path: Path, graph: OnnxGraph, card: ModelCard) -> ModelCard:
     finally:
         whole.unlink(missing_ok=True)
     card = msgspec.structs.replace(card, probe=probe, hashes=hashes)
-    write_whole(path, lambda file: file.write(_bytes(graph, card)))
+    write_whole(path, lambda file: file.write(_serialise(graph, card)))
     return card
 
 
-def _made_by() -> dict[str, str]:
+def _list_versions() -> dict[str, str]:
     return {
         "tactile_rt": version("tactile-rt"),
         "onnxruntime": onnxruntime.__version__,
@@ -269,5 +269,5 @@ def _made_by() -> dict[str, str]:
     }
 
 
-def _bytes(graph: OnnxGraph, card: ModelCard) -> bytes:
+def _serialise(graph: OnnxGraph, card: ModelCard) -> bytes:
     return graph.serialised(card.name, {METADATA_KEY: msgspec.json.encode(card).decode()})

@@ -1,6 +1,6 @@
-"""ONNX files written byte by byte, where no robot has the package `onnx`.
+"""ONNX files written byte by byte, since robots do not have the package `onnx`.
 
-What a graph of a few operators needs of ``onnx.proto`` (IR version 10), and no more. Numbers are
+Only the parts of ``onnx.proto`` (IR version 10) that a graph of a few operators needs. Numbers are
 protocol buffers' varints; a message within a message is its length and then its bytes.
 """
 
@@ -21,7 +21,7 @@ TYPES = {"float32": 1, "int64": 7, "bool": 9}  # of tensors
 
 def _varint(number: int) -> bytes:
     out = bytearray()
-    number &= 2**64 - 1  # a negative one is as large as a number of 64 bits can be
+    number &= 2**64 - 1  # a negative number as two's complement of 64 bits
     while number > 0x7F:
         out.append(number & 0x7F | 0x80)
         number >>= 7
@@ -53,17 +53,17 @@ def _value(name: str, shape: Sequence[int | str], dtype: DTypeLike) -> bytes:
 
 def _attribute(name: str, value: int | float | str | Sequence[int]) -> bytes:
     if isinstance(value, str):
-        told = _bytes(4, value) + _number(20, STRING)
+        data = _bytes(4, value) + _number(20, STRING)
     elif isinstance(value, int):
-        told = _number(3, value) + _number(20, INT)
+        data = _number(3, value) + _number(20, INT)
     elif isinstance(value, float):
-        told = _varint(2 << 3 | 5) + np.float32(value).tobytes() + _number(20, FLOAT)
+        data = _varint(2 << 3 | 5) + np.float32(value).tobytes() + _number(20, FLOAT)
     else:
-        told = b"".join(_number(8, one) for one in value) + _number(20, INTS)
-    return _bytes(1, name) + told
+        data = b"".join(_number(8, one) for one in value) + _number(20, INTS)
+    return _bytes(1, name) + data
 
 
-def _name(value: memoryview) -> str:
+def _read_key(value: memoryview) -> str:
     return next(str(text, "utf-8") for number, text, _ in split_fields(value) if number == 1)
 
 
@@ -72,7 +72,7 @@ def with_metadata(data: bytes, key: str, text: str) -> bytes:
     kept = (
         bytes(whole)
         for number, value, whole in split_fields(data)
-        if number != 14 or _name(value) != key
+        if number != 14 or _read_key(value) != key
     )
     return b"".join((*kept, _bytes(14, _bytes(1, key) + _bytes(2, text))))
 
@@ -85,33 +85,33 @@ class OnnxGraph:
     _names: int = 0
 
     def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:
-        """Store a tensor; returns its name."""
-        name = self._new("constant")
+        """Store a tensor; return its name."""
+        name = self._make_name("constant")
         self.parts.append(_bytes(5, _tensor(name, np.asarray(values, dtype))))
         return name
 
     def integers(self, *values: int) -> str:
-        """Store a list of integers, as operators take axes; returns its name."""
+        """Store a list of integers, as operators take axes; return its name."""
         return self.constant(values, np.int64)
 
     def input(self, name: str, shape: Sequence[int | str]) -> str:
-        """Declare an input; a size that is a name is free."""
+        """Declare an input; a size given as a name is free."""
         self.parts.append(_bytes(11, _value(name, shape, np.float32)))
         return name
 
     def output(self, name: str, value: str, shape: Sequence[int | str]) -> None:
-        """Give a value out under a name."""
+        """Declare a value as an output with a name."""
         self._node("Identity", [value], [name], {})
         self.parts.append(_bytes(12, _value(name, shape, np.float32)))
 
     def __call__(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        """Apply an ONNX operator of one output; returns the name of that."""
-        name = self._new(operator)
+        """Apply an ONNX operator with one output; return the output's name."""
+        name = self._make_name(operator)
         self._node(operator, inputs, [name], attributes)
         return name
 
     def serialised(self, name: str, metadata: Mapping[str, str]) -> bytes:
-        """The file."""
+        """Return the bytes of the file."""
         graph = b"".join(self.parts) + _bytes(2, name)
         pairs = (_bytes(14, _bytes(1, key) + _bytes(2, text)) for key, text in metadata.items())
         opset = _bytes(8, _bytes(1, "") + _number(2, OPSET))
@@ -125,6 +125,6 @@ class OnnxGraph:
         more = (_bytes(5, _attribute(*pair)) for pair in attributes.items())
         self.parts.append(_bytes(1, b"".join((*values, _bytes(4, operator), *more))))
 
-    def _new(self, what: str) -> str:
+    def _make_name(self, what: str) -> str:
         self._names += 1
         return f"taught_{what.lower()}_{self._names}"

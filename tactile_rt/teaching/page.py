@@ -1,4 +1,4 @@
-"""Buttons for who teaches, in a browser: the classes, what to touch, how well they are told."""
+"""The teaching page in a browser: buttons for the classes, what to touch, and the results."""
 
 from collections.abc import Callable
 from importlib.resources import files
@@ -22,15 +22,15 @@ class _Order(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class TeachingPage:
-    """Serves the page until it is closed.
+    """The server of the teaching page, which runs until it is closed.
 
     Args:
-        host, port: where to; port 0: any that is free.
-        state: gives what the page shows, see `Teacher.state`; called in another thread.
-        obey: takes an order, in another thread.
+        host, port: the address to listen at; port 0: any free port.
+        state: returns what the page shows, see `Teacher.state`; called in another thread.
+        obey: takes an order; called in another thread.
 
     Raises:
-        SourceError: the address is taken, or not ours.
+        SourceError: the address is taken, or not of this computer.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class TeachingPage:
         )
 
     def close(self) -> None:
-        """Serve no more."""
+        """Stop the server."""
         self._server.close()
 
     async def _answer(self, request: Request) -> Response:

@@ -1,4 +1,4 @@
-"""Who teaches says what is touched, and hears how well it is told apart.
+"""The dialogue of a lesson: the user names what is touched, and sees how well it is told apart.
 
 orders (keys, lines, a page's buttons) --> Teacher <-- touches
 """
@@ -20,37 +20,37 @@ LONG = 9  # digits: more are no class's number
 
 @dataclass
 class Teacher:
-    """What is asked of who touches."""
+    """The dialogue with the user who touches."""
 
     lesson: Lesson
     # names of the classes to be taught, in their order; more come as they are named
     wanted: list[str]
     each: int
-    label: str = ""  # name of what is touched now; empty: nobody has said
-    done: bool = False  # whether who teaches has had enough, or all that was wanted is there
+    label: str = ""  # name of what is touched now; empty: not named yet
+    done: bool = False  # whether the user has ended it, or all wanted touches are there
     ended: str = ""  # how the lesson ended; empty: it goes on
     said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
-    _planned: bool = False  # whether there is a list to be worked through, and then an end
-    _ends_s: float | None = None  # when there is enough of anything else
+    _planned: bool = False  # whether the lesson ends after a list of classes
+    _ends_s: float | None = None  # time at which there is enough of anything else
 
     def __post_init__(self) -> None:
         for name in self.wanted:
             check_label(name)
         self.progress = self.lesson.leave_one_out()
-        self.label = next(iter(self._short()), "")
+        self.label = next(iter(self._list_short()), "")
         self._planned = bool(self.label)
         self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
 
     def obey(self, order: str) -> str:
-        """Do what is asked: one of `ORDERS`, a class's name, or its number. What to say of it.
+        """Execute an order: one of `ORDERS`, a class's name or number; return the answer.
 
         ``forget NAME`` and ``rename OLD NEW`` take names with spaces in quotes.
         """
         return self.note(self._obey(order.strip()))
 
     def note(self, said: str) -> str:
-        """Let the page show what is said, too; the same."""
+        """Show an answer on the page, too; return it."""
         self.said = said
         return said
 
@@ -63,7 +63,7 @@ class Teacher:
         if order == "next":
             return self._next()
         if order == "list":
-            return "\n".join(self._list()) or "nothing is taught yet"
+            return "\n".join(self._describe_classes()) or "nothing is taught yet"
         if order.partition(" ")[0] in NAMING:
             return self._rename(order)
         if order.isdecimal() and order not in self.wanted:
@@ -80,7 +80,7 @@ class Teacher:
         return self.prompt()
 
     def watch(self, now_s: float | None) -> None:
-        """End when anything else was touched for long enough; None: no sample comes."""
+        """End after anything else was touched for long enough; None: no sample comes."""
         if self.label != ANYTHING_ELSE or not self._planned:
             self._ends_s = None
         elif now_s is None:
@@ -96,17 +96,17 @@ class Teacher:
         recording: str,
         span_s: tuple[float, float],
     ) -> str:
-        """Take a touch that was begun under a label; what to say of it."""
+        """Take a touch that was begun under a label; return the answer."""
         if not label:
             return self.note("touched, but what? say so first: nothing was learnt")
         self.lesson.add(label, features, recording, span_s)
-        said = [f"{len(self.lesson.touches):3d}  {label} {self.lesson.count(label)}"]
+        texts = [f"{len(self.lesson.touches):3d}  {label} {self.lesson.count(label)}"]
         before = set(self.progress.odd)
         self.progress = self.lesson.leave_one_out()
         refused, others = self.progress.others
         other = label == ANYTHING_ELSE and self.lesson.taught_enough
-        said.append(f"refused: {refused} of {others}" if other else self._told_apart())
-        said += [
+        texts.append(f"refused: {refused} of {others}" if other else self._describe_progress())
+        texts += [
             f"touch {number} is unlike the others of {self.lesson.touches[number - 1].label}"
             + ("" if like == self.lesson.touches[number - 1].label else f", more like {like}")
             for number, like in self.progress.odd
@@ -115,13 +115,13 @@ class Teacher:
         enough = self.lesson.count(label) >= self.each and label != ANYTHING_ELSE
         changed = self.label == label and enough
         if changed:
-            self._go_on()
+            self._choose_next()
         if self.done or changed:
-            said.append(self.prompt())
-        return self.note("\n".join([", ".join(filter(None, said[:2])), *said[2:]]))
+            texts.append(self.prompt())
+        return self.note("\n".join([", ".join(filter(None, texts[:2])), *texts[2:]]))
 
     def prompt(self) -> str:
-        """What to do now."""
+        """Return what the user should do now."""
         if self.ended:
             return self.ended
         if self.done:
@@ -135,8 +135,8 @@ class Teacher:
         return f"touch it: {self.label} ({count + 1}{of})"
 
     def state(self) -> dict[str, Any]:
-        """What a page shows."""
-        # Asked for in another thread: what is looked at twice must not change in between.
+        """Return what a page shows."""
+        # Called in another thread: what is read twice must not change in between.
         progress, touches = self.progress, tuple(self.lesson.touches)
         right, of = progress.right
         rows = {name: (count, good) for name, count, good in progress.classes}
@@ -164,7 +164,7 @@ class Teacher:
         }
 
     def summary(self) -> Sequence[str]:
-        """What was learnt, line by line."""
+        """Return what was learnt, line by line."""
         lines = [
             f"{name}: {good} of {count} touches right, leave-one-out"
             for name, count, good in self.progress.classes
@@ -191,7 +191,7 @@ class Teacher:
                 )
         return lines
 
-    def _list(self) -> list[str]:
+    def _describe_classes(self) -> list[str]:
         right = {name: f", {good} right" for name, _, good in self.progress.classes}
         names = self.lesson.labels
         return [f"{name}: {self.lesson.count(name)} touches{right.get(name, '')}" for name in names]
@@ -214,7 +214,7 @@ class Teacher:
             self.label = "".join(new)
         return f"{old} is {f'called {new[0]} now' if new else 'forgotten'}\n{self.prompt()}"
 
-    def _told_apart(self) -> str:
+    def _describe_progress(self) -> str:
         right, of = self.progress.right
         if len(self.progress.classes) < 2:
             return ""
@@ -237,9 +237,9 @@ class Teacher:
         self.label = self.wanted[at % len(self.wanted)]
         return self.prompt()
 
-    def _go_on(self) -> None:
-        """To the next class that lacks touches; to the end of the list if none does."""
-        short = self._short()
+    def _choose_next(self) -> None:
+        """Choose the next class that lacks touches; if none does, end the list."""
+        short = self._list_short()
         if short:
             self.label = short[0]
         elif self._planned and not self.lesson.count(ANYTHING_ELSE):
@@ -247,5 +247,5 @@ class Teacher:
         else:
             self.done = self._planned
 
-    def _short(self) -> list[str]:
+    def _list_short(self) -> list[str]:
         return [name for name in self.wanted if self.lesson.count(name) < self.each]

@@ -114,7 +114,7 @@ def test_a_device_apart_from_the_cpu_gets_and_gives_the_same(
         if shape[-1:] != (5,):  # not the logits, which come to the CPU in any case
             self.copy = self.array.copy()
             self.value = made(self.copy, "cpu", 0)
-            self._apart = True
+            self._on_device = True
 
     monkeypatch.setattr(stepper.Tensor, "__init__", apart)
     assert same(push_all(Classifier(model, SAME_RATE, **options), chunks), expected)

@@ -134,12 +134,12 @@ def test_it_is_tried_at_rest_on_a_touch_of_its_card_and_beyond_what_any_sensor_g
 )
 def test_how_a_trial_ended_is_told(code: int, why: str) -> None:
     with pytest.raises(ModelError, match=f"^m.onnx is refused: {why}"):
-        trial._result(Path("m.onnx"), TrialLimits(seconds=7.0), code, b"")
+        trial._read_result(Path("m.onnx"), TrialLimits(seconds=7.0), code, b"")
 
 
 def test_memory_is_what_the_limit_counts() -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[5])
-    assert trial._data_bytes() == pytest.approx(pages * resource.getpagesize(), rel=0.1)
+    assert trial._read_data_bytes() == pytest.approx(pages * resource.getpagesize(), rel=0.1)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")

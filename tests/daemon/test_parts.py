@@ -420,7 +420,7 @@ class Fragile(Part):
         step = self.plan.pop(0) if self.plan else None
         if isinstance(step, Exception):
             raise step
-        self._up()
+        self._report_running()
         if step is None:
             return
         self._busy_ns = time.monotonic_ns()

@@ -25,10 +25,10 @@ SHORTEST_TOKEN = 16
 
 
 class Page(Consumer):
-    """Serves the page of the table ``[page]``.
+    """The consumer that serves the page of the table ``[page]``.
 
     Raises:
-        ConfigError: Others could reach it without a token.
+        ConfigError: Other computers could reach the page without a token.
     """
 
     wants = frozenset({Opened, SourceChunk, Decision, Contact, Event})
@@ -45,11 +45,11 @@ class Page(Consumer):
         self._feed = Feed()
         self._routes: routes.PageRoutes | None = None
         self._server: HttpServer | None = None
-        self._told_state = 0.0
+        self._state_sent = 0.0
         self._frames = 0
 
     def open(self, view: View) -> None:
-        """Listen.
+        """Start to listen.
 
         Raises:
             SourceError: The port is taken, or the address is not of this computer.
@@ -60,7 +60,7 @@ class Page(Consumer):
         self._routes = routes.PageRoutes(guard, self._greet, control)
         self._server = HttpServer(
             "tactile-rt page server", listen(options.host, options.port), self._routes.answer,
-            routes.LIMITS, HEADERS, self._failed,
+            routes.LIMITS, HEADERS, self._log_error,
         )  # fmt: skip
         if not is_loopback(options.host):
             view.report(
@@ -71,7 +71,7 @@ class Page(Consumer):
             )  # fmt: skip
 
     def handle(self, items: list[Item]) -> None:
-        """Send what browsers are to see.
+        """Send new lines to the browsers.
 
         Raises:
             TactileError: The server is gone.
@@ -83,9 +83,9 @@ class Page(Consumer):
         lines = self._feed.take(items, {c.source for c in clients})
         self._frames += sum(bool(source) for source, _ in lines)
         now = time.monotonic()
-        if clients and now - self._told_state >= STATE_S:
-            self._told_state = now
-            lines.append(("", self._state()))
+        if clients and now - self._state_sent >= STATE_S:
+            self._state_sent = now
+            lines.append(("", self._encode_state()))
         if clients and lines:
             server.call(answers.deliver, lines)
 
@@ -112,7 +112,7 @@ class Page(Consumer):
         }
 
     def _greet(self) -> list[bytes]:
-        """The first lines, made in the server's thread."""
+        """Make the first lines for a browser, in the server's thread."""
         snapshot = self._view.snapshot()
         hello = {
             "type": "hello", "version": FEED_VERSION, "control": self._options.control,
@@ -120,16 +120,16 @@ class Page(Consumer):
         }  # fmt: skip
         arrays = [array_line(opened) for opened in self._view.streams().values()]
         recent = self._feed.recent()
-        return [msgspec.json.encode(hello) + b"\n", *arrays, self._state(), *recent]
+        return [msgspec.json.encode(hello) + b"\n", *arrays, self._encode_state(), *recent]
 
-    def _state(self) -> bytes:
+    def _encode_state(self) -> bytes:
         return encode(state_message(self._view.snapshot())) + b"\n"
 
     def _control(self, action: str, who: str) -> bool:
-        there = self._view.send("recorder", Control(action))
-        if there:
+        sent = self._view.send("recorder", Control(action))
+        if sent:
             self._view.report(self._name, "control", f"{who} asked the recorder to {action}")
-        return there
+        return sent
 
-    def _failed(self, reason: str) -> None:
+    def _log_error(self, reason: str) -> None:
         self._view.report(self._name, "request", reason, "error")

@@ -1,8 +1,8 @@
-"""What the page is sent: lines of JSON, thinned to what an eye can follow.
+"""The feed of the page: lines of JSON, thinned to what an eye can follow.
 
-Of samples there are ``frame`` lines, some thirty a second whatever the source's rate: the newest
+Samples are sent as ``frame`` lines, some thirty a second at any rate of the source: the newest
 sample, and the least and greatest value of each channel since the frame before, so that no spike
-goes unseen. All else is in the daemon's messages (`tactile_rt.daemon.messages`).
+goes unseen. All other lines are the daemon's messages (`tactile_rt.daemon.messages`).
 """
 
 import base64
@@ -24,11 +24,11 @@ FEED_VERSION = 1
 FRAME_S = 0.024  # with the gathering, some thirty a second
 KEPT_EVENTS, KEPT_DECISIONS = 40, 160
 
-Line = tuple[str, bytes]  # the source that it is of alone, or empty; JSON with the end of the line
+Line = tuple[str, bytes]  # the one source that it is about, or empty; JSON with the end of the line
 
 
 class _Fold:
-    """Samples of one source since the last frame."""
+    """The range and the newest of a source's samples since the last frame."""
 
     def __init__(self) -> None:
         self.samples = 0
@@ -52,26 +52,26 @@ class _Fold:
     def line(self, source: str) -> Line:
         frame: dict[str, Any] = {
             "type": "frame", "source": source, "t_ms": self.t_ns / 1e6, "samples": self.samples,
-            "newest": _text(self.newest),
+            "newest": _encode_values(self.newest),
         }  # fmt: skip
         if self.samples > 1:
-            frame |= {"least": _text(self.least), "most": _text(self.most)}
+            frame |= {"least": _encode_values(self.least), "most": _encode_values(self.most)}
         self.samples = 0
         return source, msgspec.json.encode(frame) + b"\n"
 
 
 class Feed:
-    """Makes lines of items; in the consumer's thread, but for `recent`."""
+    """The lines made from items; for the consumer's thread, except `recent`."""
 
     def __init__(self) -> None:
         self._folds: dict[str, _Fold] = {}
         self._lock = threading.Lock()
-        # The newest of those that say the same: what is tried again and again hides nothing else.
+        # Only the newest of equal events is kept, so that a repeated failure hides no others.
         self._events: dict[tuple[str, str, str], bytes] = {}
         self._decisions: deque[bytes] = deque(maxlen=KEPT_DECISIONS)
 
     def take(self, items: list[Item], watched: Collection[str]) -> list[Line]:
-        """Return the lines to send now; samples of sources nobody watches cost nothing."""
+        """Return the lines to send now; samples of unwatched sources cost nothing."""
         lines: list[Line] = []
         for item in items:
             if isinstance(item, SourceChunk):
@@ -81,7 +81,7 @@ class Feed:
                 lines.append(("", array_line(item)))
                 self._folds.pop(item.source, None)
             elif isinstance(item, Decision | Contact | Event):
-                lines.append(("", self._message(item)))
+                lines.append(("", self._encode_message(item)))
         for source in [s for s in self._folds if s not in watched]:
             del self._folds[source]
         now = time.monotonic()
@@ -92,11 +92,11 @@ class Feed:
         return lines
 
     def recent(self) -> list[bytes]:
-        """Lines of what happened last, for whoever comes now; from any thread."""
+        """Return the newest events and decisions, for a new browser; from any thread."""
         with self._lock:
             return [*self._events.values(), *self._decisions]
 
-    def _message(self, item: Item) -> bytes:
+    def _encode_message(self, item: Item) -> bytes:
         message = message_of(item)
         assert message is not None
         line = encode(message) + b"\n"
@@ -113,7 +113,7 @@ class Feed:
 
 
 def array_line(opened: Opened) -> bytes:
-    """The array of a source."""
+    """Encode the array of a source as a line."""
     spec = opened.spec
     return (
         msgspec.json.encode(
@@ -128,12 +128,12 @@ def array_line(opened: Opened) -> bytes:
 
 
 def map_axes(spec: ArraySpec) -> NDArray[np.float64]:
-    """(element, 2, 3): turns a vector in each element's own frame into (right, down) of the map.
+    """Compute the matrices (element, 2, 3) from elements' own frames to the map's (right, down).
 
     Right is the mean direction, in the mount frame, in which the columns of the grid follow each
-    other, down that of the rows: the part of a force in the plane of the array, so that arrows of
-    elements that point differently can be compared. Where the elements' places do not span a
-    plane, it is the element's own (x, y), y upwards.
+    other, down that of the rows. So the map shows the part of a force in the plane of the array,
+    and arrows of elements that point differently can be compared. If the elements' positions span
+    no plane, the axes are the element's own (x, y), y upwards.
     """
     n = len(spec.elements)
     plain = np.tile([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], (n, 1, 1))
@@ -146,11 +146,11 @@ def map_axes(spec: ArraySpec) -> NDArray[np.float64]:
     if min(lengths) < 1e-9 or np.linalg.norm(np.cross(right, down)) < 0.1 * np.prod(lengths):
         return plain
     right = right / lengths[0]
-    down = down - right * (right @ down)  # the map's axes stand at right angles
+    down = down - right * (right @ down)  # make the axes perpendicular
     axes = np.stack([right, down / np.linalg.norm(down)])
     return np.asarray((axes @ rotation_matrices(spec.orientations)).round(4))
 
 
-def _text(values: NDArray[np.float32]) -> str:
-    """Little-endian float32, base64: a quarter of what digits take; not a number where invalid."""
+def _encode_values(values: NDArray[np.float32]) -> str:
+    """Encode values as base64 of little-endian float32, a quarter of the size of digits."""
     return base64.b64encode(values.astype("<f4").tobytes()).decode()

@@ -1,12 +1,12 @@
-"""What the page answers, and to whom: a few files, one stream of lines, perhaps a control.
+"""The routes of the page: a few files, one stream of lines, and optionally a control.
 
-    GET  /, /*.js, /*.css, /icon.svg     the page itself; tells nothing
+    GET  /, /*.js, /*.css, /icon.svg     the page itself; holds no data
     POST /login    {"token": "..."}      gives the cookie
     GET  /live?source=NAME               lines of JSON without end (`tactile_rt.daemon.page.feed`)
     POST /control  {"action": "start"}   of the recorder
 
-Beside what `tactile_rt.daemon.http` bounds, the streams and what waits for each are bounded here.
-Who cannot keep up loses the oldest lines and nobody waits for them.
+In addition to the limits of `tactile_rt.daemon.http`, the streams and the lines that wait for each
+are bounded here. A browser that cannot keep up loses the oldest lines and delays nothing else.
 """
 
 import asyncio
@@ -69,11 +69,11 @@ class _Control(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Guard:
-    """Decides on requests by their headers alone.
+    """The checks of requests by their headers alone.
 
     Args:
         host: The address that the page is bound to, as configured.
-        token: The secret that a browser must know; empty: none.
+        token: The secret that a browser must know; empty: no secret.
     """
 
     def __init__(self, host: str, port: int, token: str) -> None:
@@ -82,14 +82,15 @@ class Guard:
         self._token = token.encode()
         # Cookies are shared by all ports of a host: two daemons must not overwrite each other's.
         self.cookie = f"tactile_rt_{port}"
-        # It outlives the daemon, so that a page goes on after a restart, and tells no token.
+        # It outlives the daemon, so that a page goes on after a restart, and hides the token.
         self._session = hmac.digest(self._token, b"tactile_rt page", hashlib.sha256).hex().encode()
 
     def check(self, headers: Mapping[str, str], method: str) -> None:
-        """Refuse a request that is of another site.
+        """Refuse a request that comes from another site.
 
-        A foreign site can neither point a name of its own at this address (DNS rebinding): only
-        numbers and this host's names are answered; nor ask from its own pages: browsers tell.
+        A foreign site cannot point its own name at this address (DNS rebinding), as only IP
+        addresses and this host's names are served. It cannot send requests from its own pages, as
+        browsers state the origin.
 
         Raises:
             Refused: 403.
@@ -106,7 +107,7 @@ class Guard:
             raise Refused(403, "asked for by another site")
 
     def knows(self, headers: Mapping[str, str]) -> bool:
-        """Return whether a request brings the token in a header, or its cookie."""
+        """Return whether a request carries the token in a header, or its cookie."""
         if not self._token:
             return True
         kind, _, given = headers.get("authorization", "").partition(" ")
@@ -119,13 +120,13 @@ class Guard:
         return False
 
     def is_token(self, given: str) -> bool:
-        """Compares in a time that does not tell how much of it is right."""
+        """Return whether a text is the token, in a time independent of its content."""
         return len(given) <= MAX_TOKEN and hmac.compare_digest(
             given.encode("utf-8", "surrogatepass"), self._token
         )
 
     def set_cookie(self) -> str:
-        """Header that lets a browser in; scripts and other sites never see it."""
+        """Return the header that lets a browser in, hidden from scripts and other sites."""
         return (
             f"{self.cookie}={self._session.decode()}; HttpOnly; SameSite=Strict; Path=/; "
             f"Max-Age={COOKIE_S}"
@@ -143,7 +144,7 @@ class Guard:
 
 
 def urlsplit_netloc(origin: str) -> str:
-    """HOST:PORT of an ``Origin`` header; empty if it is of no web site."""
+    """Return HOST:PORT of an ``Origin`` header, or an empty text for no web site."""
     try:
         parts = urlsplit(origin)
     except ValueError:
@@ -152,7 +153,7 @@ def urlsplit_netloc(origin: str) -> str:
 
 
 class PageClient:
-    """Lines that wait for one browser; the oldest goes when there are too many."""
+    """The lines that wait for one browser; excess lines are dropped, oldest first."""
 
     def __init__(self, source: str) -> None:
         self.source = source
@@ -161,32 +162,32 @@ class PageClient:
 
     @property
     def dropped(self) -> int:
-        """How many lines went because there were too many."""
+        """Number of lines that were dropped."""
         return self._lines.dropped["items"]
 
     def put(self, line: bytes) -> None:
-        """One more."""
+        """Add a line."""
         self._lines.put(line)
         self._some.set()
 
     async def take(self) -> bytes:
-        """All that wait, as soon as there are any."""
+        """Wait for lines; return all that wait."""
         await self._some.wait()
         self._some.clear()
         return b"".join(self._lines.take(0))
 
 
 class PageRoutes:
-    """Answers requests; all in the thread of the page's server.
+    """The answers to requests, all in the thread of the page's server.
 
     Args:
-        greet: Gives the first lines for a new client.
-        control: Asked with an action and who asks; returns whether there is a recorder. None: the
-            page may only look.
+        greet: Returns the first lines for a new client.
+        control: Called with an action and the client's address; returns whether there is a
+            recorder. None: the page may only look.
 
     Attributes:
         clients: The browsers that stream now.
-        dropped: The number of lines that browsers which are gone were too slow for.
+        dropped: The number of lines that earlier browsers were too slow for.
     """
 
     def __init__(
@@ -205,14 +206,14 @@ class PageRoutes:
         }
 
     def deliver(self, lines: list[Line]) -> None:
-        """To all clients that they are for."""
+        """Queue lines for the clients that they concern."""
         for client in self.clients:
             for source, line in lines:
                 if not source or source == client.source:
                     client.put(line)
 
     async def answer(self, request: Request) -> Response:
-        """What a request gets."""
+        """Answer a request."""
         path = request.path
         self._guard.check(request.headers, request.method)
         if path in self._files:
@@ -242,7 +243,7 @@ class PageRoutes:
 
     async def _login(self, given: _Login) -> Response:
         if not self._guard.is_token(given.token):
-            # Guessing takes time, and takes it of everybody who guesses.
+            # Each wrong token delays the answers to all of them, so that guessing takes long.
             self._wrong += 1
             try:
                 await asyncio.sleep(WRONG_TOKEN_S * self._wrong)
@@ -266,8 +267,8 @@ class PageRoutes:
 
 
 async def json_body(request: Request, kind: Any) -> Any:
-    """Return what a request brings, of this msgspec type; refuse anything else."""
-    # A form of another site cannot send this type without asking first, and is never allowed.
+    """Decode the body of a request as a msgspec type; refuse anything else."""
+    # A form of another site needs a CORS preflight to send this type, which is never granted.
     sent = request.headers.get("content-type", "").partition(";")[0]
     if sent.strip().lower() != "application/json":
         raise Refused(415, "send application/json")

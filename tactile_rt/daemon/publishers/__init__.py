@@ -1,4 +1,4 @@
-"""The consumers that a configuration asks for; publishers are imported when they are asked for."""
+"""The consumers of a configuration; the module of a publisher is imported only if needed."""
 
 import os
 from collections.abc import Callable
@@ -29,7 +29,7 @@ PUBLISHERS = {
 
 
 def publisher_class(kind: str) -> Any:
-    """The class of a kind of publisher.
+    """Return the class of a kind of publisher.
 
     Raises:
         ConfigError: no such kind, it cannot be loaded, or an extra is not installed.
@@ -66,9 +66,9 @@ class Wanted:
 
     Attributes:
         name: The name of the part that runs the consumer, e.g. ``publisher.zmq``.
-        key: Equal for two consumers that are configured alike: the running one need not restart.
-        make: Makes the consumer; may raise `ConfigError`.
-        options: The table of the configuration; of a publisher that of its ``options``.
+        key: Equal for two consumers with the same configuration: the running one need not restart.
+        make: Creates the consumer; may raise `ConfigError`.
+        options: The table of the configuration; for a publisher, that of its ``options``.
     """
 
     name: str
@@ -79,26 +79,26 @@ class Wanted:
 
 
 def wanted_consumers(loaded: Loaded) -> list[Wanted]:
-    """All of them; nothing is made yet.
+    """List the consumers of a configuration, without creating them.
 
     Raises:
         ConfigError: no such kind of publisher, or a wrong option.
     """
     config, limits = loaded.config, loaded.config.limits
-    wanted = [_publisher(loaded, i, publisher) for i, publisher in enumerate(config.publisher)]
+    wanted = [_resolve(loaded, i, publisher) for i, publisher in enumerate(config.publisher)]
     for table in TABLES:
         if (options := getattr(config, table)) is not None:
             cls = load_class(f"{_HERE}.{table}:{table.title()}", table, "")
             make = partial(cls, table, options)
             wanted.append(Wanted(table, table, (options, limits), make, options))
-    wanted.sort(key=lambda one: one.kind != "log")  # it is to hear of all others
+    wanted.sort(key=lambda one: one.kind != "log")  # the log first, for the events of all others
     if os.environ.get("NOTIFY_SOCKET"):
         cls = load_class(f"{_HERE}.systemd:Systemd", "systemd", "")
         wanted.append(Wanted("systemd", "systemd", limits, partial(cls, "systemd", None)))
     return wanted
 
 
-def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
+def _resolve(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
     try:
         cls = publisher_class(config.kind)
     except ConfigError as error:
@@ -113,7 +113,7 @@ def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
     elif kind is not None:
         try:
             options = convert(make_node({}, "options", 0, Path()), kind)
-        except ConfigError as error:  # it needs some
+        except ConfigError as error:  # some are required
             loaded.refuse(["publisher", i], str(error))
     key = (config.kind, config.name, options, loaded.config.limits)
     name = f"publisher.{config.name}"

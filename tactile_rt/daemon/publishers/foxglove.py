@@ -1,8 +1,8 @@
-"""Live in Foxglove: a WebSocket server that the app opens as a data source.
+"""Live data for Foxglove: a WebSocket server that the app opens as a data source.
 
-Per source a 3-D ``scene``, ``values`` to plot, ``decision``, ``contact`` and ``array``; of the
-daemon ``health``, ``log`` and ``state``. What nobody subscribes to is not even made. A client that
-is slow loses messages beyond the 1024 that the SDK keeps for it.
+The topics of a source are a 3-D ``scene``, ``values`` to plot, ``decision``, ``contact`` and
+``array``; those of the daemon ``health``, ``log`` and ``state``. Messages without a subscriber are
+not encoded. A slow client loses messages beyond the 1024 that the SDK keeps for it.
 """
 
 import logging
@@ -48,7 +48,7 @@ from tactile_rt.daemon.publishers.sending import (
     tell_exposed,
 )
 
-REPEAT_S = 1.0  # whoever comes late sees the array after so long
+REPEAT_S = 1.0  # a client that comes late sees the array within this time
 LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "error": LogLevel.Error}
 
 
@@ -56,10 +56,10 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Options of ``kind = "foxglove"``.
 
     Attributes:
-        host: The address to listen on. Foxglove's protocol knows no password.
+        host: The address to listen on. Foxglove's protocol has no password.
         port: The TCP port to listen on; 0: a free one.
         rate_hz: The largest number of pictures and values a second, Hz.
-        m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen after the largest force.
+        m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen by the largest force.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"
@@ -71,7 +71,7 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 
 class FoxglovePublisher(Consumer):
-    """Serves the Foxglove WebSocket protocol (``foxglove.sdk.v1``)."""
+    """A server of the Foxglove WebSocket protocol (``foxglove.sdk.v1``)."""
 
     Options = FoxgloveOptions
     wants = frozenset({Opened, Closed, SourceChunk, Decision, Contact, Skipped, Event})
@@ -94,7 +94,7 @@ class FoxglovePublisher(Consumer):
     def open(self, view: View) -> None:
         host, port = self._options.host, self._options.port
         self._view, self._context = view, Context()
-        # To the SDK each client that goes without a word is an error worth a line on stderr.
+        # The SDK would log an error on stderr for each client that leaves without a close message.
         logging.getLogger("foxglove").setLevel(logging.CRITICAL + 1)
         try:
             self._server = start_server(
@@ -111,7 +111,7 @@ class FoxglovePublisher(Consumer):
         self._log = LogChannel(f"/{self._options.prefix}/log", context=self._context)
         self._channels[self._log.topic()] = self._log
         for opened in view.streams().values():
-            self._opened(opened)
+            self._add_source(opened)
         self._repeat(view)
 
     def handle(self, items: list[Item]) -> None:
@@ -121,9 +121,9 @@ class FoxglovePublisher(Consumer):
                 newest[item.source] = item
                 continue
             if isinstance(item, Opened):
-                self._opened(item)
+                self._add_source(item)
             elif isinstance(item, Closed):
-                self._closed(item)
+                self._remove_source(item)
             message = message_of(item)
             if message is not None:
                 self._publish(message)
@@ -157,18 +157,18 @@ class FoxglovePublisher(Consumer):
     def _publish(self, message: Message) -> None:
         topic = f"/{topic_of(message, self._options.prefix)}"
         if isinstance(message, DecisionMessage) and message.model != message.source:
-            # A plot of a topic in which two models alternate shows neither.
+            # If two models alternated in one topic, a plot would show neither.
             topic += f"/{quote(message.model, safe='')}"
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._json(topic, schema_of(message))
+            channel = self._add_channel(topic, schema_of(message))
         if channel.has_sinks():
             channel.log(encode(message), log_time=message.utc_ns)
             self._messages += 1
         if isinstance(message, HealthMessage):
-            self._tell(message)
+            self._log_health(message)
 
-    def _tell(self, message: HealthMessage) -> None:
+    def _log_health(self, message: HealthMessage) -> None:
         if self._log is None or not self._log.has_sinks():
             return
         seconds, ns = divmod(message.utc_ns, 10**9)
@@ -181,20 +181,20 @@ class FoxglovePublisher(Consumer):
         )  # fmt: skip
         self._messages += 1
 
-    def _opened(self, item: Opened) -> None:
+    def _add_source(self, item: Opened) -> None:
         base = self._base(item.source)
         self._scenes[item.source] = Scene(item.source, item.spec, self._options.m_per_n)
         if f"{base}/scene" not in self._channels:
             self._channels[f"{base}/scene"] = SceneUpdateChannel(
                 f"{base}/scene", context=self._context
             )
-        # The array may be another one than before: a channel cannot change its schema.
+        # The array may differ from the one before, and a channel cannot change its schema.
         old = self._channels.pop(f"{base}/values", None)
         if old is not None:
             old.close()
-        self._json(f"{base}/values", _values_schema(item.spec))
+        self._add_channel(f"{base}/values", _make_values_schema(item.spec))
 
-    def _closed(self, item: Closed) -> None:
+    def _remove_source(self, item: Closed) -> None:
         scene = self._scenes.pop(item.source, None)
         channel = self._channels.get(f"{self._base(item.source)}/scene")
         if scene is not None and channel is not None:
@@ -216,7 +216,7 @@ class FoxglovePublisher(Consumer):
                 self._channels[f"{base}/scene"].log(update, log_time=utc_ns)
                 self._messages += 1
         if self._channels[f"{base}/values"].has_sinks():
-            found = _values(item.spec, shortest(values).tolist(), valid.tolist())
+            found = _group_values(item.spec, shortest(values).tolist(), valid.tolist())
             message = {"t_ns": t_ns, "utc_ns": utc_ns, "frame": item.spec.frame, **found}
             self._channels[f"{base}/values"].log(msgspec.json.encode(message), log_time=utc_ns)
             self._messages += 1
@@ -237,30 +237,30 @@ class FoxglovePublisher(Consumer):
     def _base(self, source: str) -> str:
         return f"/{self._options.prefix}/{quote(source, safe='')}"
 
-    def _json(self, topic: str, schema: dict[str, Any]) -> Channel:
+    def _add_channel(self, topic: str, schema: dict[str, Any]) -> Channel:
         channel = Channel(topic, schema=schema, message_encoding="json", context=self._context)
         self._channels[topic] = channel
         return channel
 
 
 def schema_of(message: Message) -> dict[str, Any]:
-    """JSON schema of a message as Foxglove takes it: without references, a decision with its
-    labels, so that each probability can be chosen for a plot."""
-    schema = _schema(msgspec.to_builtins(message))
+    """Return a message's JSON schema for Foxglove, which takes no references. That of a decision
+    has its labels, so that each probability can be chosen for a plot."""
+    schema = _infer_schema(msgspec.to_builtins(message))
     return {"title": f"tactile.{type(message).topic}", **schema}
 
 
-def _schema(value: Any) -> dict[str, Any]:
+def _infer_schema(value: Any) -> dict[str, Any]:
     if isinstance(value, dict):
-        return {"type": "object", "properties": {k: _schema(v) for k, v in value.items()}}
+        return {"type": "object", "properties": {k: _infer_schema(v) for k, v in value.items()}}
     if isinstance(value, list | tuple):
-        return {"type": "array", "items": _schema(value[0]) if value else {}}
+        return {"type": "array", "items": _infer_schema(value[0]) if value else {}}
     kinds = {bool: "boolean", int: "integer", float: "number", str: "string"}
     return {"type": kinds[type(value)]} if type(value) in kinds else {}
 
 
-def _values(spec: ArraySpec, values: list[list[float]], valid: list[bool]) -> dict[str, Any]:
-    """{channel: {element: value}}; none where it is not trustworthy."""
+def _group_values(spec: ArraySpec, values: list[list[float]], valid: list[bool]) -> dict[str, Any]:
+    """Return {channel: {element: value}}, with None where a value is not trustworthy."""
     return {
         channel: {
             element: row[c] if ok else None
@@ -270,7 +270,7 @@ def _values(spec: ArraySpec, values: list[list[float]], valid: list[bool]) -> di
     }
 
 
-def _values_schema(spec: ArraySpec) -> dict[str, Any]:
+def _make_values_schema(spec: ArraySpec) -> dict[str, Any]:
     zero = [[0.0] * len(spec.channels)] * len(spec.elements)
-    found = {"t_ns": 0, "utc_ns": 0, "frame": "", **_values(spec, zero, [True] * len(zero))}
-    return {"title": "tactile.values", **_schema(found)}
+    found = {"t_ns": 0, "utc_ns": 0, "frame": "", **_group_values(spec, zero, [True] * len(zero))}
+    return {"title": "tactile.values", **_infer_schema(found)}

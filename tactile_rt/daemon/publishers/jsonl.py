@@ -18,7 +18,7 @@ class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         file: The file that lines are appended to; empty: standard output.
-        state_s: The time between two ``state`` messages, s; 0: none is sent.
+        state_s: The time between two ``state`` messages, s; 0: no such messages.
     """
 
     file: str = ""
@@ -27,8 +27,8 @@ class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class JsonlPublisher(Publisher):
-    """Appends a line per message; a line that could not be written whole is not followed by
-    another in the same line."""
+    """A publisher that appends a line per message. After a line that could not be written whole,
+    the next message begins on a new line."""
 
     Options = JsonlOptions
 
@@ -45,14 +45,14 @@ class JsonlPublisher(Publisher):
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
         self._handle = os.open(self._options.file, flags, 0o644)
         size = os.fstat(self._handle).st_size
-        if size and os.pread(self._handle, 1, size - 1) != b"\n":  # a disk that was full
+        if size and os.pread(self._handle, 1, size - 1) != b"\n":  # a disk was full
             os.write(self._handle, b"\n")
 
     def handle(self, items: list[Item]) -> None:
         name = self._options.file
         if name and not os.path.samestat(os.fstat(self._handle), os.stat(name)):
             raise OSError(f"{name} was moved while it was written: another is begun")
-        # After a reader that stalled much waits: not all of it at once, in this thread and memory.
+        # Much waits after a reader has stalled: do not hold all of it in memory at once.
         for start in range(0, len(items), TOGETHER):
             found = map(message_of, items[start : start + TOGETHER])
             self._write([message for message in found if message is not None])

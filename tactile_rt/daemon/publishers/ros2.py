@@ -1,7 +1,7 @@
-"""Messages as ROS 2 nodes take them: over DDS, with the names of topics and types that ROS 2 uses.
+"""Messages for ROS 2 nodes: over DDS, with the names of topics and types that ROS 2 uses.
 
-Nothing of ROS is needed here. A node needs the definitions, which `tactile-rt config ros2-messages`
-writes as a package. Messages for a node that cannot keep up are dropped, and nobody waits for it.
+No ROS is needed here. A node needs the definitions, which `tactile-rt config ros2-messages` writes
+as a package. Messages for a node that cannot keep up are dropped, so it delays nothing.
 """
 
 import os
@@ -46,12 +46,12 @@ KINDS: dict[str, Any] = {
     "bool": bool, "uint8": types.uint8, "int32": types.int32, "uint32": types.uint32,
     "int64": types.int64, "float32": types.float32, "float64": types.float64, "string": str,
 }  # fmt: skip
-# On loopback nobody is found by multicast: each asks the ports at which another may be.
+# On loopback, multicast finds no participants: each queries the ports where another may be.
 LOOPBACK = """<AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="{0}"/></Peers></Discovery>"""
-FIRST_PORT, PORTS = 7400, 250  # of domain 0, and of each
+FIRST_PORT, PORTS = 7400, 250  # of domain 0; per domain
 CONFIG = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface address="{0}"/></Interfaces>{1}</Domain></CycloneDDS>"""
 
@@ -60,13 +60,13 @@ class Ros2Options(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_onl
     """Options of ``kind = "ros2"``.
 
     Attributes:
-        samples: Whether samples are published, too; of an array of one element that measures a
+        samples: Whether samples are published, too; for an array of one element that measures a
             force, also as wrenches.
         domain: The DDS domain, as ``ROS_DOMAIN_ID`` of the nodes.
-        interface: The IP address of the network interface to publish at. What is not loopback is
-            read by whoever is on that network.
+        interface: The IP address of the network interface to publish at. Beyond loopback, everyone
+            on that network can read the messages.
         config_file: The file of Cyclone DDS's own configuration (XML), for security, peers and the
-            like; it then also says which interface.
+            like; it then also selects the interface.
         queue: The number of messages of a topic that may wait for a node before the oldest go.
     """
 
@@ -86,15 +86,15 @@ class Ros2Options(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Ros2Publisher(Publisher):
-    """Writes each message to the topic of its name, as soon as it is there."""
+    """A publisher that writes each message at once to the topic of its name."""
 
     Options = Ros2Options
 
     def __init__(self, name: str, options: Ros2Options) -> None:
         super().__init__(name, options.samples, options.state_s)
         self._options = options
-        self.gather_s = 0.0  # a control loop is on the other side
-        self._config()  # refuse what cannot be read before anything starts
+        self.gather_s = 0.0  # a control loop may read it
+        self._read_config()  # refuse an unreadable file before anything starts
         self._domain: Domain | None = None
         self._participant: DomainParticipant | None = None
         self._writers: dict[str, DataWriter[Any]] = {}
@@ -104,7 +104,7 @@ class Ros2Publisher(Publisher):
         self._view = view
         options = self._options
         try:
-            self._domain = Domain(options.domain, self._config())
+            self._domain = Domain(options.domain, self._read_config())
             self._participant = DomainParticipant(options.domain)
         except DDSException as error:
             raise SourceError(
@@ -115,23 +115,23 @@ class Ros2Publisher(Publisher):
         elif not (is_loopback(options.interface) and _keep_to_loopback(options.domain)):
             tell_exposed(view, self.name, f"DDS at {options.interface}")
         for name in ("health", "state"):
-            self._writer(name, messages.EVENT)
+            self._find_writer(name, messages.EVENT)
         for opened in view.streams().values():
-            self._opened(opened)
+            self._add_source(opened)
 
     def handle(self, items: list[Item]) -> None:
         for item in items:
             if isinstance(item, SourceChunk):
-                self._samples(item)
+                self._write_samples(item)
             elif isinstance(item, Opened):
-                self._opened(item)
+                self._add_source(item)
             elif (message := message_of(item)) is not None:
-                self._tell(message)
+                self._write_message(message)
         if self._state_due.now():
-            self._tell(state_message(self._view.snapshot()))
+            self._write_message(state_message(self._view.snapshot()))
 
     def close(self) -> None:
-        # What holds others goes last.
+        # Writers before their participant, and that before its domain.
         self._writers.clear()
         self._participant = None
         self._domain = None
@@ -148,21 +148,21 @@ class Ros2Publisher(Publisher):
             "dropped": self._dropped,  # messages that at least one node did not get
         }
 
-    def _opened(self, item: Opened) -> None:
-        """A source's topics are there before anything is said: a node finds them, and misses
-        nothing."""
+    def _add_source(self, item: Opened) -> None:
+        """Create a source's topics and publish its array. Nodes can then find the topics before
+        the first message, and miss none."""
         spec, wanted = item.spec, dict(OF_SOURCE)
         if not self._options.samples:
             del wanted["samples"], wanted["wrench"]
         elif messages.wrenches_of(spec, np.zeros((0, *spec.shape), np.float32)) is None:
             del wanted["wrench"]
         for name, message in wanted.items():
-            self._writer(f"{item.source}/{name}", message)
+            self._find_writer(f"{item.source}/{name}", message)
         utc_ns = item.t_ns + item.utc_offset_ns
         data = messages.array_message(item.spec, item.source, utc_ns)
         self._write(f"{item.source}/array", messages.ARRAY, data, keep=True)
 
-    def _samples(self, item: SourceChunk) -> None:
+    def _write_samples(self, item: SourceChunk) -> None:
         chunk, spec = item.chunk, item.spec
         utc_ns = chunk.t_ns + item.utc_offset_ns
         data = messages.stamped(encode_samples(chunk), int(utc_ns[-1]), spec.frame)
@@ -176,7 +176,7 @@ class Ros2Publisher(Publisher):
                 data = messages.wrench_message(row, at_ns, spec.frame)
                 self._write(f"{item.source}/wrench", messages.WRENCH, data)
 
-    def _tell(self, message: Message) -> None:
+    def _write_message(self, message: Message) -> None:
         name = topic_of(message, "").lstrip("/")
         if isinstance(message, DecisionMessage):
             self._write(name, messages.DECISION, messages.decision_message(encode(message)))
@@ -184,9 +184,9 @@ class Ros2Publisher(Publisher):
             self._write(name, messages.EVENT, messages.event_message(encode(message)))
 
     def _write(self, name: str, message: str, data: bytes, keep: bool = False) -> None:
-        writer = self._writer(name, message, keep)
+        writer = self._find_writer(name, message, keep)
         try:
-            writer.write(_sample(_type(message), data))
+            writer.write(_wrap(_make_type(message), data))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise SourceError(f"ros2: {name}: {error.msg}") from None
@@ -194,8 +194,8 @@ class Ros2Publisher(Publisher):
         self._messages += 1
         self._bytes += len(data)
 
-    def _writer(self, name: str, message: str, keep: bool = False) -> "DataWriter[Any]":
-        """The writer of a topic; keep: the newest message is for those, too, that come later."""
+    def _find_writer(self, name: str, message: str, keep: bool = False) -> "DataWriter[Any]":
+        """Return a topic's writer; `keep`: nodes that come later also get the newest message."""
         if name in self._writers:
             return self._writers[name]
         assert self._participant is not None
@@ -206,11 +206,11 @@ class Ros2Publisher(Publisher):
             Policy.History.KeepLast(1 if keep else self._options.queue),
             Policy.DataRepresentation(use_cdrv0_representation=True),
         )  # fmt: skip
-        topic = Topic(self._participant, f"rt/{'/'.join(parts)}", _type(message))
+        topic = Topic(self._participant, f"rt/{'/'.join(parts)}", _make_type(message))
         self._writers[name] = writer = DataWriter(self._participant, topic, qos)
         return writer
 
-    def _config(self) -> str:
+    def _read_config(self) -> str:
         options = self._options
         if options.config_file:
             try:
@@ -223,8 +223,8 @@ class Ros2Publisher(Publisher):
 
 
 def _keep_to_loopback(domain: int) -> bool:
-    """Let DDS, which waits for others at any address, be reached on loopback alone; whether the
-    system allows that."""
+    """Restrict the sockets of DDS to loopback; return whether the system allows that. DDS itself
+    listens at any address."""
     first = FIRST_PORT + PORTS * domain
     for name in os.listdir("/proc/self/fd"):
         try:
@@ -243,20 +243,20 @@ def _keep_to_loopback(domain: int) -> bool:
     return True
 
 
-def _sample(kind: Any, data: bytes) -> Any:
-    """A message of this type that is encoded already."""
+def _wrap(kind: Any, data: bytes) -> Any:
+    """Wrap an encoded message as an object of a DDS type."""
     made = kind.__new__(kind)
     made.serialize = lambda **_: data
     return made
 
 
 @cache
-def _type(message: str) -> Any:
-    """A message as DDS knows it."""
+def _make_type(message: str) -> Any:
+    """Make the DDS type of a message."""
     fields: dict[str, Any] = {}
     sequence: Any = types.sequence
     for name, kind, many in fields_of(message):
-        one = KINDS[kind] if kind in SIMPLE else _type(kind)
+        one = KINDS[kind] if kind in SIMPLE else _make_type(kind)
         fields[name] = sequence[one] if many else one
     name = dds_type(message)
     return make_idl_struct(re.sub(r"\W", "_", name), name.replace("::", "."), fields)

@@ -26,16 +26,16 @@ from tactile_rt.core.stream import ArraySpec, rotation_matrices
 
 FORCES = ("fx", "fy", "fz")
 SINGLE_M = 0.05  # extent of an array of one element
-LIFETIME_S = 1  # after which an arrow of a source that is silent goes
+LIFETIME_S = 1  # after which the arrows of a silent source disappear
 NEVER = Duration(sec=0)
-FORGET = 0.999  # of the largest force, per picture: at 25 a second, half in 28 s
+FORGET = 0.999  # decay of the largest force per picture: at 25 a second, to half in 28 s
 BASE = Color(r=0.35, g=0.5, b=0.85, a=1.0)
 STEM = Color(r=0.55, g=0.6, b=0.7, a=1.0)
 FORCE = Color(r=0.95, g=0.5, b=0.1, a=1.0)
 
 
 class Scene:
-    """Pictures of one array.
+    """The pictures of one array.
 
     Args:
         m_per_n: length of the arrow of 1 N, m; 0: so that the largest force of the last half
@@ -53,7 +53,7 @@ class Scene:
         self._spacing = self._extent / max(1.0, len(self._at) ** 0.5)
 
     def bases(self, utc_ns: int) -> SceneUpdate:
-        """Where the elements are, and along what they stand: their own x axis."""
+        """Draw the positions of the elements and their directions, the own x axes."""
         ends = self._at + 0.5 * self._spacing * self._turns[:, :, 0]
         size = 0.15 * self._spacing
         spheres = [
@@ -78,7 +78,7 @@ class Scene:
     def forces(
         self, values: NDArray[np.float32], valid: NDArray[np.bool_], utc_ns: int
     ) -> SceneUpdate | None:
-        """One arrow per element that has a trustworthy value; None: it measures no force.
+        """Draw an arrow per element with a trustworthy value; None without force channels.
 
         Args:
             values: (element, channel), forces in each element's own frame, N.
@@ -96,13 +96,13 @@ class Scene:
         scale = self._m_per_n or (self._extent / 3 / self._largest if self._largest > 0 else 0.0)
         entity = SceneEntity(
             timestamp=_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/forces",
-            lifetime=Duration(sec=LIFETIME_S), arrows=list(self._arrows(force, size, scale)),
+            lifetime=Duration(sec=LIFETIME_S), arrows=list(self._draw_arrows(force, size, scale)),
             metadata=[KeyValuePair(key="m_per_N", value=f"{scale:.6g}")],
         )  # fmt: skip
         return SceneUpdate(entities=[entity])
 
     def gone(self, utc_ns: int) -> SceneUpdate:
-        """The array is no longer there."""
+        """Remove the array and its forces from the scene."""
         return SceneUpdate(
             deletions=[
                 SceneEntityDeletion(timestamp=_time(utc_ns), id=f"{self._source}/{what}")
@@ -110,7 +110,7 @@ class Scene:
             ]
         )
 
-    def _arrows(
+    def _draw_arrows(
         self, force: NDArray[np.float64], size: NDArray[np.float64], scale: float
     ) -> Iterator[ArrowPrimitive]:
         shown = np.flatnonzero(size > 0)
@@ -129,7 +129,7 @@ class Scene:
 
 
 def force_columns(spec: ArraySpec) -> dict[int, int]:
-    """Axis (0: x): channel, of the forces that an array measures in N."""
+    """Return the channels of an array's forces in N, by axis (0: x)."""
     return {
         axis: spec.channels.index(name)
         for axis, name in enumerate(FORCES)
@@ -138,9 +138,9 @@ def force_columns(spec: ArraySpec) -> dict[int, int]:
 
 
 def turn_x_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 4) unit quaternions, w first, that turn the x axis to unit vectors (n, 3)."""
+    """Compute unit quaternions (n, 4), w first, from x to unit vectors (n, 3)."""
     x, y, z = directions.T
-    # Half-way between the axis and the direction; straight back, any half turn will do.
+    # Half-way between the axis and the direction; for opposite ones, any half turn will do.
     found = np.stack([1 + x, np.zeros_like(x), -z, y], axis=1)
     found[x < -1 + 1e-9] = (0.0, 0.0, 0.0, 1.0)
     unit: NDArray[np.float64] = found / np.linalg.norm(found, axis=1, keepdims=True)

@@ -1,13 +1,13 @@
-"""What publishers over a network share: which messages go out, how often, to how many.
+"""Common parts of network publishers: choice and repetition of messages, limit of connections.
 
-ZeroMQ, Zenoh and Foxglove's server accept whoever comes until the process has no descriptor left,
-and then the recorder cannot open its next file. None of them can be told a limit that holds before
-a peer has said who it is.
+ZeroMQ, Zenoh and Foxglove's server accept connections until the process has no descriptor left, and
+then the recorder cannot open its next file. None of them has a limit that applies before a peer has
+identified itself.
 
-The kernel knows which connections a port has. A thread looks at the descriptors of the process some
-times a second; of those that are connected to the port, it lets the first few be and shuts down the
-rest, whereupon the library closes them. A look is made without a descriptor being opened, since
-there may be none left.
+The kernel knows which connections a port has. Several times a second, a thread looks at the
+descriptors of the process. Of those that are connected to the port, it keeps the first few and
+shuts down the rest, whereupon the library closes them. It opens no descriptor to look, since none
+may be left.
 """
 
 import abc
@@ -29,18 +29,18 @@ from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
 
-LOOK_S: Final = 0.1  # on loopback, some thousand may come meanwhile
+LOOK_S: Final = 0.1  # on loopback, some thousand connections may come meanwhile
 BYE_S: Final = 0.2
-AGAIN_S: Final = 0.002  # while they come
-CALM: Final = 20  # looks without anyone to shut down, after which they have gone
-Key = tuple[int, int]  # descriptor and inode: a socket, as long as it is open
+AGAIN_S: Final = 0.002  # during a flood of connections
+CALM: Final = 20  # looks without an excess connection, after which a flood is over
+Key = tuple[int, int]  # descriptor and inode, which identify a socket as long as it is open
 
 
 class ConnectionLimit:
-    """Shuts connections down that are too many, from now on until it is closed.
+    """A limit of connections: excess ones are shut down until the limit is closed.
 
     Args:
-        addresses: The TCP ports and the paths of Unix sockets that are listened at.
+        addresses: The TCP ports and the paths of Unix sockets where a server listens.
         most: The number of connections that may stay, all addresses together.
 
     Attributes:
@@ -50,31 +50,31 @@ class ConnectionLimit:
     def __init__(self, name: str, addresses: set[int | str], most: int) -> None:
         self.dropped = 0
         self._addresses, self._most = addresses, most
-        self._numbers: list[int] = []  # of descriptors, at the last look
+        self._numbers: list[int] = []  # descriptors at the last look
         self._kept: set[Key] = set()
-        self._others: set[Key] = set()  # sockets that are none of ours, or shut down
-        self._spare = os.open(os.devnull, os.O_RDWR)  # a descriptor's number, whatever comes
+        self._others: set[Key] = set()  # sockets that do not count, or are shut down
+        self._spare = os.open(os.devnull, os.O_RDWR)  # a descriptor in reserve
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     @property
     def connections(self) -> int:
-        """How many there were at the last look."""
+        """Number of connections at the last look."""
         return len(self._kept)
 
     @property
     def full(self) -> bool:
-        """Whether whoever comes now is shut down."""
+        """True if a further connection would be shut down."""
         return len(self._kept) >= self._most
 
     def close(self, stop: Callable[[], object] | None = None) -> None:
-        """Look no more.
+        """Stop limiting connections.
 
         Args:
-            stop: What ends the listening, before that. Who is connected may take `BYE_S` to say
-                goodbye and is then shut down: for one that never said a word, Foxglove's server
-                and Zenoh wait for ever.
+            stop: Stops the server before that. Connected peers have `BYE_S` to say goodbye and are
+                then shut down: for a peer that never sent anything, Foxglove's server and Zenoh
+                would wait for ever.
         """
         if stop is not None:
             stopping = threading.Thread(target=stop, name=f"{self._thread.name} stop", daemon=True)
@@ -90,17 +90,17 @@ class ConnectionLimit:
         empty = os.open(os.devnull, os.O_RDWR)
         pause, calm = LOOK_S, CALM
         while not self._over.wait(pause):
-            flooded = self._look(empty) > 0
+            flooded = self._shut_down_excess(empty) > 0
             pause = AGAIN_S if flooded else LOOK_S
             calm = 0 if flooded else calm + 1
             if calm == CALM:
-                _give_back()
+                _trim_memory()
         os.close(empty)
 
-    def _look(self, empty: int) -> int:
-        """Shut down who is too many; how many that were."""
-        numbers = _descriptors()
-        # What has changed all the same is noticed at the next change.
+    def _shut_down_excess(self, empty: int) -> int:
+        """Shut down excess connections; return their number."""
+        numbers = _list_descriptors()
+        # A socket replaced under the same number is noticed at the next change.
         if numbers == self._numbers and len(self._kept) <= self._most:
             return 0
         self._numbers = numbers
@@ -119,7 +119,7 @@ class ConnectionLimit:
         dropped = 0
         for key in new:
             with suppress(OSError):
-                # Held by a number of our own: meanwhile it may be closed, and its number another's.
+                # Duplicated, as it may be closed meanwhile and its number be reused.
                 os.dup2(key[0], self._spare)
                 if os.fstat(self._spare).st_ino != key[1]:
                     continue
@@ -140,7 +140,7 @@ class ConnectionLimit:
         return dropped
 
     def _is_ours(self, connection: socket.socket) -> bool:
-        """Whether it is connected to one of the addresses, and does not listen there."""
+        """Return whether a socket is connected to one of the addresses, without listening."""
         if connection.type != socket.SOCK_STREAM or connection.getsockopt(
             socket.SOL_SOCKET, socket.SO_ACCEPTCONN
         ):
@@ -151,13 +151,13 @@ class ConnectionLimit:
         return connection.family == socket.AF_UNIX and local in self._addresses
 
 
-def _give_back() -> None:
-    """Memory that was for those who have gone, which the C library would keep."""
+def _trim_memory() -> None:
+    """Return memory of closed connections to the system, which the C library would keep."""
     with suppress(AttributeError, OSError):  # musl has no such call, and keeps less
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _descriptors() -> list[int]:
+def _list_descriptors() -> list[int]:
     try:
         return [int(number) for number in os.listdir("/proc/self/fd")]
     except OSError:  # none is left to look with
@@ -176,10 +176,10 @@ StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
 
 
 class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options that all of them have.
+    """Options that all of these publishers have.
 
     Attributes:
-        state_s: The time after which ``state`` and all ``array`` messages are repeated, for those
+        state_s: The time after which ``state`` and all ``array`` messages are repeated, for peers
             that come late, s; 0: never.
     """
 
@@ -189,23 +189,23 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ListenerOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of those that others connect to."""
+    """Options of publishers that peers connect to."""
 
     connections: Connections = 32  # at a time; more are shut down
 
 
 class Due:
-    """Tells when something is due that is done every so many seconds; 0: never."""
+    """A timer for an action that is due every so many seconds; 0: never."""
 
     def __init__(self, every_s: float) -> None:
-        self._every_s, self._at = every_s, 0.0
+        self._every_s, self._due_at = every_s, 0.0
 
     def now(self) -> bool:
-        """Whether it is; then it is done, and due again later."""
+        """Return whether the action is due; if so, start the next period."""
         now = time.monotonic()
-        if not self._every_s or now < self._at:
+        if not self._every_s or now < self._due_at:
             return False
-        self._at = now + self._every_s
+        self._due_at = now + self._every_s
         return True
 
 
@@ -216,7 +216,7 @@ def repeat_messages(view: View) -> list[Message]:
 
 
 class Publisher(Consumer):
-    """Base of what publishes messages: samples only if asked for, the state now and then."""
+    """The base of publishers of messages: samples only on request, the state regularly."""
 
     def __init__(self, name: str, samples: bool, state_s: float) -> None:
         self.name = name
@@ -227,7 +227,7 @@ class Publisher(Consumer):
 
 
 class Sender(Publisher):
-    """Sends each message as it is; `_send` does it."""
+    """A publisher that hands each message to `_send`, and repeats the state."""
 
     def __init__(self, name: str, options: SenderOptions) -> None:
         super().__init__(name, options.samples, options.state_s)
@@ -251,20 +251,20 @@ class Sender(Publisher):
 
     @abc.abstractmethod
     def _connect(self, view: View) -> None:
-        """Begin; may raise."""
+        """Connect or listen; may raise."""
 
     @abc.abstractmethod
     def _send(self, message: Message) -> int:
-        """Hand a message over without waiting for anyone; its size in bytes."""
+        """Send a message without waiting for a peer; return its size in bytes."""
 
 
 def is_port(text: str) -> bool:
-    """Whether it is the number of a TCP port."""
+    """Return whether a text is the number of a TCP port."""
     return text.isdecimal() and len(text) < 6 and 1 <= int(text) <= 65535
 
 
 def tell_exposed(view: View, name: str, host: str) -> None:
-    """Warn where others than this computer's own programs can read along."""
+    """Warn if others than this computer's own programs can read the messages."""
     if not is_loopback(host):
         view.report(
             f"publisher.{name}", "exposed",

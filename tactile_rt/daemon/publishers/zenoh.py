@@ -28,11 +28,11 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
     """Options of ``kind = "zenoh"``.
 
     Attributes:
-        listen: The endpoints at which peers may come, like ``tcp/ADDRESS:PORT``; empty: none may.
-        connect: The endpoints of peers or routers to go to; those that are away are tried again.
-        scouting: Whether peers find each other by multicast, which the whole network hears.
+        listen: The endpoints at which peers may connect, like ``tcp/ADDRESS:PORT``; may be empty.
+        connect: The endpoints of peers or routers to connect to; unreachable ones are retried.
+        scouting: Whether peers find each other by multicast, which the whole network receives.
         config_file: The file of Zenoh's own configuration (JSON5), for TLS, access control and the
-            like; what is said here comes on top of it.
+            like; the options here override it.
     """
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
@@ -53,22 +53,22 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ZenohPublisher(Sender):
-    """Puts messages as a peer of its own; nothing is listened to but what `listen` says."""
+    """A Zenoh peer that puts messages; it listens only at the endpoints of `listen`."""
 
     Options = ZenohOptions
 
     def __init__(self, name: str, options: ZenohOptions) -> None:
         super().__init__(name, options)
         self._options = options
-        self._config()  # refuse what Zenoh does not understand before anything starts
+        self._make_config()  # refuse what Zenoh does not understand before anything starts
         self._session: zenoh.Session | None = None
 
     def _connect(self, view: View) -> None:
         try:
-            self._session = zenoh.open(self._config())
+            self._session = zenoh.open(self._make_config())
         except zenoh.ZError as error:
-            raise SourceError(f"zenoh: {_short(error)}") from None
-        ports = {port for endpoint in self._options.listen if (port := _port(endpoint))}
+            raise SourceError(f"zenoh: {_shorten(error)}") from None
+        ports = {port for endpoint in self._options.listen if (port := _find_port(endpoint))}
         if ports:
             name, most = f"{self.name} limit", self._options.connections
             self._limit = ConnectionLimit(name, set(ports), most)
@@ -103,9 +103,9 @@ class ZenohPublisher(Sender):
             "bytes": self._bytes,
         }
 
-    def _config(self) -> Any:
+    def _make_config(self) -> Any:
         options = self._options
-        said: dict[str, Any] = {
+        own: dict[str, Any] = {
             "listen/endpoints": list(options.listen),
             "connect/endpoints": list(options.connect),
             "scouting/multicast/enabled": options.scouting,
@@ -113,21 +113,21 @@ class ZenohPublisher(Sender):
         try:
             if options.config_file:
                 config = zenoh.Config.from_file(options.config_file)
-                # What the file says of these stays, unless it is said here as well.
+                # The file's settings stay, unless an option here differs from its default.
                 default = ZenohOptions()
-                said = {
+                own = {
                     key: value
-                    for key, value in said.items()
+                    for key, value in own.items()
                     if getattr(options, key.split("/")[0]) != getattr(default, key.split("/")[0])
                 }
             else:
                 config = zenoh.Config()
-                # A peer that is away is tried again for ever, and meanwhile all else goes on.
-                said |= {"mode": "peer", "connect/timeout_ms": -1, "connect/exit_on_failure": False}
-            for key, value in said.items():
+                # A peer that is away is retried for ever, without blocking anything else.
+                own |= {"mode": "peer", "connect/timeout_ms": -1, "connect/exit_on_failure": False}
+            for key, value in own.items():
                 config.insert_json5(key, msgspec.json.encode(value).decode())
         except (zenoh.ZError, OSError) as error:
-            raise ConfigError(f"zenoh: {_short(error)}") from None
+            raise ConfigError(f"zenoh: {_shorten(error)}") from None
         return config
 
 
@@ -135,12 +135,12 @@ def _port_text(address: str) -> str:
     return re.split("[?#]", address)[0].rpartition(":")[2]
 
 
-def _port(endpoint: str) -> int:
-    """The TCP port of an endpoint; 0: none, or a free one, which Zenoh does not tell."""
+def _find_port(endpoint: str) -> int:
+    """Return an endpoint's TCP port; 0: none, or a free port that stays unknown."""
     protocol, _, address = endpoint.partition("/")
     return int(_port_text(address)) if protocol in ("tcp", "tls", "ws") else 0
 
 
-def _short(error: BaseException) -> str:
-    """Its first sentence: Zenoh adds the places in its source."""
+def _shorten(error: BaseException) -> str:
+    """Return the first sentence of an error, without the source locations that Zenoh adds."""
     return " ".join(str(error).split()).partition(" at /")[0]

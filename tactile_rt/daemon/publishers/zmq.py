@@ -1,6 +1,6 @@
 """Messages over ZeroMQ: a PUB socket, two frames each: topic, JSON.
 
-A subscriber that is slow loses messages, and nobody waits for it.
+A slow subscriber loses messages, and delays nothing.
 """
 
 from urllib.parse import urlsplit
@@ -18,7 +18,7 @@ from tactile_rt.daemon.publishers.sending import (
     tell_exposed,
 )
 
-LINGER_MS = 200  # how long what was sent last may take to leave
+LINGER_MS = 200  # how long the last messages may take to leave
 
 
 class ZmqOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -48,7 +48,7 @@ class ZmqOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ZmqPublisher(Sender):
-    """Sends messages with their topic as the first frame, by which subscribers choose."""
+    """A PUB socket; a message's first frame is its topic, by which subscribers filter."""
 
     Options = ZmqOptions
 
@@ -76,14 +76,14 @@ class ZmqPublisher(Sender):
         local = int(address.rpartition(":")[2]) if bind.startswith("tcp:") else address
         self._limit = ConnectionLimit(f"{self.name} limit", {local}, self._options.connections)
         if bind.startswith("tcp:"):
-            # An interface's name cannot be told from a host's: it counts as open to others.
+            # An interface's name looks like a host's: it counts as open to others.
             tell_exposed(view, self.name, urlsplit(self._endpoint).hostname or "")
 
     def _send(self, message: Message) -> int:
         assert self._socket is not None
         frames = [topic_of(message, self._options.prefix).encode(), encode(message)]
-        # ZeroMQ drops without a word. Asked not to, it refuses where anyone's queue is full, so
-        # that the drop can be counted; then it is let drop, for those that are slow alone.
+        # ZeroMQ drops silently. With NODROP it refuses if any subscriber's queue is full, so that
+        # the drop can be counted; sent again without, the message misses only slow subscribers.
         try:
             self._socket.setsockopt(zmq.XPUB_NODROP, 1)
             self._socket.send_multipart(frames, zmq.NOBLOCK, copy=True)

@@ -1,10 +1,10 @@
-// Shows what the teacher says, and sends orders. The state is asked for twice a second.
+// Shows the teacher's state, and sends orders. The state is requested twice a second.
 const $ = (id) => document.getElementById(id);
 const buttons = new Map(); // of the classes, by name
 let listed = ""; // names of the classes on the page
 let shown = ""; // the newest state
-let ended = false; // and the page says how
-let asking = false; // an answer is on its way
+let ended = false; // the lesson has ended, and the page says how
+let asking = false; // a request is in progress
 
 async function order(text) {
   try {

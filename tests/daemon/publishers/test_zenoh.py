@@ -120,11 +120,11 @@ def test_what_the_file_says_stays_and_what_is_said_beside_it_comes_on_top(tmp_pa
         f'{{ mode: "client", connect: {{ endpoints: ["{other}"] }} }}'
     )
     file = str(tmp_path / "z.json5")
-    config = ZenohPublisher("z", ZenohOptions(config_file=file))._config()
+    config = ZenohPublisher("z", ZenohOptions(config_file=file))._make_config()
     assert json.loads(config.get_json("connect/endpoints")) == [other]
     assert json.loads(config.get_json("mode")) == "client"
-    config = ZenohPublisher("z", ZenohOptions(config_file=file, connect=(at,)))._config()
+    config = ZenohPublisher("z", ZenohOptions(config_file=file, connect=(at,)))._make_config()
     assert json.loads(config.get_json("connect/endpoints")) == [at]
-    plain = ZenohPublisher("z", ZenohOptions())._config()
+    plain = ZenohPublisher("z", ZenohOptions())._make_config()
     assert json.loads(plain.get_json("scouting/multicast/enabled")) is False
     assert all("127.0.0.1" in e for e in json.loads(plain.get_json("listen/endpoints")))

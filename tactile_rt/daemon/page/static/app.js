@@ -1,4 +1,4 @@
-// The page: what comes is kept here, and drawn at most once per picture of the screen.
+// The page: keeps incoming messages, and draws at most once per frame of the screen.
 
 import { classColour, drawMap, drawProbabilities, drawTraces, layout, readColours, si, traceColour }
   from "./draw.js";
@@ -33,7 +33,7 @@ function floats(text) {
   return new Float32Array(bytes.buffer);
 }
 
-// what comes
+// incoming messages
 
 const take = {
   hello(m) {
@@ -44,7 +44,7 @@ const take = {
       arrays.clear();
     } else if (link !== "live") say("", 0);
     instance = m.instance;
-    // The newest of these are told again at once.
+    // The daemon sends the newest of these again at once.
     $("events").replaceChildren();
     decisions = [];
     $("login").hidden = true;
@@ -147,8 +147,8 @@ function tellLink() {
   const rate = recent && arrivals.length > 1
     ? Math.round((arrivals.length - 1) / ((arrivals.at(-1) - arrivals[0]) / 1000)) : 0;
   const live = link === "live";
-  const told = rate ? `live, ${rate} updates/s` : "connected, no samples";
-  $("link").textContent = live ? told : words[link] || link;
+  const text = rate ? `live, ${rate} updates/s` : "connected, no samples";
+  $("link").textContent = live ? text : words[link] || link;
   $("link").dataset.rate = live ? rate : 0;
   $("link").className = "chip " + (live ? (rate ? "good" : "warn") : "bad");
 }
@@ -165,7 +165,7 @@ function clock(ms) {
   return new Date(ms).toLocaleTimeString([], { hour12: false });
 }
 
-// what is chosen
+// the choice of source and element
 
 function forget() {
   frames = [];
@@ -240,7 +240,7 @@ function quantity(array, group) {
   return words[array.units[group[0]]] || "Value";
 }
 
-// Of the channels that the map shows, those along x, y and z; null without x and y.
+// Return the map's channels along x, y and z; null without x and y.
 function across(array) {
   const main = groups(array)[0];
   const [x, y, z] = [/x$/, /y$/, /z$/].map((end) => main.find((c) => end.test(array.channels[c])));
@@ -293,14 +293,14 @@ function states() {
   tellLink();
 }
 
-// Sentences of the daemon, and what to do.
-function tell(where, told) {
-  $(where).replaceChildren(...told.map(({ says, do: advice }) => {
+// Show the daemon's sentences, with advice.
+function tell(where, diagnostics) {
+  $(where).replaceChildren(...diagnostics.map(({ says, do: advice }) => {
     const item = make("li", says);
     if (advice) item.append(make("p", advice));
     return item;
   }));
-  $(where).hidden = told.length === 0;
+  $(where).hidden = diagnostics.length === 0;
 }
 
 // Without an array there is nothing to draw: say why instead.
@@ -363,8 +363,8 @@ function parts(s) {
   const lines = [];
   const base = (path) => path.split("/").at(-1) || "the shipped model";
   for (const p of s.sources) {
-    const said = p.device ? [`identity: ${p.device.identity}`, p.device.reason, ...new Set([...p.device.faults, ...p.device.status])].filter(Boolean) : [];
-    const device = p.device ? `, device ${p.device.state} ${said.join(", ")}` : "";
+    const facts = p.device ? [`identity: ${p.device.identity}`, p.device.reason, ...new Set([...p.device.faults, ...p.device.status])].filter(Boolean) : [];
+    const device = p.device ? `, device ${p.device.state} ${facts.join(", ")}` : "";
     lines.push([p.part, `${p.url}${device}`, p.device && (p.device.state !== "streaming" || p.device.faults.length)]);
   }
   for (const m of s.models) lines.push([m.part, `${base(m.file)} on ${m.source}, ${m.labels.length} labels`]);
@@ -481,7 +481,7 @@ function decide(now) {
   });
 }
 
-// what a person does
+// user input
 
 $("source").addEventListener("change", (e) => {
   if (arrays.has(e.target.value)) choose(e.target.value);

@@ -57,7 +57,7 @@ function prepare(canvas) {
   return [g, width, height];
 }
 
-// Where each element is on the map: {x, y} of its centre, and the size of a cell.
+// Return the layout of the map: the centre [x, y] of each element, and the size of a cell.
 export function layout(array, width, height) {
   const rows = Math.max(...array.grid.map((c) => c[0])) + 1;
   const columns = Math.max(...array.grid.map((c) => c[1])) + 1;
@@ -209,7 +209,7 @@ export function drawTraces(canvas, frames, array, element, channels, zero, windo
     g.lineJoin = "round";
     for (const run of runs(seen, i)) {
       g.beginPath();
-      // Between frames all values were passed: a band from the least to the most is what is known.
+      // Between frames only the range of the values is known: a band from the least to the most.
       const between = (f, k) => x(k ? (run[k - 1].t + f.t) / 2 : f.t);
       run.forEach((f, k) => g.lineTo(between(f, k), y(f.most[i] - zero[i])));
       for (let k = run.length - 1; k >= 0; k--) {
@@ -226,7 +226,7 @@ export function drawTraces(canvas, frames, array, element, channels, zero, windo
   g.restore();
 }
 
-// Frames that follow each other without a gap, in which value i is known.
+// Split frames into runs without a gap, in which value i is known.
 function runs(frames, i) {
   const found = [];
   let last = -Infinity;

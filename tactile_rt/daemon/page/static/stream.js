@@ -1,13 +1,13 @@
-// Lines of JSON from the daemon, for ever: comes back by itself after whatever ended them.
+// Endless lines of JSON from the daemon; the stream reconnects by itself after an end or error.
 
-const SILENT_MS = 5000; // the daemon says something twice a second
+const SILENT_MS = 5000; // the daemon sends a line twice a second
 const FIRST_MS = 300, LAST_MS = 2000;
 const LONGEST = 8 << 20;
 
 export class Stream {
-  // told: {message(object), link(state, reason)}; states: live, lost, full, locked, hidden
-  constructor(told) {
-    this.told = told;
+  // handlers: {message(object), link(state, reason)}; states: live, lost, full, locked, hidden
+  constructor(handlers) {
+    this.handlers = handlers;
     this.turn = 0;
     this.abort = null;
   }
@@ -39,7 +39,7 @@ export class Stream {
         });
         if (turn !== this.turn) break;
         if (answer.status === 401) {
-          this.told.link("locked", "");
+          this.handlers.link("locked", "");
           break;
         }
         if (answer.ok) {
@@ -55,7 +55,7 @@ export class Stream {
         abort.abort();
       }
       if (turn !== this.turn) break;
-      this.told.link(state, reason);
+      this.handlers.link(state, reason);
       await new Promise((done) => setTimeout(done, wait));
       wait = Math.min(wait * 1.5, LAST_MS);
     }
@@ -73,7 +73,7 @@ export class Stream {
       if (rest.length > LONGEST) throw new RangeError("a line that does not end");
       for (const line of lines) {
         begun();
-        this.told.message(JSON.parse(line));
+        this.handlers.message(JSON.parse(line));
       }
     }
   }
