@@ -163,14 +163,14 @@ def _encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, in
 def _graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
     """Every node's output, step by step: the window form leaves out what reaches no feature."""
     found: dict[str, list[Tensor]] = {node.name: [] for node in encoder.graph.nodes}
-    original = encoder._cell
+    original = encoder._run_cell
 
     def recording(node: Node, *rest: Any) -> tuple[Tensor, tuple[Tensor, ...]]:
         h, memory = original(node, *rest)
         found[node.name].append(h.movedim(2, 0).flatten(1))
         return h, memory
 
-    encoder._cell = recording  # type: ignore[method-assign, assignment]
+    encoder._run_cell = recording  # type: ignore[method-assign, assignment]
     try:
         state, steps = encoder.initial_state(len(frames)), []
         for t in range(frames.shape[1]):

@@ -192,7 +192,7 @@ def _resample(values: Floats, length: int) -> Floats:
     at = np.clip((np.arange(length) + 0.5) * values.shape[1] / length - 0.5, 0, values.shape[1] - 1)
     low = np.minimum(at.astype(int), values.shape[1] - 2)
     share = (at - low).reshape(-1, *(1,) * (values.ndim - 2)).astype(np.float32)
-    return values[:, low] * (1 - share) + values[:, low + 1] * share
+    return np.asarray(values[:, low] * (1 - share) + values[:, low + 1] * share)
 
 
 def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:

@@ -158,7 +158,8 @@ def _choose_sweeps(
         return chosen
     recipe = manifest.recipe["sweeps"]
     if recipe.get("held_out_draws"):
-        held = read_arrays(path, "draw").get("draw", np.zeros(sweeps)) >= recipe["draws"]
+        draws = read_arrays(path, "draw").get("draw", np.zeros(sweeps))
+        held = np.asarray(draws >= recipe["draws"])
     else:
         rng = np.random.default_rng(zlib.crc32(path.stem.encode()))
         held = rng.permutation(sweeps) < recipe["held_out"]
