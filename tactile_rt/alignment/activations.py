@@ -177,7 +177,7 @@ def _graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
             out, state = encoder.step(frames[:, t], torch.zeros(0), state)
             steps.append(out)
     finally:
-        del encoder.__dict__["_cell"]
+        del encoder.__dict__["_run_cell"]
     return {f"encoder.{k}": torch.stack(v, 1) for k, v in found.items()}, torch.stack(steps, 1)
 
 

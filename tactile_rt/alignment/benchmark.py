@@ -175,6 +175,8 @@ def check_benchmark(benchmark: Benchmark, path: Path) -> None:
     number = len(benchmark.stimuli)
     if not FEWEST <= number == len(set(benchmark.stimuli)) <= MOST:
         raise ConfigError(f"{path}: stimuli need {FEWEST} to {MOST} names, each another")
+    if {*benchmark.stimuli} == {*STIMULI} and benchmark.stimuli != STIMULI:
+        raise ConfigError(f"{path}: the six stimuli are in another order than {STIMULI}")
     pairs = len(upper(number)[0])
     for target in benchmark.all_targets:
         if not target.chosen.rdm.shape == target.unfiltered.rdm.shape == (pairs,):

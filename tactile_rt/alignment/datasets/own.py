@@ -23,10 +23,10 @@ def _read(
 OWN = NeuralDataset(
     name="own",
     title="Recordings of your own",
-    citation="",
+    citation="as their owner asks for",
     license="",
     url="",
-    size="",
+    size="as recorded",
     about=(
         "Any 3 to 50 named stimuli: an .npz of rates by session, or a folder with a table of "
         "spikes and one of events. Models are given as their responses to the same stimuli."
