@@ -178,7 +178,7 @@ def check_named_once(file: Path) -> None:
 
 
 def _list_files(word: str) -> set[Path]:
-    """Return the files that an argument may name: alone, as an option, or in a URL."""
+    """Return the files that an argument may name: alone, in an option or URL."""
     parts = (word, *map(unquote, re.split("[:?&=@,]", word)))
     return {Path(part).resolve() for part in parts if part and "\0" not in part}
 

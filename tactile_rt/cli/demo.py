@@ -38,7 +38,7 @@ HEIGHT = 15  # of the upper panels
 DROPPED = 0.02  # share of lost samples above which the score says little about the model
 REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
 END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
-LATENCIES_KEPT = 10_000  # steps in the latency percentiles, a limit since a demo may run for days
+LATENCIES_KEPT = 10_000  # newest steps in the latency percentiles: a demo may run for days
 
 # Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises
 # evenly, from a grey for "untouched".
@@ -129,12 +129,12 @@ def demo(
                     typer.echo(outcome.line(), err=json == STDOUT)
         else:
             watch(demonstration, console)
-    told = {
+    results = {
         "outcomes": demonstration.outcomes, "right": demonstration.right,
         "latency_p50_ms": demonstration.latency_ms(50),
         "latency_p99_ms": demonstration.latency_ms(99), "dropped": demonstration.dropped,
     }  # fmt: skip
-    if not told_as_json(told, json):
+    if not told_as_json(results, json):
         typer.echo(demonstration.summary())
     late = demonstration.dropped / max(1.0, demonstration.samples)
     if late > DROPPED:

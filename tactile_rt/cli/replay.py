@@ -101,7 +101,7 @@ class _Replay:
             )
 
     def write(self, file: BinaryIO | None) -> None:
-        """Write all lines into a file; None: only make them."""
+        """Write all lines into a file; with None, only run the model."""
         for line in self.lines():
             if file is not None:
                 file.write(line + b"\n")

@@ -79,7 +79,7 @@ def fitting(table: Table, console: Console) -> RenderableType:
 
 
 def told_as_json(what: Any, json: Path | None) -> bool:
-    """Write the results of a command as JSON; a file is written whole or not at all.
+    """Write a command's results as JSON; a file is written whole or not at all.
 
     Args:
         what: structs, dataclasses, mappings, sequences, arrays; NaN and infinity become null.
@@ -114,7 +114,7 @@ def _list_cells(table: Table) -> Text:
 
 
 def _format_cell(value: Any) -> str:
-    """Return a cell's text: "-" for None, four digits of a float, a list in one line."""
+    """Return a cell's text: "-" for None, four digits of a float, comma-separated lists."""
     if value is None:
         return "-"
     if isinstance(value, float):
@@ -188,7 +188,7 @@ def progress_bar(
 
 @contextmanager
 def share_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar; yield the function that sets the share of work done, 0 to 1."""
+    """Show a bar; yield the function that sets the share done, 0 to 1."""
     with progress_bar(what, total=1.0) as update:
         yield lambda share: update(completed=share)
 
@@ -204,7 +204,7 @@ def _print_lines(
 
 
 def describe_task(task: progress.Task, counted: bool, timed: bool = True) -> str:
-    """Return a line with the progress of the work, the time so far and the time left."""
+    """Return a line with the progress, the time so far and the time left."""
     line = f"{task.description}:"
     if task.total and counted:
         line += f" {task.completed:.0f} of {task.total:.0f},"

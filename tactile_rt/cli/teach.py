@@ -158,7 +158,7 @@ class Orders:
             self._page.close()
 
     def end(self, message: str) -> None:
-        """Show on the page how the lesson ended; wait until the page has asked for it."""
+        """Show on the page how the lesson ended; wait until it has asked."""
         if self.teacher is not None:
             self.teacher.ended = message
             time.sleep(PAGE_S if self._page else 0)

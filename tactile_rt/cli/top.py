@@ -65,8 +65,8 @@ def snapshot_at(url: str) -> "Snapshot":
     """Ask a daemon for its state over HTTP.
 
     Raises:
-        ConfigError: not an http URL, or not a daemon's.
-        SourceError: nobody answers.
+        ConfigError: the URL is not http, or the answer is not a daemon's.
+        SourceError: no daemon answers.
     """
     import http.client
 

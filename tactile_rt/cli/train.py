@@ -59,7 +59,7 @@ def train(
     if begin is not None:
         given = {**network_of(begin), **given, "begin": str(begin)}
     config = read_recipe(recipe, str(data), sets or (), **given)
-    first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, or alone
+    first = os.environ.get("RANK", "0") == "0"  # the first of torchrun's processes, or the only one
     # Refuse what cannot be trained before torch is imported, which takes seconds.
     config.check_sets()
     if config.begin:

@@ -112,7 +112,7 @@ class Project:
         return f"sim:{quote(str(self.array))}?{query}"
 
     def unseen(self) -> tuple[str, ...]:
-        """Return the objects that the model was not trained on, named as in a ``sim:`` URL.
+        """Return objects that the model was not trained on, named as in ``sim:`` URLs.
 
         Without a model, these are the test objects of sweeps.toml.
         """

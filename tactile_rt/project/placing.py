@@ -12,7 +12,7 @@ from tactile_rt.sim_backend.sweep import Sweep, centrelines, draw_sweep, usual_d
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
 
-SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances of objects, relative, as `draw_sweep` draws them
+SPREAD = (5.5 / 6.5, 8 / 6.5)  # relative range of the distances, as `draw_sweep` draws them
 ABOUT_MM = 6.0  # largest height of an object of 40 mm above or below the middle of the tips
 NEARER = (1.0, 0.8, 0.6, 0.45, 0.3)  # shares of the usual distance, tried in turn
 TRIALS, ENOUGH = 48, 0.97  # sweeps that are tried, and the share of them that should touch
