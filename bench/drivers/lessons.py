@@ -25,7 +25,7 @@ from bench.emulated import PRIORITY, LoopedSource
 from bench.processes import Helper
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.session import Session
-from tactile_rt.cli.teach import _begun, _teach
+from tactile_rt.cli.teach import _begin, _teach
 from tactile_rt.core.stream import NS_PER_S
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.sources.opening import open_source
@@ -50,7 +50,7 @@ def run_lesson(opened: Any, drawn: Drawing, now: Any, began_ns: int) -> dict[str
 
     with TemporaryDirectory() as folder:
         with opened() as source:
-            lesson = _begun(Path(folder) / "lesson", source)
+            lesson = _begin(Path(folder) / "lesson", source)
             _teach(Teacher(lesson, list(dict.fromkeys(taught)), TAUGHT), source, "", who)
         lesson.learn()
         with Session(opened(), Classifier(lesson.folder / MODEL, drawn.spec)) as session:

@@ -1,6 +1,6 @@
 """The `tactile-rt` command: one thin module per group of commands.
 
-A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quietly.
+A user's mistake gives one clear line on stderr and exit code 2; Ctrl-C ends a command quietly.
 """
 
 import io
@@ -20,54 +20,54 @@ if TYPE_CHECKING:
 
 __all__ = ["load_app", "main"]
 
-AGAIN_S = 0.01  # after which a signal whose exception Python dropped comes again
+AGAIN_S = 0.01  # delay before a signal is raised again, if Python dropped its exception
 
 
 def main() -> None:
     """Run the command line."""
     _open_streams()
     if sys.argv[1:2] == ["run"] and not any(a.startswith("--source") for a in sys.argv):
-        # It is to be the daemon: a signal that comes before all else is imported counts, too.
+        # The daemon also obeys signals that come before everything is imported.
         from tactile_rt.daemon.process import note_signals
 
         note_signals()
     if sys.argv[1:2] == ["teach"]:  # two threads of numpy's libraries take 30 times as long as one
         os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with _signals() as told:
-        _run(told)
+    with _catch_signals() as received:
+        _run(received)
 
 
 @contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Let Ctrl-C, SIGTERM and SIGHUP end the block alike; gives the signals that have come."""
-    told: list[int] = []
-    alike = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-    untouched = signal.SIG_DFL, signal.default_int_handler
+def _catch_signals() -> Iterator[list[int]]:
+    """End the block on Ctrl-C, SIGTERM or SIGHUP; yield the list of received signals."""
+    received: list[int] = []
+    handled = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    defaults = signal.SIG_DFL, signal.default_int_handler
 
     def leave(number: int, frame: FrameType | None) -> None:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        if number in alike:
-            told.append(number)
-        elif told:
-            number = told[-1]
+        if number in handled:
+            received.append(number)
+        elif received:
+            number = received[-1]
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         _leave(number)
 
     def report_or_repeat(unraisable: "sys.UnraisableHookArgs") -> None:
-        # While an object is taken away Python drops what is raised: it comes again a little later.
-        if told and isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
+        # Python drops exceptions while it deletes an object: raise the signal again a little later.
+        if received and isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
             signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
         else:
             report(unraisable)
 
-    found = {s: signal.getsignal(s) for s in (*alike, signal.SIGALRM)}
-    before = {s: handler for s, handler in found.items() if handler in untouched}
+    found = {s: signal.getsignal(s) for s in (*handled, signal.SIGALRM)}
+    before = {s: handler for s, handler in found.items() if handler in defaults}
     for number in before:
         signal.signal(number, leave)
     report, sys.unraisablehook = sys.unraisablehook, report_or_repeat
     try:
-        yield told
+        yield received
     except KeyboardInterrupt:
         _leave(signal.SIGINT)
     finally:
@@ -93,40 +93,40 @@ def load_app() -> "typer.Typer":
     return app
 
 
-def _run(told: list[int]) -> None:
+def _run(received: list[int]) -> None:
     import typer
 
     app = load_app()
     from tactile_rt.core.errors import TactileError
 
-    # Typer brings a copy of click since 0.29: whose these are depends on its release.
+    # Since 0.29 Typer has a copy of click of its own: the class depends on Typer's release.
     usage_error: Any = typer.BadParameter.__base__
 
     try:
         try:
             sys.exit(app(prog_name="tactile-rt", standalone_mode=False))
         except Exception:
-            if told:  # what a library makes of a signal is no mistake
-                _leave(told[-1])
+            if received:  # a library has turned the signal into another error
+                _leave(received[-1])
             raise
         finally:
-            sys.stdout.flush()  # while what goes wrong can still be told
+            sys.stdout.flush()  # while an error can still be reported
     except usage_error as error:
-        _misused(error)
+        _report_misuse(error)
     except TactileError as error:
         _give_up(str(error))
-    except BrokenPipeError:  # whoever read it has gone
+    except BrokenPipeError:  # the reader of stdout has gone
         _empty_stdout()
         sys.exit(1)
-    except OSError as error:  # a folder that is a file, a full disk, ...: the user's to mend
-        # Folders are made where there is none, so what exists all the same is a file.
+    except OSError as error:  # a folder that is a file, a full disk, ...: for the user to mend
+        # Missing folders are created, so a path that exists all the same is a file.
         _empty_stdout()
         why = "is not a folder" if isinstance(error, FileExistsError) else error.strerror
         _give_up(f"cannot use {error.filename}: {why}" if error.filename else why or str(error))
 
 
-class _Told(io.FileIO):
-    """The error output: where it can take no more, as the disk of a log is full, work goes on."""
+class _ErrorStream(io.FileIO):
+    """The error output, which ignores write errors such as the full disk of a log."""
 
     def write(self, data: "ReadableBuffer") -> int:
         with suppress(OSError):
@@ -135,35 +135,35 @@ class _Told(io.FileIO):
 
 
 def _open_streams() -> None:
-    """Have a standard input, output and error output, whatever we were started with."""
+    """Open standard streams that are closed, and let stderr ignore write errors."""
     for descriptor in range(3):
         try:
             os.fstat(descriptor)
-        except OSError:  # closed: the next file that is opened would be taken for it
+        except OSError:  # closed: the next file to be opened would take its place
             os.open(os.devnull, os.O_RDWR)
     if sys.stdin is None:
         sys.stdin = open(0, closefd=False)
     if sys.stdout is None:
         sys.stdout = open(1, "w", closefd=False)
-    if sys.stderr is not sys.__stderr__:  # somebody listens in
+    if sys.stderr is not sys.__stderr__:  # somebody has replaced it
         return
-    told = io.BufferedWriter(_Told(2, "w", closefd=False))
+    stream = io.BufferedWriter(_ErrorStream(2, "w", closefd=False))
     coding = getattr(sys.stderr, "encoding", None)
-    sys.stderr = io.TextIOWrapper(told, coding, "backslashreplace", line_buffering=True)
+    sys.stderr = io.TextIOWrapper(stream, coding, "backslashreplace", line_buffering=True)
 
 
-def _misused(error: Any) -> NoReturn:
-    """Say in a line what was wrong with the words of a command, and where to read about it."""
-    if type(error).__name__ == "NoArgsIsHelpError":  # nothing was said at all
+def _report_misuse(error: Any) -> NoReturn:
+    """Report a usage error in one line that names the help, and exit."""
+    if type(error).__name__ == "NoArgsIsHelpError":  # no argument was given at all
         error.show()
         sys.exit(error.exit_code)
     command = error.ctx.command_path if error.ctx else "tactile-rt"
-    said = " ".join(error.format_message().split()).rstrip(".")
-    _give_up(f"{said}; see {command} --help", error.exit_code)
+    message = " ".join(error.format_message().split()).rstrip(".")
+    _give_up(f"{message}; see {command} --help", error.exit_code)
 
 
 def _empty_stdout() -> None:
-    """Print what is still buffered, or forget it: at exit Python would try, fail and say so."""
+    """Flush stdout, or discard its buffer, which Python would fail to print at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -176,6 +176,6 @@ def _give_up(why: str, code: int = 0) -> NoReturn:
     from tactile_rt.cli.app import USER_ERROR
     from tactile_rt.core.errors import shorten
 
-    line = shorten(" ".join(why.splitlines()))  # what a user wrote may have several
+    line = shorten(" ".join(why.splitlines()))  # a user's text may have several lines
     typer.secho(f"tactile-rt: {line}", err=True, fg="red")
     sys.exit(code or USER_ERROR)

@@ -1,4 +1,4 @@
-"""`tactile-rt align`: does a model represent touch as barrel cortex does?"""
+"""`tactile-rt align`: compare a model's representation of touch with barrel cortex."""
 
 from dataclasses import asdict, replace
 from math import isfinite
@@ -83,11 +83,11 @@ def build_benchmark(
     with share_bar("building") as tell, needing("align"):
         made = build(recordings, protocol, bootstraps, seed, tell, selection, clock)
     save_benchmark(made, out)
-    told = {
+    results = {
         "benchmark": out, "animals": len(made.targets), "reliable": len(made.reliable),
         "animal_to_animal": made.a2a.mean, "sem": made.a2a.sem, "notes": made.notes,
     }  # fmt: skip
-    told_as_json(told, json)
+    told_as_json(results, json)
     for note in made.notes:
         warning = note.startswith("WARNING")
         typer.secho(note, err=True, fg="red" if warning else None, bold=warning)
@@ -136,7 +136,7 @@ def score_models(
         _write_report(results, page)
     for model in done:
         if not isfinite(model.score):
-            typer.echo(f"{model.name}: no score: {_why_none(results)}", err=True)
+            typer.echo(f"{model.name}: no score: {_explain_no_score(results)}", err=True)
     if not told_as_json(results, json):
         _show_scores(results)
 
@@ -226,8 +226,8 @@ def decode_stimuli(
         typer.echo(note, err=True)
     for target in targets:
         rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
-    told = [{"name": n, "variant": v or "balanced", **asdict(d)} for n, v, d in rows]
-    if not told_as_json(told, json):
+    records = [{"name": n, "variant": v or "balanced", **asdict(d)} for n, v, d in rows]
+    if not told_as_json(records, json):
         _show_decoded(rows)
 
 
@@ -239,7 +239,7 @@ def _write_report(results: "Results", path: Path) -> None:
         write_page(report_page(results), path)
 
 
-def _why_none(results: Any) -> str:
+def _explain_no_score(results: Any) -> str:
     b = results.benchmark
     reliable = len(b.reliable)
     if b.protocol == "strict" and reliable < 2:
@@ -259,17 +259,19 @@ def _show_scores(results: Any) -> None:
         chosen = [name for name in model.chosen if name]
         table.add_row(
             model.name,
-            f"{_said(model.score)} ± {_said(model.sem)}",
-            _said(model.p, 4),
-            _said(model.null_95),
-            _said(model.untrained.score) if model.untrained else "",
+            f"{_format(model.score)} ± {_format(model.sem)}",
+            _format(model.p, 4),
+            _format(model.null_95),
+            _format(model.untrained.score) if model.untrained else "",
             max(set(chosen), key=chosen.count) if chosen else "-",
         )
     raw, a2a = results.raw, results.benchmark.a2a
     if raw:
-        table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
-    table.add_row("animal to animal", f"{_said(a2a.mean)} ± {_said(a2a.sem)}")
-    table.add_row("its highest", _said(a2a.highest))
+        table.add_row(
+            "raw sensor input", f"{_format(raw.score)} ± {_format(raw.sem)}", _format(raw.p, 4)
+        )
+    table.add_row("animal to animal", f"{_format(a2a.mean)} ± {_format(a2a.sem)}")
+    table.add_row("its highest", _format(a2a.highest))
     print_table(table)
 
 
@@ -279,11 +281,11 @@ def _show_decoded(rows: list[tuple[str, str, Any]]) -> None:
     for name, variant, d in rows:
         table.add_row(
             f"{name} ({variant})" if variant else name,
-            *(_said(v) for v in (d.shape, d.shape_chance)), _said(d.shape_p, 3),
-            *(_said(v) for v in (d.distance, d.distance_chance)), _said(d.distance_p, 3),
+            *(_format(v) for v in (d.shape, d.shape_chance)), _format(d.shape_p, 3),
+            *(_format(v) for v in (d.distance, d.distance_chance)), _format(d.distance_p, 3),
         )  # fmt: skip
     print_table(table)
 
 
-def _said(value: float, digits: int = 2) -> str:
+def _format(value: float, digits: int = 2) -> str:
     return f"{value:.{digits}f}" if isfinite(value) else "-"

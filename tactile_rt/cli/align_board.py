@@ -1,4 +1,4 @@
-"""`tactile-rt align board`: models by datasets by metrics; the datasets, and how they are got."""
+"""`tactile-rt align board`, `datasets`, `fetch`: models by datasets by metrics."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -57,10 +57,10 @@ def fetch_recordings(
     if not dataset.listing:
         raise ConfigError(f"{name} cannot be fetched: download it, see `align datasets`")
     every = published_files(dataset.listing)
-    wanted = Selection(sessions=tuple(sessions or ()))
-    files = [file for file in every if wanted.takes(file.name)]
+    selection = Selection(sessions=tuple(sessions or ()))
+    files = [file for file in every if selection.takes(file.name)]
     if not files:
-        raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
+        raise ConfigError(f"no session of {len(every)} is of {selection}: --list names them")
     if listed:
         if not told_as_json(files, json):
             for file in files:
@@ -125,11 +125,11 @@ def write_board(
             find_metric(name)
         for name in parts:
             part_of((), name)
-        named = [_named(text) for text in data]
-        called = told_apart([name for name, _ in named], [path for _, path in named])
+        sources = [_parse_data(text) for text in data]
+        distinct = told_apart([name for name, _ in sources], [path for _, path in sources])
         datasets = [
             (replace(find_dataset(name), name=own), path)
-            for (name, path), own in zip(named, called, strict=True)
+            for (name, path), own in zip(sources, distinct, strict=True)
         ]
         felt = read_stimuli(stimuli)
         files = list(zip(models, check_models(models), strict=True))
@@ -142,9 +142,9 @@ def write_board(
                 names = read.animals[0].sessions[0].stimuli
                 if names != (first := first or names):
                     raise ConfigError(
-                        f"{path} is of other stimuli than {named[0][1]}: a board each"
+                        f"{path} is of other stimuli than {sources[0][1]}: a board each"
                     )
-                rows = _rows(files, read.stimuli or felt, seed, update, names)
+                rows = _make_rows(files, read.stimuli or felt, seed, update, names)
             with share_bar(f"scoring on {dataset.name}") as tell:
                 made = with_cells(rows, dataset, read.animals, parts, metrics, read.notes, tell)
             boards.append(made)
@@ -158,7 +158,7 @@ def write_board(
         _show(made)
 
 
-def _rows(
+def _make_rows(
     files: list[tuple[Path, str]],
     felt: "StimuliInput",
     seed: int,
@@ -173,7 +173,7 @@ def _rows(
         update(description=name)
         layers: Layers = load_layers(path, felt, names=stimuli)[0]
         before = load_untrained(path, felt, seed)
-        # The same network: a file keeps some of its numbers in other places than a checkpoint.
+        # The same network: an exported file stores some parameters elsewhere than a checkpoint.
         size = before.parameters if before else layers.parameters
         row = BoardRow(name, "model", layers.sha256, size, layers.notes)
         rows.append((row, traces_of(layers)))
@@ -185,7 +185,7 @@ def _rows(
     return rows
 
 
-def _named(text: str) -> tuple[str, Path]:
+def _parse_data(text: str) -> tuple[str, Path]:
     name, equals, path = text.partition("=")
     if not equals or not name or not path:
         raise ConfigError(f"--data is NAME=PATH, not {text!r}")

@@ -1,4 +1,4 @@
-"""`tactile-rt align gate`: may a model be released?"""
+"""`tactile-rt align gate`: test whether a model may be released."""
 
 import sys
 import traceback
@@ -18,17 +18,17 @@ from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, TactileError
 
 USAGE = 2  # click's exit code
-INPUT_ERROR = 3  # of the gate, whose 1 and 2 mean something else
+INPUT_ERROR = 3  # exit code of the gate, whose 1 and 2 mean fail and inconclusive
 
 
 class GateCommand(TyperCommand):
-    """A command whose misuse is an input error, not an inconclusive test."""
+    """A command whose usage errors are input errors, not inconclusive tests."""
 
     def make_context(self, *arguments: Any, **more: Any) -> Any:
         try:
             return super().make_context(*arguments, **more)
         except Exception as error:
-            # click's UsageError, which typer brings along under a name of its own.
+            # click's UsageError, of which typer has its own copy.
             if getattr(error, "exit_code", None) == USAGE:
                 error.exit_code = INPUT_ERROR  # type: ignore[attr-defined]
             raise
@@ -56,7 +56,7 @@ def gate_model(
     except (TactileError, OSError) as error:
         typer.secho(f"tactile-rt: {' '.join(str(error).splitlines())}", err=True, fg="red")
         code = INPUT_ERROR
-    except Exception:  # a mistake of ours: Python would leave with 1, a verdict
+    except Exception:  # a bug of ours: Python would exit with 1, which is a verdict
         traceback.print_exc()
         code = INPUT_ERROR
     sys.exit(code)
@@ -91,8 +91,8 @@ def _gate(
         rows: list[Any] = []
         if reference is not None:
             original, _ = load_layers(reference, felt)
-            of_onnx = model.suffix == ".onnx"
-            made = export_layers(model, felt, original) if of_onnx else load_layers(model, felt)[0]
+            is_onnx = model.suffix == ".onnx"
+            made = export_layers(model, felt, original) if is_onnx else load_layers(model, felt)[0]
             check, found = fidelity_check(original, made)
             checks.append(check)
             rows += found
@@ -101,9 +101,9 @@ def _gate(
             checks = [*neural_checks(score(frozen, patterns), frozen, before), *checks]
     code = exit_code(checks)
     colours = {"pass": "green", "fail": "bold red", "inconclusive": "yellow"}
-    told = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
+    verdicts = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
     taps = [asdict(row) for row in rows]
-    if told_as_json({"exit_code": code, "checks": told, "taps": taps}, json):
+    if told_as_json({"exit_code": code, "checks": verdicts, "taps": taps}, json):
         return code
     console = Console(soft_wrap=True)
     for check in checks:

@@ -1,4 +1,4 @@
-"""The application that every command adds itself to, and what commands share."""
+"""The Typer application that every command joins, and helpers that commands share."""
 
 import logging
 import os
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tactile_rt.core.stream import Source
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
-SLOW_WORK = "tactile_rt.sim_backend.objects"  # a logger
+SLOW_WORK = "tactile_rt.sim_backend.objects"  # its logger
 
 COLUMNS, BOXED = shutil.get_terminal_size().columns, 100
 
@@ -41,7 +41,7 @@ app = typer.Typer(
 )
 
 
-def _version(asked: bool) -> None:
+def _print_version(asked: bool) -> None:
     if asked:
         typer.echo(f"tactile-rt {VERSION}")
         raise typer.Exit
@@ -58,22 +58,21 @@ def add_group(name: str, help: str) -> typer.Typer:
 def _options(
     context: typer.Context,
     version: bool = typer.Option(
-        False, "--version", callback=_version, is_eager=True, help="Print the version."
+        False, "--version", callback=_print_version, is_eager=True, help="Print the version."
     ),
 ) -> None:
     if context.invoked_subcommand is None:
         typer.echo(WELCOME)
-    if sys.stderr.isatty():  # what takes seconds says so; a log file keeps clean
-        said = logging.getLogger(SLOW_WORK)
-        said.addHandler(logging.StreamHandler())
-        said.setLevel(logging.INFO)
-        said.propagate = False
+    if sys.stderr.isatty():  # a terminal shows what takes seconds; a log file stays clean
+        logger = logging.getLogger(SLOW_WORK)
+        logger.addHandler(logging.StreamHandler())
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
 
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """Let Ctrl-C end the block even where a library swallows it, as trimesh does while it is
-    imported, or makes another error of it."""
+    """Let Ctrl-C end the block even if a library swallows it or raises another error."""
     asked = False
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -86,13 +85,13 @@ def starting() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, note)
     try:
         yield
-    except Exception:
+    except Exception:  # raised by a library in place of Ctrl-C, if `asked`
         if asked:
             raise KeyboardInterrupt from None
         raise
     finally:
         signal.signal(signal.SIGINT, before)
-    if asked:
+    if asked:  # swallowed, as by trimesh while it is imported
         raise KeyboardInterrupt
 
 
@@ -106,20 +105,19 @@ def open_url(url: str) -> "Source":
 
 @contextmanager
 def needing(extra: str) -> Iterator[None]:
-    """Let the block import what an extra brings; say which where it is missing."""
+    """Let the block import packages of an extra; name the extra if one is missing."""
     with require_extra("this needs", extra), starting():
         yield
 
 
 @contextmanager
 def leaving(seconds: float | None) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM, a closed terminal or output pipe, or the clock end the block, and go on
-    after it."""
-    alike = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup has it
-        alike.append(signal.SIGHUP)
-    before = [signal.signal(s, signal.default_int_handler) for s in alike]
-    # A timer, not a look at the stream's clock: a silent device must not keep us waiting.
+    """Leave the block without an error at Ctrl-C, SIGTERM, hangup, broken pipe or timeout."""
+    handled = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup sets it
+        handled.append(signal.SIGHUP)
+    before = [signal.signal(s, signal.default_int_handler) for s in handled]
+    # A timer, not the stream's clock: a silent device must not keep us waiting.
     signal.setitimer(signal.ITIMER_REAL, seconds or 0)
     try:
         yield
@@ -130,7 +128,7 @@ def leaving(seconds: float | None) -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        for s, handler in zip(alike, before, strict=True):
+        for s, handler in zip(handled, before, strict=True):
             signal.signal(s, handler)
 
 
@@ -138,7 +136,7 @@ def check_output(file: Path | None) -> None:
     """Refuse a file that cannot be written, now rather than after minutes of work.
 
     Raises:
-        ConfigError: it is a folder, or the folder that it goes into is not there or not one's own.
+        ConfigError: it is a folder, or the folder around it is missing or not writable.
     """
     if file is None:
         return
@@ -151,10 +149,10 @@ def check_output(file: Path | None) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder that nothing can be written into, now rather than after seconds of work.
+    """Refuse a folder that is not writable, now rather than after seconds of work.
 
     Raises:
-        ConfigError: it is a file, or it, or the one that it would be made in, is not one's own.
+        ConfigError: it is a file, or it or its nearest existing parent is not writable.
     """
     above = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
     if not above.is_dir():
@@ -164,7 +162,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_text(*names: Path | None) -> None:
-    """Refuse names of files that are no UTF-8, which cannot stand in another file."""
+    """Refuse file names that are not UTF-8, which cannot be written into another file."""
     for name in filter(None, names):
         try:
             str(name).encode()
@@ -173,14 +171,14 @@ def check_text(*names: Path | None) -> None:
 
 
 def check_named_once(file: Path) -> None:
-    """Refuse to write a file that two words of the command line name, see `_files`."""
+    """Refuse to write a file that two arguments of the command line name."""
     where = file.resolve()
-    if sum(where in _files(word) for word in sys.argv[1:]) > 1:
+    if sum(where in _list_files(word) for word in sys.argv[1:]) > 1:
         raise ConfigError(f"{file} is another file of this command: name a new one")
 
 
-def _files(word: str) -> set[Path]:
-    """What files a word may name: alone, as an option, or in a URL."""
+def _list_files(word: str) -> set[Path]:
+    """Return the files that an argument may name: alone, in an option or URL."""
     parts = (word, *map(unquote, re.split("[:?&=@,]", word)))
     return {Path(part).resolve() for part in parts if part and "\0" not in part}
 
@@ -192,11 +190,11 @@ def check_is_mcap(file: Path) -> None:
 
 
 def check_new(file: Path, force: bool) -> None:
-    """Refuse to write over a file that is there, that is read, or that is just being recorded.
+    """Refuse to overwrite a file that exists, is an input or is being recorded.
 
     Raises:
-        ConfigError: as `check_output`; it is there, and not to be replaced; the command line names
-            it twice; or some process is recording into it.
+        ConfigError: as `check_output`; or the file exists without ``force``, the command line
+            names it twice, or a process is recording into it.
     """
     check_output(file)
     if not file.exists():

@@ -1,4 +1,4 @@
-"""`tactile-rt array`: arrays by name; a device measured, and its description brought to that."""
+"""`tactile-rt array`: list named arrays, and fit an array's file to measurements."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,7 +77,7 @@ def fit(
     from tactile_rt.core.stream import concatenate
 
     with open_url(url) as source:
-        read_described(described, source.spec)  # a mistake is told before the reading
+        read_described(described, source.spec)  # reports a mistake before samples are read
         chunks = record(source, seconds)
         fitted = fit_array(described, source.spec, concatenate(chunks))
     if not told_as_json(

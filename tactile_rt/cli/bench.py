@@ -1,6 +1,6 @@
-"""`tactile-rt bench`: measure this installation and compare with what is promised.
+"""`tactile-rt bench`: measure this installation and compare with the stated limits.
 
-What measures stands beside the package in a checkout, in `bench/AREA/area.py`, and in no wheel.
+The measuring code is in `bench/AREA/area.py` of a checkout, and in no wheel.
 """
 
 import sys
@@ -28,7 +28,7 @@ AREAS = {
 }
 
 
-FAULTS = "faults"  # of the daemon's world; takes hours
+FAULTS = "faults"  # of the daemon's surroundings; takes hours
 
 
 @app.command(epilog="tactile-rt bench inference --quick")
@@ -54,23 +54,23 @@ def bench(
         with progress_bar(f"measuring {name}"):
             with needing(AREAS.get(name, "train")):
                 if name == FAULTS:
-                    rig = _rig("daemon", "faults")
+                    rig = _load_rig("daemon", "faults")
                     records += rig.faults(2 if quick else rig.TIMES, resume=resume)
                 else:
-                    records += _rig(name).run(quick)
+                    records += _load_rig(name).run(quick)
     if show_records(records, json):
         return
     bars = [r for r in records if r.bar]
     typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} bars met")
 
 
-def _rig(area: str, module: str = "area") -> Any:
-    """Import the module that measures an area, or some of it, from the checkout."""
-    if not (CHECKOUT / "bench" / area / "area.py").is_file():  # a `bench` of others may be there
+def _load_rig(area: str, module: str = "area") -> Any:
+    """Import the module that measures an area, or a part of it, from the checkout."""
+    if not (CHECKOUT / "bench" / area / "area.py").is_file():  # another `bench` may exist
         raise ConfigError(
             f"bench {area} measures from a checkout (pip install --editable): "
             f"{Path(__file__).parents[1]} was installed without its rigs"
         )
     if sys.path[0] != str(CHECKOUT):
-        sys.path.insert(0, str(CHECKOUT))  # first, lest that `bench` be imported
+        sys.path.insert(0, str(CHECKOUT))  # first, or another `bench` is imported
     return import_module(f"bench.{area}.{module}")

@@ -1,4 +1,4 @@
-"""`tactile-rt tare` and `calibrate`: what a device needs to read in newtons, kept by its id."""
+"""`tactile-rt tare` and `calibrate`: measure a device's calibration and store it by its id."""
 
 import re
 from datetime import UTC, datetime
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tactile_rt.calibration import Calibration, Fit, LoadTable, Tare
     from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
-LOUDER = 3.0  # noise over that of the last tare that is worth a word
+LOUDER = 3.0  # times the noise of the last tare: more prints a warning
 
 Out = Annotated[Path | None, option("TOML file to write or update. Default: the device's own.")]
 Device = Annotated[str, option("Id of the device. Default: the id that it reports.")]
@@ -46,17 +46,17 @@ def tare(
     check_output(out)
     with open_url(source) as opened:
         raw, before = _find_raw(opened, source)
-        name = device or (before.device if before else _own_id(raw))
+        name = device or (before.device if before else _find_id(raw))
         path = out or calibration_path(name)
-        known = _existing(path, device) or before or Calibration.of(name, raw.spec)
-        known.output_spec(raw.spec)  # refuses another array now, not after the reading
+        known = _load_existing(path, device) or before or Calibration.of(name, raw.spec)
+        known.output_spec(raw.spec)  # refuses another array before samples are read
         with progress_bar(f"do not touch {raw.spec.name}"):
             measured = measure(raw, seconds)
     untared = set(measured.untared)
     tared = [i for i, e in enumerate(raw.spec.elements) if e not in untared]
-    new = {raw.spec.elements[i]: _digits(measured.offset[i]) for i in tared}
-    noise = {raw.spec.elements[i]: _digits(measured.noise[i]) for i in tared}
-    louder = [e for e in noise if _louder(noise[e], known.noise.get(e, ()))]
+    new = {raw.spec.elements[i]: _round_row(measured.offset[i]) for i in tared}
+    noise = {raw.spec.elements[i]: _round_row(measured.noise[i]) for i in tared}
+    louder = [e for e in noise if _is_louder(noise[e], known.noise.get(e, ()))]
     known = known.noted(
         f"{_now()} tare: {measured.seconds:.3g} s, {measured.samples.max()} samples",
         tare={**known.tare, **new},
@@ -64,12 +64,12 @@ def tare(
         changes=round(measured.changes, 4),
     )
     save_calibration(known, path if out else None)
-    told = {
+    results = {
         "device": known.device, "file": path, "seconds": measured.seconds,
         "channels": raw.spec.channels, "units": raw.spec.units, "offset": new, "noise": noise,
         "untared": measured.untared, "louder": louder,
     }  # fmt: skip
-    if not told_as_json(told, json):
+    if not told_as_json(results, json):
         _show_tare(measured)
     if untared:
         typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
@@ -108,9 +108,9 @@ def calibrate(
     check_output(out)
     loads = read_loads(table)
     path = out or (calibration_path(device) if device else None)
-    known = _existing(path, device) if path else None
+    known = _load_existing(path, device) if path else None
     if len(loads.times):
-        recorded, spec = _recorded(table, loads, source)
+        recorded, spec = _read_samples(table, loads, source)
         fresh = Calibration.of(device or (path.stem if path else "unnamed"), spec)
     elif source:
         raise ConfigError(f"{table} has readings of its own: leave out --source")
@@ -130,35 +130,35 @@ def calibrate(
             raw = raw_readings(loads, recorded, spec, element)
         else:
             raw = loads.raw
-        raw = raw[:, _order(fresh.channels, target)]
+        raw = raw[:, _match_channels(fresh.channels, target)]
         fit = fit_loads(raw, loads.loads, loads.axes, target.channels)
     except ConfigError as error:
         raise ConfigError(f"{table}: {error}") from None
     made = None
     if path:
-        made = _with_fit(target, element, fit, loads, table)
+        made = _add_fit(target, element, fit, loads, table)
         save_calibration(made, path if out else None)
-    told = {
+    results = {
         "device": target.device, "element": element, "file": path, "units": loads.units,
         "lines": loads.lines, **vars(fit),
     }  # fmt: skip
-    if not told_as_json(told, json):
+    if not told_as_json(results, json):
         _show_fit(fit, loads)
     if made:
         _show_uncalibrated(made)
-        said = f"matrix of {made.device}, element {element}, written to {path}"
+        message = f"matrix of {made.device}, element {element}, written to {path}"
     else:
-        said = "not written: name a --device or a file (--out)"
-    typer.echo(said, err=json == STDOUT)
+        message = "not written: name a --device or a file (--out)"
+    typer.echo(message, err=json == STDOUT)
 
 
-def _own_id(source: "Source") -> str:
-    """What a device calls itself; of one that has no id, what its array is called."""
+def _find_id(source: "Source") -> str:
+    """Return a device's id, else its array's name, as a valid file name."""
     own = str(getattr(source, "device_id", "") or source.spec.name)
     return re.sub(r"[^\w.:+-]+", "-", own).lstrip(".")
 
 
-def _existing(path: Path, device: str) -> "Calibration | None":
+def _load_existing(path: Path, device: str) -> "Calibration | None":
     from tactile_rt.calibration import load_calibration
 
     if not path.exists():
@@ -169,8 +169,8 @@ def _existing(path: Path, device: str) -> "Calibration | None":
     return known
 
 
-def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
-    """The raw samples that the times of a table are of."""
+def _read_samples(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
+    """Return the raw samples up to the last time of a table, and their array."""
     from tactile_rt.calibration.tare_measurement import record
     from tactile_rt.core.stream import concatenate
 
@@ -193,8 +193,8 @@ def _find_raw(source: "Source", url: str) -> "tuple[Source, Calibration | None]"
     return source, known
 
 
-def _order(channels: tuple[str, ...], known: "Calibration") -> list[int]:
-    """Find where each raw channel of a device is among those of the table."""
+def _match_channels(channels: tuple[str, ...], known: "Calibration") -> list[int]:
+    """Return the column in the table of each raw channel of a device."""
     for channel in (*known.channels, *channels):
         if channel in channels and channel in known.channels:
             continue
@@ -203,7 +203,7 @@ def _order(channels: tuple[str, ...], known: "Calibration") -> list[int]:
     return [channels.index(c) for c in known.channels]
 
 
-def _with_fit(
+def _add_fit(
     known: "Calibration", element: str, fit: "Fit", loads: "LoadTable", table: Path
 ) -> "Calibration":
     if element not in known.elements:
@@ -220,17 +220,17 @@ def _with_fit(
         output_channels=loads.axes,
         output_units=loads.units,
         gain=known.gain if len(known.channels) == len(loads.axes) else (),
-        tare={**known.tare, element: _digits(fit.tare)},
-        matrices={**known.matrices, element: tuple(map(_digits, fit.matrix))},
+        tare={**known.tare, element: _round_row(fit.tare)},
+        matrices={**known.matrices, element: tuple(map(_round_row, fit.matrix))},
     )
 
 
-def _digits(row: "NDArray[np.float64]") -> tuple[float, ...]:
-    # as many as float32 holds and two more: people read the file
+def _round_row(row: "NDArray[np.float64]") -> tuple[float, ...]:
+    # two digits more than float32 holds: people read the file
     return tuple(float(f"{v:.9g}") for v in row)
 
 
-def _louder(noise: tuple[float, ...], before: tuple[float, ...]) -> bool:
+def _is_louder(noise: tuple[float, ...], before: tuple[float, ...]) -> bool:
     return any(now > LOUDER * then > 0 for now, then in zip(noise, before, strict=False))
 
 
@@ -242,9 +242,9 @@ def _show_tare(measured: "Tare") -> None:
     import numpy as np
 
     spec = measured.spec
-    counted = np.array([e not in measured.untared for e in spec.elements])
-    offset, noise = measured.offset[counted], measured.noise[counted]
-    names = [e for e, there in zip(spec.elements, counted, strict=True) if there]
+    tared = np.array([e not in measured.untared for e in spec.elements])
+    offset, noise = measured.offset[tared], measured.noise[tared]
+    names = [e for e, use in zip(spec.elements, tared, strict=True) if use]
     table = Table("channel", "unit", "offset", "noise (median)", "noisiest", box=None)
     for c, (channel, unit) in enumerate(zip(spec.channels, spec.units, strict=True)):
         low, high = offset[:, c].min(), offset[:, c].max()

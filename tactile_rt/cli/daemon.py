@@ -1,4 +1,4 @@
-"""`tactile-rt run`, `config` and `install-service`: the onboard daemon, and a classifier alone."""
+"""`tactile-rt run`, `config` and `install-service`: the onboard daemon, or a classifier alone."""
 
 import re
 import shlex
@@ -131,14 +131,14 @@ def run(
                         "object_touches": d.object_touches,
                         "latency_ms": round(1e3 * d.latency_s, 3),
                     }
-                    typer.echo(msgspec.json.encode(fields))  # which flushes
+                    typer.echo(msgspec.json.encode(fields))  # echo flushes
                     printed += 1
     dropped = session.dropped + opened.stats.dropped
     typer.echo(f"{samples} samples, {printed} decisions, {dropped} dropped", err=True)
 
 
 def _serve(file: Path, sets: list[str], seconds: float | None) -> None:
-    """Run the daemon; leaves the process with its exit code."""
+    """Run the daemon, then end the process with its exit code."""
     from tactile_rt.core.locks import AlreadyRunning
     from tactile_rt.daemon.process import ExitCode, leave, run_daemon
 
@@ -197,7 +197,7 @@ def example(
     """Write an example configuration that explains every key."""
     from tactile_rt.daemon.config import EXAMPLE
 
-    _give(EXAMPLE, output, f"run it with: tactile-rt run {shlex.quote(str(output))}")
+    _print_or_write(EXAMPLE, output, f"run it with: tactile-rt run {shlex.quote(str(output))}")
 
 
 @config.command(epilog="tactile-rt config alerts alerts.yml")
@@ -207,7 +207,7 @@ def alerts(
     """Write Prometheus alert rules for a daemon that serves metrics."""
     from tactile_rt.daemon.metrics import ALERTS
 
-    _give(ALERTS.read_text("utf-8"), output, "name it under rule_files of prometheus.yml")
+    _print_or_write(ALERTS.read_text("utf-8"), output, "name it under rule_files of prometheus.yml")
 
 
 @config.command("ros2-messages", epilog="tactile-rt config ros2-messages ws/src")
@@ -225,13 +225,13 @@ def ros2_messages(
         raise ConfigError(f"no folder {folder}")
     if made.exists():
         raise ConfigError(f"{made} is there already")
-    with whole_folder(made) as there:
-        shutil.copytree(PACKAGE, there, dirs_exist_ok=True)
+    with whole_folder(made) as unfinished:
+        shutil.copytree(PACKAGE, unfinished, dirs_exist_ok=True)
     typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
 
 
-def _give(text: str, output: Path | None, then: str) -> None:
-    """Print a text, or write it to where there is nothing yet."""
+def _print_or_write(text: str, output: Path | None, then: str) -> None:
+    """Print a text, or write it into a new file."""
     check_output(output)
     if output is None:
         typer.echo(text, nl=False)
@@ -271,7 +271,7 @@ def install_service(
     check_folders(loaded, user)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out} is there already: name a new folder with --out")
-    program, path = _program(), str(file.absolute())
+    program, path = _find_program(), str(file.absolute())
     unit = unit_text([*program, "run", path], loaded.config, user)
     again = [*program, "install-service", path, "--user", user]
     script = install_script(UNIT, again, user)
@@ -286,8 +286,8 @@ def install_service(
     typer.echo(f"read them, then: sudo sh {shlex.quote(str(out / 'install.sh'))}")
 
 
-def _program() -> list[str]:
-    """How this program is started, whatever the folder and the environment."""
+def _find_program() -> list[str]:
+    """Return the words that start this program in any folder and environment."""
     script = Path(sys.executable).with_name("tactile-rt")
     if script.exists():
         return [str(script)]

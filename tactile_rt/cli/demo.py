@@ -1,7 +1,7 @@
 """`tactile-rt demo`: objects sweep past whiskers and every guess is scored.
 
-The whiskers are simulated; where nothing can be, an emulated device on a serial port plays a
-recording of theirs. The view takes 80 columns and 22 lines of a terminal. Every coloured cell sets
+The whiskers are simulated; without a simulator, an emulated device on a serial port plays a
+recording of them. The view takes 80 columns and 22 lines of a terminal. Every coloured cell sets
 its own background and text colour, so that it reads alike on dark and on light terminals.
 """
 
@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 WIDTH = 80
 HEIGHT = 15  # of the upper panels
-DROPPED = 0.02  # share of the samples from which on the score says little of the model
+DROPPED = 0.02  # share of lost samples above which the score says little about the model
 REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
 END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
-LATENCIES_KEPT = 10_000  # steps that the latency percentiles look back on: a demo may run for days
+LATENCIES_KEPT = 10_000  # newest steps in the latency percentiles: a demo may run for days
 
 # Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises
 # evenly, from a grey for "untouched".
@@ -60,13 +60,13 @@ GREEN, RED, GREY = "#2f9e62", "#d64545", "#8a8fa3"
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """One object that has passed, and what the model took it for."""
+    """An object that has passed, and the model's decision on it."""
 
     name: str
     category: str
     said: str | None = None  # None: it passed without a decision
     probability: float = 0.0
-    names: tuple[str, ...] = ()  # kinds of that class that it may be
+    names: tuple[str, ...] = ()  # possible kinds within that class
 
     @property
     def right(self) -> bool:
@@ -81,14 +81,14 @@ class SweepOutcome:
 
 
 def describe(label: str, names: Sequence[str]) -> str:
-    """Return a class with the kinds of it that are possible: other (birdcage, ladder)."""
+    """Return a class with its possible kinds, such as: other (birdcage, ladder)."""
     more = ", ..." if len(names) > MOST_NAMES else ""
     return f"{label} ({', '.join(names[:MOST_NAMES])}{more})" if names else label
 
 
 @dataclass(frozen=True)
 class RecordedPass:
-    """An object that passes in the recording; it starts ns after the first sample."""
+    """An object's pass in the recording; `start_ns` counts from the first sample."""
 
     start_ns: int
     name: str
@@ -129,12 +129,12 @@ def demo(
                     typer.echo(outcome.line(), err=json == STDOUT)
         else:
             watch(demonstration, console)
-    told = {
+    results = {
         "outcomes": demonstration.outcomes, "right": demonstration.right,
         "latency_p50_ms": demonstration.latency_ms(50),
         "latency_p99_ms": demonstration.latency_ms(99), "dropped": demonstration.dropped,
     }  # fmt: skip
-    if not told_as_json(told, json):
+    if not told_as_json(results, json):
         typer.echo(demonstration.summary())
     late = demonstration.dropped / max(1.0, demonstration.samples)
     if late > DROPPED:
@@ -147,11 +147,11 @@ def demo(
 
 
 class Demonstration:
-    """Run a model on the simulated or recorded array, and keep the score.
+    """A model that runs on the simulated or recorded array, and its score.
 
     The score counts objects, not touches: only the first episode of each object's pass, by its
     final decision. An episode belongs to the pass in which it began, even if its last steps come
-    while the next object is still on its way. An object whose pass brings no decision is wrong.
+    while the next object approaches. An object whose pass brings no decision is wrong.
 
     Args:
         model: an ``.onnx`` file made for the mouse array.
@@ -173,7 +173,7 @@ class Demonstration:
         self.recorded = recorded
         self.passes: Sequence[Any]  # each with start_ns, name and category
         self._device = ExitStack()
-        self._ends_ns = sys.maxsize  # stream time from the first sample at which it is over
+        self._ends_ns = sys.maxsize  # end of the demo: stream time from the first sample
         if recorded:
             self._source = self._open_recording(sweeps)
         else:
@@ -181,7 +181,7 @@ class Demonstration:
 
             unseen = load_model(model)[1].provenance.get("unseen_objects", [])
             options = SimOptions(
-                objects=",".join(unseen),  # none listed: the first one of every category
+                objects=",".join(unseen),  # empty: the first object of every category
                 sweeps=sweeps,
                 seed=seed,
                 pace="fast" if fast else "realtime",
@@ -191,7 +191,7 @@ class Demonstration:
         self.classifier = Classifier(model, self._source.spec)
         self._class_of = self.classifier.card.class_of
         self._session = Session(self._source, self.classifier)
-        self.target: Any = None  # what `decision` is about
+        self.target: Any = None  # the pass that `decision` is about
         self.decision: Classification | None = None  # the latest
         self.outcomes: list[SweepOutcome] = []  # of the objects that have passed, in order
         self._latencies: deque[float] = deque(maxlen=LATENCIES_KEPT)
@@ -208,8 +208,8 @@ class Demonstration:
 
         recording = Recording(DEMO)
         notes = recording.description.session
-        told = [note.split() for name, note in notes.items() if name.startswith("pass_")]
-        passes = [RecordedPass(int(start), name, category) for start, name, category in told]
+        fields = [note.split() for name, note in notes.items() if name.startswith("pass_")]
+        passes = [RecordedPass(int(start), name, category) for start, name, category in fields]
         chunks = list(recording)
         last = int(chunks[-1].t_ns[-1] - chunks[0].t_ns[0])
         ends = [p.start_ns for p in passes[1:]] + [last - END_NS]
@@ -220,7 +220,7 @@ class Demonstration:
         return open_source(device.url)
 
     def run(self) -> Iterator[list[SweepOutcome]]:
-        """Run to the end; yields after every chunk the outcomes that it has settled."""
+        """Run to the end; after every chunk, yield the outcomes that it has settled."""
         from tactile_rt.core.stream import NS_PER_S
 
         for chunk, decisions in self._session:
@@ -238,7 +238,7 @@ class Demonstration:
             if self._now_ns - self._base_ns >= self._ends_ns:
                 break
         settled = len(self.outcomes)
-        self._miss_before(len(self.passes))
+        self._settle_missed(len(self.passes))
         yield self.outcomes[settled:]
 
     @property
@@ -253,12 +253,12 @@ class Demonstration:
 
     @property
     def samples(self) -> float:
-        """Number of samples in that time."""
+        """Number of samples in `stream_s` at the nominal rate."""
         return self.stream_s * self._source.spec.rate_hz
 
     @property
     def dropped(self) -> int:
-        """Number of samples for which the classifier was too late."""
+        """Number of samples dropped because they were not taken in time."""
         return self._session.dropped + self._source.stats.dropped
 
     def latency_ms(self, percentile: float) -> float:
@@ -281,13 +281,13 @@ class Demonstration:
         onset_ns = decision.onset_ns - self._base_ns
         number = bisect_right(self.passes, onset_ns, key=lambda p: p.start_ns) - 1
         if number < len(self.outcomes):
-            return  # touched again after its first episode, which alone counts
-        self._miss_before(number)
+            return  # touched again: only the first episode counts
+        self._settle_missed(number)
         self.target, self.decision = self.passes[number], decision
         if decision.final:
             self._settle(self.target, decision.label, decision.probability, decision.names)
 
-    def _miss_before(self, number: int) -> None:
+    def _settle_missed(self, number: int) -> None:
         for missed in self.passes[len(self.outcomes) : number]:
             self._settle(missed)
 
@@ -295,7 +295,7 @@ class Demonstration:
         self.outcomes.append(SweepOutcome(passed.name, self.true_class(passed), *decision))
 
     def true_class(self, passed: Any) -> str:
-        """Return the class that an object is of: a shape, where the model answers shapes."""
+        """Return the class of a pass: a shape, if the model's classes are shapes."""
         return str(self._class_of.get(passed.category, passed.category))
 
     def __enter__(self) -> Self:
@@ -358,7 +358,7 @@ def _draw_forces(demo: Demonstration) -> Text:
 
 
 def _draw_guess(demo: Demonstration) -> Text:
-    """Draw what is passing, the five likeliest classes, and whether that is right."""
+    """Draw the passing object, the five likeliest classes and the verdict."""
     detector = demo.classifier.detector
     state = "touching" if detector.contact else "nothing touched"
     text = Text(f"whiskers  {state if detector.ready else 'measuring at rest'}\n", no_wrap=True)
@@ -388,7 +388,7 @@ def _draw_score(demo: Demonstration) -> Text:
     how = "of a recording" if demo.recorded else "simulated"
     text.append(f"{demo.stream_s:.0f} s {how}; blind guessing: {blind:.0f} %\nlatest ", GREY)
     for outcome in reversed(demo.outcomes[-8:]):
-        said = "" if outcome.right else f" (said {outcome.said or 'nothing'})"
+        mistake = "" if outcome.right else f" (said {outcome.said or 'nothing'})"
         text.append("✓ " if outcome.right else "✗ ", GREEN if outcome.right else RED)
-        text.append(f"{outcome.category}{said}  ")
+        text.append(f"{outcome.category}{mistake}  ")
     return text

@@ -1,4 +1,4 @@
-"""`tactile-rt list`, `doctor`, `codecs`, `describe`, `echo`, `hz`, `dump`: looking at devices."""
+"""`tactile-rt list`, `doctor`, `codecs`, `describe`, `echo`, `hz`, `dump`: look at devices."""
 
 import math
 import re
@@ -14,7 +14,7 @@ from tactile_rt.cli.options import STDOUT, Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import show_table, told_as_json
 
 WINDOW_S = 1.0
-LOG_BYTES = 1 << 16  # of its end, in which the newest warning is looked for
+LOG_BYTES = 1 << 16  # of a log's end that are searched for the newest warning
 
 
 @app.command("list", epilog="tactile-rt list")
@@ -137,10 +137,10 @@ def codecs(
     from tactile_rt.drivers.catalogue import CODECS, FRAMES
 
     if frame:
-        described = {path.stem: path for path in sorted(FRAMES.glob("*.toml"))}
-        if frame not in described:
-            raise ConfigError(no_such("described frame", frame, described))
-        typer.echo(described[frame].read_text("utf-8"), nl=False)
+        frames = {path.stem: path for path in sorted(FRAMES.glob("*.toml"))}
+        if frame not in frames:
+            raise ConfigError(no_such("described frame", frame, frames))
+        typer.echo(frames[frame].read_text("utf-8"), nl=False)
         return
     names = sorted({name for _, name in CODECS})
     if codec and codec not in names:
@@ -150,7 +150,7 @@ def codecs(
         for wire, name in sorted(CODECS, key=lambda key: key[::-1])
         if codec in ("", name)
     ]
-    if codec or json is not None:  # which takes their classes
+    if codec or json is not None:  # imports the classes of the codecs
         from tactile_rt.drivers.codec import codec_class
 
         for one in found:
@@ -214,7 +214,7 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
         spec = opened.spec
         shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
         typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz", err=json == STDOUT)
-        np.quantile([0.0], 0.5)  # the first takes a while, in which samples would wait
+        np.quantile([0.0], 0.5)  # the first call is slow, and samples would wait for it
         ends, ended = time.monotonic() + (seconds or math.inf), False
         while not ended and (began := time.monotonic()) < ends:
             until, n, late = min(began + WINDOW_S, ends), 0, []

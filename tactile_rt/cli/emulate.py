@@ -24,8 +24,8 @@ ProjectFolder = Annotated[
     Path | None, option("Folder of `tactile-rt new`: its array, device and model.")
 ]
 
-LOOK_S = 0.25  # how often the count is renewed
-SWEEPS = 6  # of `hil`, unless told otherwise
+LOOK_S = 0.25  # between updates of the count
+SWEEPS = 6  # default of `hil`
 LINGER_S = 0.5  # for the host to read the last samples before the port disappears
 
 
@@ -89,10 +89,10 @@ def emulate(
         raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
-    speed = "baud" if wire == "serial" else "bitrate"  # of the line, unless the codec has such one
+    speed = "baud" if wire == "serial" else "bitrate"  # of the line, unless the codec has it, too
     known = codec_class("serial" if wire == "serial" else "can", codec).Options
     own = {k: v for k, v in fields.items() if k != speed or k in known.__dataclass_fields__}
-    make_codec("serial" if wire == "serial" else "can", codec, own)  # refused before the rest
+    make_codec("serial" if wire == "serial" else "can", codec, own)  # refuses wrong options early
     further: dict[str, Any] = {
         "options": fields,
         "faults": read_faults(faults) if faults else None,
@@ -113,14 +113,14 @@ def emulate(
                 typer.echo("a virtual bus is seen inside its own process only", err=True)
             _watch(device)
     if device is not None:
-        typer.echo(_count(device), err=True)
+        typer.echo(_describe_counts(device), err=True)
 
 
 def open_project(folder: Path) -> "Project":
     """Open the folder of a project.
 
     Raises:
-        TactileError: it is none, or the extra that it needs is not installed.
+        TactileError: it is no project, or the extra that it needs is not installed.
     """
     with needing("sim"):
         from tactile_rt.project.folder import Project
@@ -145,14 +145,14 @@ def _watch(device: "EmulatedDevice") -> None:
     if console.is_terminal:
         with console.status("") as status:
             while not device.wait(LOOK_S):
-                there = "" if device.endpoint.heard else ", nobody listens"
-                status.update(_count(device) + there)
+                note = "" if device.endpoint.heard else ", nobody listens"
+                status.update(_describe_counts(device) + note)
     else:
         device.wait()
     time.sleep(LINGER_S)
 
 
-def _count(device: "EmulatedDevice") -> str:
+def _describe_counts(device: "EmulatedDevice") -> str:
     log = device.log
     counts = {fate.name.lower(): n for fate, n in sorted(log.counts.items()) if n}
     counts |= {"copies": log.duplicated} if log.duplicated else {}
@@ -223,11 +223,11 @@ def hil(
     with leaving(None), progress_bar(f"{codec} over {wire}"):
         loop.run()
     report = loop.report()
-    told = {
+    results = {
         "source": source, "wire": wire, "codec": codec, "complete": loop.complete,
         "failure": report.failure, **vars(report),
     }  # fmt: skip
-    if not told_as_json(told, json):
+    if not told_as_json(results, json):
         print_table(_make_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
         typer.echo("interrupted: what was on its way is missing above", err=True)
@@ -238,20 +238,20 @@ def hil(
 
 
 def _find_model(project: "Project") -> Path:
-    """Find the model that a project has made; say if its array has changed since."""
+    """Return a project's model file; print a note if its array has changed."""
     from tactile_rt.project.budget import read_budget
 
     if not project.model.exists():
         raise ConfigError(f"{project.folder} has no model yet: `tactile-rt make {project.folder}`")
     try:
         read_budget(project)
-    except ConfigError as error:  # as when the array has been fitted to the device since
+    except ConfigError as error:  # such as: the array has since been fitted to the device
         typer.echo(f"{error}; until then the model is the one made before", err=True)
     return project.model
 
 
 def _add_option(url: str, name: str, value: str) -> str:
-    """The URL with this option, unless it has one."""
+    """Return the URL with this option added, unless the URL has it."""
     _, mark, query = url.partition("?")
     if any(key == name for key, _ in parse_qsl(query, keep_blank_values=True)):
         return url

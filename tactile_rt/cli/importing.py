@@ -1,4 +1,4 @@
-"""`tactile-rt import`: logs, tables and bags of others, as recordings."""
+"""`tactile-rt import`: make recordings from logs, tables and bags of other programs."""
 
 import os
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 PICTURES: Final = (".png", ".svg", ".pdf")
 ROWS, NAMED, NOTES = 12, 8, 4  # channels, elements in the legend, notes that are drawn
-BINS, PAUSE = 2000, 5  # stretches of time, each drawn by its extremes; typical steps
+BINS, PAUSE = 2000, 5  # stretches of time, drawn by their extremes; steps that make a gap
 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
@@ -79,7 +79,7 @@ def import_file(
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
     with ExitStack() as stack:
         target = output
-        if strict:  # hidden until it is known to be good
+        if strict:  # hidden until it is known to be in order
             hidden = stack.enter_context(TemporaryDirectory(prefix=".", dir=output.parent))
             target = Path(hidden) / output.name
         with starting(), progress_bar(f"reading {log}"):
@@ -137,10 +137,10 @@ def _list_odd(made: "Import") -> list[str]:
 
 
 def codec_fields(text: str, option: str) -> dict[str, str]:
-    """The options of ``codec=NAME&OPTION=VALUE``, written as in a URL.
+    """Split ``codec=NAME&OPTION=VALUE``, written as in a URL, into fields.
 
     Raises:
-        ConfigError: one is given twice, or no codec.
+        ConfigError: an option is given twice, or the codec is missing.
     """
     pairs = parse_qsl(text.replace("+", "%2B"), keep_blank_values=True)
     fields = dict(pairs)
@@ -150,7 +150,7 @@ def codec_fields(text: str, option: str) -> dict[str, str]:
 
 
 def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> None:
-    """Draw the samples of a recording that was imported."""
+    """Draw the samples of an imported recording, with gaps, invalid samples and notes."""
     import numpy as np
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""`tactile-rt label`: recordings become a sweep set."""
+"""`tactile-rt label`: make a sweep set from recordings."""
 
 import shlex
 from pathlib import Path
@@ -55,8 +55,8 @@ def label(
         raise ConfigError(f"no OUT: name the folder of the sweep set after {folder}")
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
-    check_text(*recordings, folder, labels, like)  # which the manifest tells
-    parts = _shares(shares)
+    check_text(*recordings, folder, labels, like)  # the manifest names them
+    parts = _parse_shares(shares)
     _check_out(folder, force)
     check_folder(folder)
     beside = (one.parent / LABELS for one in recordings)
@@ -95,12 +95,12 @@ def label(
         },
         json,
     )  # fmt: skip
-    told = ", ".join(f"{name} {n}" for name, n in counts.items())
-    used = f"{len(touches.used)} of {touches.found.total()} touches ({told})"
+    classes = ", ".join(f"{name} {n}" for name, n in counts.items())
+    used = f"{len(touches.used)} of {touches.found.total()} touches ({classes})"
     typer.echo(f"{folder}: {used}; objects: {sides}", err=True)
 
 
-def _shares(text: str) -> tuple[float, ...]:
+def _parse_shares(text: str) -> tuple[float, ...]:
     from tactile_rt.recording.labelled_set import check_shares
 
     try:
@@ -114,7 +114,7 @@ def _shares(text: str) -> tuple[float, ...]:
 
 
 def _check_out(folder: Path, force: bool) -> None:
-    """Refuse a folder that is there, unless it is a recorded set that is to be replaced."""
+    """Refuse a folder with files, unless it is a recorded set to be replaced."""
     from tactile_rt.sets.manifest import MANIFEST, SweepManifest, object_path
     from tactile_rt.sim_backend.datasets.inventory import SUMS
 

@@ -1,4 +1,4 @@
-"""`tactile-rt model` and `tactile-rt eval`: what is in a file, is it whole, fast and good."""
+"""`tactile-rt model` and `tactile-rt eval`: show, verify, time and evaluate a model file."""
 
 import math
 from pathlib import Path
@@ -49,12 +49,12 @@ def show(file: File, json: Json = None) -> None:
         "refusals": ", ".join(card.refusals),
         "embedding": f"{card.embedding} units",
         "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
-        "sensor": _pairs(card.sensor),
-        "clip": _channels(spec, card.clip),
-        "scale": _channels(spec, card.scale),
-        "noise floor": _channels(spec, card.floor),
+        "sensor": _format_pairs(card.sensor),
+        "clip": _format_channels(spec, card.clip),
+        "scale": _format_channels(spec, card.scale),
+        "noise floor": _format_channels(spec, card.floor),
         "temperature": f"{card.temperature:.4g}",
-        "unknown": _unknown(card.unknown),
+        "unknown": _describe_unknown(card.unknown),
         "prediction sets": "\n".join(map(_describe_set, card.candidates)),
         "kinds": "\n".join(f"{c}: {', '.join(kinds)}" for c, kinds in card.kinds.items()),
         "names": "\n".join(f"{c}: {_describe_set(of[0])}" for c, of in card.names.items() if of),
@@ -62,18 +62,18 @@ def show(file: File, json: Json = None) -> None:
         f"{name_some((one.name for one in card.enrolled), MANY) or 'none'}"
         if card.identity
         else "",
-        "figures": _pairs(card.figures),
+        "figures": _format_pairs(card.figures),
         "licence": card.license,
         "probe": "stored" if card.probe else "none stored",
-        "hashes": _pairs(card.hashes),
-        "made by": _pairs({k: v for k, v in card.provenance.items() if isinstance(v, str)}),
+        "hashes": _format_pairs(card.hashes),
+        "made by": _format_pairs({k: v for k, v in card.provenance.items() if isinstance(v, str)}),
     }
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for what, text in rows.items():
         if text:
-            # Text of a stranger's file: nothing in it is for the terminal to obey.
+            # The file may be anybody's: its text must not control the terminal.
             lines = "\n".join(one_line(line) for line in text.splitlines())
             table.add_row(what, escape(lines))
     print_table(table)
@@ -93,10 +93,10 @@ def verify(file: File, json: Json = None) -> None:
     from tactile_rt.classifier.trial import try_model
 
     card, contents, data = read_model(file)
-    told: dict[str, str] = {}
+    results: dict[str, str] = {}
 
     def tell(what: str, says: str) -> None:
-        told[what] = says
+        results[what] = says
         if json != STDOUT:
             typer.echo(f"{what}: {says}")
 
@@ -115,7 +115,7 @@ def verify(file: File, json: Json = None) -> None:
     for line in verify_model(file):
         what, _, says = line.partition(": ")
         tell(what, says)
-    told_as_json(told, json)
+    told_as_json(results, json)
 
 
 @model.command(epilog="tactile-rt model bench model.onnx --steps 500")
@@ -136,12 +136,12 @@ def bench(
     show_records(records, json)
 
 
-def _channels(spec: Any, values: tuple[float, ...]) -> str:
+def _format_channels(spec: Any, values: tuple[float, ...]) -> str:
     named = zip(spec.channels, values, spec.units, strict=True)
     return ", ".join(f"{channel} {value:.3g} {unit}" for channel, value, unit in named)
 
 
-def _unknown(rule: Any) -> str:
+def _describe_unknown(rule: Any) -> str:
     if rule is None:
         return ""
     least, most = min(rule.thresholds), max(rule.thresholds)
@@ -154,11 +154,11 @@ def _describe_set(rule: Any) -> str:
     return f"{100 * rule.coverage:.3g} % by {rule.score}, of {rule.objects} objects{noise}"
 
 
-def _pairs(values: dict[str, Any]) -> str:
-    def said(value: Any) -> str:
+def _format_pairs(values: dict[str, Any]) -> str:
+    def format_value(value: Any) -> str:
         return f"{value:.4g}" if isinstance(value, float) else str(value)
 
-    return "\n".join(f"{key}: {said(value)}" for key, value in values.items())
+    return "\n".join(f"{key}: {format_value(value)}" for key, value in values.items())
 
 
 @app.command("eval", epilog="tactile-rt eval model.onnx sweeps --pictures pictures")

@@ -9,7 +9,7 @@ from tactile_rt.cli.app import check_named_once, check_output
 from tactile_rt.core.errors import ConfigError
 
 STDOUT = Path("-")
-LARGEST_SEED = 2**32 - 1  # that every generator takes
+LARGEST_SEED = 2**32 - 1  # every generator of random numbers takes it
 
 
 def _check_json(file: Path | None) -> Path | None:
@@ -24,7 +24,7 @@ def _check_json(file: Path | None) -> Path | None:
 
 
 def option(help: str, *names: str, **more: Any) -> Any:
-    """Return an option of a command, of its parameter's name if no others are given."""
+    """Return an option of a command, named after its parameter if ``names`` is empty."""
     return typer.Option(*names, help=help, **more)
 
 
@@ -34,7 +34,7 @@ def argument(help: str, **more: Any) -> Any:
 
 
 def set_option(help: str) -> Any:
-    """Return the option ``--set KEY=VALUE`` of a command, which may be given again."""
+    """Return the option ``--set KEY=VALUE`` of a command, which may be repeated."""
     return option(f"{help}; may be repeated.", "--set", metavar="KEY=VALUE")
 
 

@@ -1,10 +1,10 @@
-"""The help of the program: commands in panels, an example at the end of each, a first screen."""
+"""The help of the program: commands in panels, an example of each, a welcome screen."""
 
 from typing import Any
 
 from typer.core import TyperGroup
 
-# Of the program and of a group: each panel and its commands, the most common first.
+# The panels of the program and of a group, with their commands, the most common first.
 PANELS = {
     "tactile-rt": {
         "Try": "demo teach new make",
@@ -35,7 +35,7 @@ WHOLE = 1000  # characters: no sentence is cut
 class PanelGroup(TyperGroup):
     """A group that shows its commands in panels, also where help is plain text.
 
-    The epilog of a command is an example: one line of a shell.
+    The epilog of a command is an example of one shell line.
     """
 
     def __init__(self, **settings: Any) -> None:

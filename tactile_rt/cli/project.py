@@ -1,4 +1,4 @@
-"""`tactile-rt new` and `make`: from the description of an array to a model that decides."""
+"""`tactile-rt new` and `make`: make a model from the description of an array."""
 
 import shlex
 from pathlib import Path

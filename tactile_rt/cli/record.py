@@ -1,4 +1,4 @@
-"""`tactile-rt record`, `recover` and `convert`: streams at rest."""
+"""`tactile-rt record`, `recover` and `convert`: make, repair and convert recordings."""
 
 import time
 from pathlib import Path
@@ -39,26 +39,26 @@ def record(
     check_output(output)
     check_is_mcap(output)
     check_new(output, force)  # before a device is opened and started
-    session = _notes(note or [])
+    session = _parse_notes(note or [])
     with (
         open_url(source) as opened,
         StreamWriter(output, opened, url=source, session=session, force=force) as writer,
         leaving(seconds),
     ):
         _copy(opened, writer)
-    told = {
+    results = {
         "file": output, "samples": writer.stats.samples,
         "packets": writer.stats.packets, "bytes": writer.stats.bytes,
         "corrupt": opened.stats.corrupt, "missing": opened.stats.missing,
         "dropped_samples": writer.stats.dropped_samples,
         "dropped_packets": writer.stats.dropped_packets,
     }  # fmt: skip
-    if not told_as_json(told, json):
-        typer.echo(f"{output}: {_told(opened, writer)}")
+    if not told_as_json(results, json):
+        typer.echo(f"{output}: {_describe_progress(opened, writer)}")
 
 
 def _copy(source: "Source", writer: "StreamWriter") -> None:
-    """Record until the stream ends, and tell how it goes."""
+    """Record until the stream ends; print a line of progress every second."""
     from tactile_rt.core.stream import EndOfStream
 
     tell_at = time.monotonic() + TELL_S
@@ -71,27 +71,27 @@ def _copy(source: "Source", writer: "StreamWriter") -> None:
             writer.push(chunk)
         if time.monotonic() >= tell_at:
             tell_at += TELL_S
-            typer.echo(_told(source, writer), err=True)
+            typer.echo(_describe_progress(source, writer), err=True)
 
 
-def _told(source: "Source", writer: "StreamWriter") -> str:
+def _describe_progress(source: "Source", writer: "StreamWriter") -> str:
     done, stats = writer.stats, source.stats
     health = getattr(source, "health", None)
-    said = [f"{health.state}"] if health is not None else []
-    said.append(f"{done.samples} samples")
+    parts = [f"{health.state}"] if health is not None else []
+    parts.append(f"{done.samples} samples")
     if writer.about.wire:
-        said.append(f"{done.packets} packets")
-    said.append(f"{done.bytes / 1e6:.1f} MB")
+        parts.append(f"{done.packets} packets")
+    parts.append(f"{done.bytes / 1e6:.1f} MB")
     if stats.corrupt or stats.missing:
-        said.append(f"lost on the wire: {stats.corrupt} damaged, {stats.missing} missing")
+        parts.append(f"lost on the wire: {stats.corrupt} damaged, {stats.missing} missing")
     if done.dropped_samples or done.dropped_packets:
-        said.append(
+        parts.append(
             f"disk too slow: {done.dropped_samples} samples, {done.dropped_packets} packets dropped"
         )
-    return ", ".join(said)
+    return ", ".join(parts)
 
 
-def _notes(given: list[str]) -> dict[str, str]:
+def _parse_notes(given: list[str]) -> dict[str, str]:
     notes = {}
     for pair in given:
         name, equals, value = pair.partition("=")
@@ -112,18 +112,18 @@ def recover(
 ) -> None:
     """Repair a damaged recording in a new file."""
     from tactile_rt.recording import Recording
-    from tactile_rt.recording import recover as recovered
+    from tactile_rt.recording import recover as repair
 
     check_output(out)
     with progress_bar(f"reading {recording}"):
-        made = recovered(recording, out, force)
+        made = repair(recording, out, force)
         n, first, last = 0, 0, 0
         for chunk in Recording(made):
             first = first if n else int(chunk.t_ns[0])
             n, last = n + len(chunk), int(chunk.t_ns[-1])
     whole = made == recording
-    told = {"file": made, "whole": whole, "samples": n, "seconds": (last - first) / 1e9}
-    if told_as_json(told, json):
+    results = {"file": made, "whole": whole, "samples": n, "seconds": (last - first) / 1e9}
+    if told_as_json(results, json):
         return
     if whole:
         typer.echo(f"{recording} is whole: nothing to do")
@@ -159,37 +159,37 @@ def convert(
     dataset hold the samples; a ROS 2 bag also holds the raw packets. With --to, OUTPUT may be left
     out: RECORDING-ros2, RECORDING-lerobot.
     """
-    from tactile_rt.recording.conversion import convert as converted
+    from tactile_rt.recording.conversion import convert as convert_file
 
     if to:
         with progress_bar(f"writing for {to}"):
-            told = _as_folder(to, files, fps, task, video or [], force)
-        _tell(told, json)
+            results = _write_folder(to, files, fps, task, video or [], force)
+        _print_results(results, json)
         return
     if len(files) != 2:
         raise ConfigError("name a recording and what to write, or say what --to")
     recording, output = files
     check_new(output, force)
     with progress_bar(f"converting {recording}"):
-        samples = converted(recording, output)
-    _tell({"output": output, "samples": samples}, json)
+        samples = convert_file(recording, output)
+    _print_results({"output": output, "samples": samples}, json)
 
 
-def _tell(told: dict[str, Any], json: Path | None) -> None:
-    """Say how much was written, and where."""
-    if not told_as_json(told, json):
-        said = ", ".join(f"{n} {what}" for what, n in told.items() if what != "output")
-        typer.echo(f"{told['output']}: {said}")
+def _print_results(results: dict[str, Any], json: Path | None) -> None:
+    """Print how much was written, and where, or write it as JSON."""
+    if not told_as_json(results, json):
+        counts = ", ".join(f"{n} {what}" for what, n in results.items() if what != "output")
+        typer.echo(f"{results['output']}: {counts}")
 
 
-# What a folder of each form has, which may be replaced.
+# A file by which --force recognises an earlier output of each form, which it may replace.
 MARKS = {"ros2": "metadata.yaml", "lerobot": "meta/info.json"}
 
 
-def _as_folder(
+def _write_folder(
     to: str, files: list[Path], fps: int, task: str, video: list[str], force: bool
 ) -> dict[str, Any]:
-    """Write a bag or a dataset; what to say of it."""
+    """Write a bag or a dataset; return its path and the numbers written."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording.as_lerobot import write_dataset
     from tactile_rt.recording.conversion import write_bag

@@ -1,4 +1,4 @@
-"""`tactile-rt replay`: what a model decides on a recording, and whether it did so live."""
+"""`tactile-rt replay`: run a model on a recording, and compare with its live decisions."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 DIFFERENT = 1
 RECORDED = "recorded"  # the codec and options by which packets were decoded live
-TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # of a decision's message: not the same twice
+TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # keys of a decision that differ between runs
 
 
 @app.command(epilog="tactile-rt replay touches.mcap --model model.onnx")
@@ -43,33 +43,33 @@ def replay(
     recorded ones instead of printed; exit code 1, and the first difference, if there is one. With
     --codec the samples are decoded anew, and their differences from the recorded ones go to stderr.
     """
-    fields = {"speed": _speed(speed)} | _decoding(codec)
+    fields = {"speed": _parse_speed(speed)} | _parse_codec(codec)
     if out is not None:
         check_new(out, force)
-    told = _Replay(_in_order(files), model, name, check, fields)
+    run = _Replay(_open_in_order(files), model, name, check, fields)
     if "from" in fields:
-        _compare(told.files, {k: v for k, v in fields.items() if k not in ("from", "speed")})
+        _show_decoding(run.files, {k: v for k, v in fields.items() if k not in ("from", "speed")})
     if out is not None:
         from tactile_rt.core.files import write_whole
 
-        write_whole(out, told.write)
+        write_whole(out, run.write)
     elif check:
-        told.write(None)
+        run.write(None)
     else:
         finished = False
         with leaving(None):
-            for line in told.lines():
-                typer.echo(line)  # which flushes
+            for line in run.lines():
+                typer.echo(line)  # echo flushes
             finished = True
         if not finished:
             typer.echo("stopped before the end", err=True)
-    typer.echo(f"{told.samples} samples, {len(told.decided)} decisions", err=True)
+    typer.echo(f"{run.samples} samples, {len(run.decided)} decisions", err=True)
     if check:
-        told.compare()
+        run.compare()
 
 
 class _Replay:
-    """Files through a classifier."""
+    """Recordings that are replayed through a classifier."""
 
     def __init__(
         self,
@@ -101,13 +101,13 @@ class _Replay:
             )
 
     def write(self, file: BinaryIO | None) -> None:
-        """All lines into a file; None: nowhere."""
+        """Write all lines into a file; with None, only run the model."""
         for line in self.lines():
             if file is not None:
                 file.write(line + b"\n")
 
     def lines(self) -> Iterator[bytes]:
-        """A line for each decision, as soon as it is due."""
+        """Yield a line of JSON for each decision, as soon as it is due."""
         import msgspec
 
         from tactile_rt.recording.replay import prepare_replay
@@ -117,27 +117,27 @@ class _Replay:
         for recording in self.files:
             with prepare_replay(str(recording.path), dict(self._fields)).open() as source:
                 for chunk in source:
-                    # Numbers that begin anew are another stream: what was touched is not known.
+                    # Sequence numbers that restart are another stream: it needs a new classifier.
                     if classifier is None or chunk.seq[0] < after:
-                        classifier = self._classifier(source.spec)
+                        classifier = self._make_classifier(source.spec)
                     if not self.samples:
                         self._first, self._begins_at = int(chunk.t_ns[0]), int(chunk.seq[0])
                     after, self._last = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1])
                     self.samples += len(chunk)
                     for decision in self._decide(classifier, chunk):
-                        message = self._message(decision, recording)
+                        message = self._make_message(decision, recording)
                         self.decided.append(message)
                         yield msgspec.json.encode(message)
 
     def _decide(self, classifier: "Classifier", chunk: "Chunk") -> "list[Classification]":
-        """What the model says of those samples that it was given live."""
+        """Classify those samples of a chunk that the model also got live."""
         from tactile_rt.recording.checking import samples_given
 
         given = samples_given(chunk, self._skips)
         return classifier.push(given) if given is not None else []
 
     def compare(self) -> None:
-        """Tell whether the decisions are the recorded ones; leave with `DIFFERENT` if not."""
+        """Print whether the decisions are the recorded ones; exit with `DIFFERENT` if not."""
         from tactile_rt.recording.checking import check_decisions
 
         assert self._live is not None
@@ -153,18 +153,18 @@ class _Replay:
             final_only=table.get("decisions") == "final",
             may_withhold=table.get("late") == "skip",
         )  # fmt: skip
-        said = [f"{checked.same} decisions of {self._live.name} are as recorded"]
+        parts = [f"{checked.same} decisions of {self._live.name} are as recorded"]
         if checked.before:
-            said.append(f"{checked.before} recorded ones are about samples before the first")
+            parts.append(f"{checked.before} recorded ones are about samples before the first")
         if self._skips:
-            said.append(f"{len(self._skips)} stretches were skipped live, the model being behind")
+            parts.append(f"{len(self._skips)} stretches were skipped live, the model being behind")
         if checked.withheld:
-            said.append(f"{checked.withheld} were withheld live as late")
+            parts.append(f"{checked.withheld} were withheld live as late")
         if checked.late:
-            said.append(f"{checked.late} at the end came too late for the recording")
+            parts.append(f"{checked.late} at the end came too late for the recording")
         if not self._live.sha256:
-            said.append("the recording does not tell the model's hash")
-        typer.echo("; ".join(said))
+            parts.append("the recording does not tell the model's hash")
+        typer.echo("; ".join(parts))
         if checked.difference:
             typer.secho(checked.difference, err=True, fg="red")
             if self._begins_at:
@@ -175,7 +175,7 @@ class _Replay:
                 )
             raise typer.Exit(DIFFERENT)
 
-    def _classifier(self, spec: Any) -> "Classifier":
+    def _make_classifier(self, spec: Any) -> "Classifier":
         from tactile_rt.classifier.classifier import Classifier
         from tactile_rt.classifier.skips import Skip
 
@@ -188,7 +188,7 @@ class _Replay:
             skips=[Skip(s["from_ns"], s["until_ns"]) for s in self._skips],
         )  # fmt: skip
 
-    def _message(self, decision: "Classification", recording: "Recording") -> dict[str, Any]:
+    def _make_message(self, decision: "Classification", recording: "Recording") -> dict[str, Any]:
         import msgspec
 
         from tactile_rt.daemon.items import Decision
@@ -204,13 +204,13 @@ class _Replay:
         return {key: value for key, value in fields.items() if key not in TIMING}
 
 
-def _in_order(files: list[Path]) -> "list[Recording]":
+def _open_in_order(files: list[Path]) -> "list[Recording]":
     from tactile_rt.recording import Recording
     from tactile_rt.recording.layout import DECISIONS, EVENTS, SAMPLES
 
     folders = [path for path in files if path.is_dir()]
     if folders:
-        raise ConfigError(f"{folders[0]} is a folder: {_sources_in(folders[0])}")
+        raise ConfigError(f"{folders[0]} is a folder: {_list_sources(folders[0])}")
     found = [Recording(path) for path in files]
     names = dict.fromkeys(map(_source_of, found))
     if len(names) > 1:
@@ -225,14 +225,14 @@ def _in_order(files: list[Path]) -> "list[Recording]":
             raise ConfigError(
                 f"{recording.path} is of another array than {files[0]}: {differing[0]}"
             )
-        # One may have no samples: what was decided about those of the file before it came late.
+        # A file may have no samples, only late decisions about those of the file before.
         first = next(recording.raw(SAMPLES, DECISIONS, EVENTS), None)
         offset = recording.description.utc_offset_ns
         begins.append(0 if first is None else first.t_ns + offset)
     return [found[k] for k in sorted(range(len(found)), key=begins.__getitem__)]
 
 
-def _sources_in(folder: Path) -> str:
+def _list_sources(folder: Path) -> str:
     from tactile_rt.recording import Recording
 
     names: dict[str, str] = {}
@@ -243,8 +243,8 @@ def _sources_in(folder: Path) -> str:
             continue
     if not names:
         return "name a recording"
-    said = ", ".join(f"{name} ({file} ...)" for name, file in names.items())
-    return f"name the files of one source; it has recordings of {said}"
+    sources = ", ".join(f"{name} ({file} ...)" for name, file in names.items())
+    return f"name the files of one source; it has recordings of {sources}"
 
 
 def _source_of(recording: "Recording") -> str:
@@ -252,7 +252,7 @@ def _source_of(recording: "Recording") -> str:
     return about.session.get("daemon_source", about.source)
 
 
-def _compare(files: "list[Recording]", options: dict[str, str]) -> None:
+def _show_decoding(files: "list[Recording]", options: dict[str, str]) -> None:
     from tactile_rt.recording.checking import compare_decoding
 
     if len(files) > 1:
@@ -261,7 +261,7 @@ def _compare(files: "list[Recording]", options: dict[str, str]) -> None:
         typer.echo(line, err=True)
 
 
-def _speed(text: str) -> str:
+def _parse_speed(text: str) -> str:
     try:
         speed = 0.0 if text == "max" else float(text)
     except ValueError:
@@ -271,8 +271,8 @@ def _speed(text: str) -> str:
     return repr(speed)
 
 
-def _decoding(codec: str) -> dict[str, str]:
-    """Options of `replay:` for raw packets; none to replay samples."""
+def _parse_codec(codec: str) -> dict[str, str]:
+    """Return the `replay:` options to decode raw packets; none to replay samples."""
     if codec in ("", RECORDED):
         return {"from": "wire"} if codec else {}
     chosen, _, query = codec.partition("?")

@@ -1,4 +1,4 @@
-"""`tactile-rt sniff`: which codec, speed or columns fit a port, a bus, or a file."""
+"""`tactile-rt sniff`: find the codec, speed or columns that fit a port, a bus or a file."""
 
 import shlex
 from collections import Counter
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from tactile_rt.drivers.sniffing import CodecFit, Tried
 
 NOTHING = 1  # exit code: nothing fits
-SHOWN = 6  # fits
+SHOWN = 6  # fits that are listed
 DESCRIBE = "frames of one length can be described: codec=binary_frame"
-DOUBTFUL = 0.1  # damaged frames to an intact one, in text
-GUESSED_HZ = 100  # where nothing tells the time
+DOUBTFUL = 0.1  # damaged frames per intact one: more in text are a coincidence
+GUESSED_HZ = 100  # placeholder if the file has no times
 FORMS = {
     "hex": "bytes in hexadecimal",
     "terminal": "lines of text and when each came",
@@ -54,33 +54,33 @@ def sniff(
     """
     from tactile_rt.cli.importing import codec_fields
 
-    told = _Told(target, json)
+    out = _Output(target, json)
     tried = [codec_fields(text, "--try") for text in further or []]
     candidates: list[Tried] = [(fields.pop("codec"), fields) for fields in tried]
     path = Path(target.removeprefix("serial://").removeprefix("serial:"))
     with starting(), leaving(None):
         if target.startswith("can:"):
-            _sniff_bus(target, seconds, candidates, ask, told)
+            _sniff_bus(target, seconds, candidates, ask, out)
         elif target.startswith(("serial:", "socket:", "rfc2217:")) or path.is_char_device():
             port = str(path) if path.exists() else target.removeprefix("serial:")
-            _sniff_port(port, seconds, baud, candidates, ask, told)
+            _sniff_port(port, seconds, baud, candidates, ask, out)
         elif path.exists():
-            _sniff_file(path, candidates, told)
+            _sniff_file(path, candidates, out)
         else:
             raise ConfigError(
                 f"{target} is no port, bus or file: `tactile-rt list` shows what is plugged in"
             )
 
 
-class _Told:
-    """What is found, told as it comes, or as JSON at the end."""
+class _Output:
+    """Output of findings, printed as they come, or as JSON at the end."""
 
     def __init__(self, target: str, json: Path | None) -> None:
         self._json, self._alone = json, json == STDOUT
         self._all: dict[str, Any] = {"target": target, "fits": [], "said": [], "command": None}
 
     def show(self, what: str, value: Any, table: "Table") -> None:
-        """A table, and what it shows for the JSON."""
+        """Print a table, and store its data for the JSON."""
         self._all[what] = value
         if not self._alone:
             print_table(table)
@@ -91,14 +91,14 @@ class _Told:
             typer.echo(text)
 
     def go_on(self, *words: object) -> None:
-        """Show the last line: the command to go on with."""
+        """Print the last line: the command to continue with."""
         self._all["command"] = command = shlex.join(["tactile-rt", *map(str, words)])
         if not self._alone:
             typer.echo(command)
         told_as_json(self._all, self._json)
 
     def nothing(self, what: str, hint: str = "") -> NoReturn:
-        """The last line: there is nothing; leave."""
+        """Print the last line, that nothing was found, and exit."""
         self.say(f"{what}{f': {hint}' if hint else ''}")
         told_as_json(self._all, self._json)
         raise typer.Exit(NOTHING)
@@ -109,7 +109,7 @@ class _Told:
 
 def _sniff_port(
     port: str, seconds: float, bauds: list[int] | None, further: "list[Tried]", ask: bool,
-    told: _Told,
+    out: _Output,
 ) -> None:  # fmt: skip
     from tactile_rt.drivers.links import SerialLink
     from tactile_rt.drivers.sniffing import ask_devices, hear_port, line_speeds, sniff_bytes
@@ -139,28 +139,28 @@ def _sniff_port(
     )  # fmt: skip
     url = f"serial://{port}" if "://" not in port else f"serial:{port}"
     if found:
-        _show([fit for fit, _ in found], told, [baud for _, baud in found])
+        _show([fit for fit, _ in found], out, [baud for _, baud in found])
         fit, baud = found[0]
-        # what USB brings is the same at every speed
+        # over USB the bytes are the same at every speed
         usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
-        _run(url, fit, {} if usual else {"baud": str(baud)}, told)
+        _propose_run(url, fit, {} if usual else {"baud": str(baud)}, out)
         return
     printed = [(propose_line_columns(data), baud) for baud, data in texts]
     proposed = [(p.samples, baud, p.columns) for p, baud in printed if p is not None]
     if proposed:
         n, baud, columns = max(proposed)
-        told.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
+        out.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
         fields = {"codec": "ascii_line", "columns": columns}
         fields |= {} if baud == 115_200 else {"baud": str(baud)}
-        told.go_on("run", "--source", f"{url}?{_query(fields)}")
+        out.go_on("run", "--source", f"{url}?{_make_query(fields)}")
         return
     if not any(data for _, data in texts):
         hint = "" if ask else "try --ask: it may have to be started"
-        told.nothing(f"nothing came from {port}", hint)
-    told.nothing(f"nothing fits what came from {port}", DESCRIBE)
+        out.nothing(f"nothing came from {port}", hint)
+    out.nothing(f"nothing fits what came from {port}", DESCRIBE)
 
 
-def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, told: _Told) -> None:
+def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, out: _Output) -> None:
     from tactile_rt.drivers.opening import open_line
     from tactile_rt.drivers.sniffing import ask_devices, hear_bus, sniff_frames
 
@@ -168,26 +168,26 @@ def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, told
     fits = sniff_frames(frames, further)
     if not fits and ask:
         typer.echo("asking for samples as each codec does", err=True)
-        for _, heard in ask_devices("can", lambda _: open_line(url), seconds):
-            fits += sniff_frames(heard, further)
+        for _, answer in ask_devices("can", lambda _: open_line(url), seconds):
+            fits += sniff_frames(answer, further)
     if not fits:
         if not frames:
-            told.nothing(
+            out.nothing(
                 f"nothing came from {url}",
                 "is the bit rate right?" + ("" if ask else " or try --ask: it may wait to be told"),
             )
-        _show_identifiers(frames, told)
-        told.nothing(f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc")
-    _show(fits, told)
-    _run(url, fits[0], {}, told)
+        _show_identifiers(frames, out)
+        out.nothing(f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc")
+    _show(fits, out)
+    _propose_run(url, fits[0], {}, out)
 
 
-def _run(url: str, fit: "CodecFit", further: dict[str, str], told: _Told) -> None:
+def _propose_run(url: str, fit: "CodecFit", further: dict[str, str], out: _Output) -> None:
     fields = fit.fields | further
     if not fit.described:
-        told.say("it has not described its array here; it does when it is started")
+        out.say("it has not described its array here; it does when it is started")
     sign = "&" if "?" in url else "?"
-    told.go_on("run", "--source", f"{url}{sign}{_query(fields)}")
+    out.go_on("run", "--source", f"{url}{sign}{_make_query(fields)}")
 
 
 def _usual_baud(fit: "CodecFit") -> int:
@@ -200,72 +200,72 @@ def _usual_baud(fit: "CodecFit") -> int:
 # files
 
 
-def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
+def _sniff_file(path: Path, further: "list[Tried]", out: _Output) -> None:
     from tactile_rt.drivers.logs import read_log
     from tactile_rt.drivers.sniffing import LOOK_BYTES, LOOK_FRAMES, sniff_bytes, sniff_frames
     from tactile_rt.recording.importing.bag_file import is_bag
 
     if is_bag(path):
-        _sniff_bag(path, told)
+        _sniff_bag(path, out)
         return
     if path.is_dir():
         raise ConfigError(f"{path} is a folder, and no bag: name a file")
     log = read_log(path)
     if log.form != "raw":
         typer.echo(f"{path}: {FORMS.get(log.form, f'a CAN log ({log.form})')}", err=True)
-    of_bus = log.wire == "can"
-    begun: Any = [] if of_bus else bytearray()
+    is_can = log.wire == "can"
+    start: Any = [] if is_can else bytearray()
     for packet, _ in log.packets():
-        begun += packet
-        if len(begun) >= (LOOK_FRAMES if of_bus else LOOK_BYTES):
+        start += packet
+        if len(start) >= (LOOK_FRAMES if is_can else LOOK_BYTES):
             break
-    data = b"" if of_bus else bytes(begun)
-    fits = sniff_frames(begun, further) if of_bus else sniff_bytes(data, further)
-    # Of text that has rows, frames of which many are damaged are a coincidence.
+    data = b"" if is_can else bytes(start)
+    fits = sniff_frames(start, further) if is_can else sniff_bytes(data, further)
+    # In text with rows, frames are a coincidence if many of them are damaged.
     doubtful = log.form == "raw" and data.isascii() and b"\0" not in data
     if fits and not (doubtful and fits[0].corrupt > DOUBTFUL * fits[0].intact):
-        _show(fits, told)
+        _show(fits, out)
         fields = fits[0].fields
         if not fits[0].described:
-            told.say("it did not describe its array: array=FILE.json of `tactile-rt describe` does")
+            out.say("it did not describe its array: array=FILE.json of `tactile-rt describe` does")
             fields["array"] = "FILE.json"
-        told.go_on("import", path, "--as", _query(fields))
-    elif of_bus:
-        _show_identifiers(begun, told)
+        out.go_on("import", path, "--as", _make_query(fields))
+    elif is_can:
+        _show_identifiers(start, out)
         for note in log.notes:
-            told.say(note)
+            out.say(note)
         hint = "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'"
-        told.nothing(f"no codec fits {path}", hint)
-    elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, told):
-        told.nothing(f"nothing fits {path}", _name_lack(data) or DESCRIBE)
+        out.nothing(f"no codec fits {path}", hint)
+    elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, out):
+        out.nothing(f"nothing fits {path}", _describe_lack(data) or DESCRIBE)
 
 
-def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
-    """Propose the columns of a table, or of what a board prints; whether there are any."""
+def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
+    """Propose columns of a table or of printed lines; return whether any exist."""
     from tactile_rt.recording.importing.table_guess import propose_columns, propose_line_columns
 
     try:
         proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     except ConfigError as error:
-        told.nothing(str(error))
+        out.nothing(str(error))
     if proposed is None:
         return False
     if not proposed.columns:
-        told.nothing(f"no columns are found with which it is read: {proposed.said}"[:200])
-    told.say(f"{proposed.said}: names and units are for you to say")
+        out.nothing(f"no columns are found with which it is read: {proposed.said}"[:200])
+    out.say(f"{proposed.said}: names and units are for you to say")
     options: list[object] = ["--columns", proposed.columns]
     if not proposed.table:
-        options = ["--as", _query({"codec": "ascii_line", "columns": proposed.columns})]
+        options = ["--as", _make_query({"codec": "ascii_line", "columns": proposed.columns})]
     elif not proposed.timed:
-        of = "the header's" if proposed.rate_hz else f"not {GUESSED_HZ}"
-        told.say(f"no column is a time: --rate says how many came in a second, {of}")
+        which = "the header's" if proposed.rate_hz else f"not {GUESSED_HZ}"
+        out.say(f"no column is a time: --rate says how many came in a second, {which}")
         options += ["--rate", f"{proposed.rate_hz or GUESSED_HZ:g}"]
-    told.go_on("import", path, *options)
+    out.go_on("import", path, *options)
     return True
 
 
-def _name_lack(data: bytes) -> str:
-    """Say that text has too few rows; empty: it has enough, or is no text."""
+def _describe_lack(data: bytes) -> str:
+    """Return a note that text has too few rows; empty if enough or not text."""
     from tactile_rt.drivers.codecs.ascii_text import fields, is_text, number
     from tactile_rt.recording.importing.table_guess import LEAST
 
@@ -275,7 +275,7 @@ def _name_lack(data: bytes) -> str:
     return f"it holds {few}" if rows < LEAST and all(map(is_text, lines)) else ""
 
 
-def _sniff_bag(path: Path, told: _Told) -> None:
+def _sniff_bag(path: Path, out: _Output) -> None:
     from rich.table import Table
 
     from tactile_rt.classifier.model_card import element_order
@@ -286,36 +286,36 @@ def _sniff_bag(path: Path, told: _Told) -> None:
 
     if is_recording(path):
         about = Recording(path).description
-        told.say(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
+        out.say(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
         try:
             element_order(read_model(shipped_model())[0].array, about.spec)
         except SpecMismatch:
-            told.go_on("teach", f"replay:{path}?speed=0", "lesson", "--classes", "A,B")
+            out.go_on("teach", f"replay:{path}?speed=0", "lesson", "--classes", "A,B")
         else:
-            told.go_on("run", "--source", f"replay:{path}")
+            out.go_on("run", "--source", f"replay:{path}")
         return
     topics = bag_topics(path)
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
     for topic in topics:
         table.add_row(topic.name, topic.type, str(topic.messages), topic.columns)
-    told.show("topics", topics, table)
+    out.show("topics", topics, table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     proposed = [t for t in topics if t.proposed]
     if not known and proposed:
         best = max(proposed, key=lambda t: t.messages)
-        told.say(f"{best.name} has numbers: names and units are for you to say")
-        told.go_on("import", path, "--topic", best.name, "--columns", best.proposed)
+        out.say(f"{best.name} has numbers: names and units are for you to say")
+        out.go_on("import", path, "--topic", best.name, "--columns", best.proposed)
         return
     if not known:
-        told.nothing(f"{path}: of no topic is known what is what", "say it with --columns")
+        out.nothing(f"{path}: of no topic is known what is what", "say it with --columns")
     best = max(known, key=lambda t: t.messages)
-    told.go_on("import", path, *(["--topic", best.name] if len(known) > 1 else []))
+    out.go_on("import", path, *(["--topic", best.name] if len(known) > 1 else []))
 
 
-# what is said
+# output
 
 
-def _show(fits: "list[CodecFit]", told: _Told, speeds: Sequence[int] = ()) -> None:
+def _show(fits: "list[CodecFit]", out: _Output, speeds: Sequence[int] = ()) -> None:
     from rich.table import Table
 
     found = [
@@ -328,15 +328,15 @@ def _show(fits: "list[CodecFit]", told: _Told, speeds: Sequence[int] = ()) -> No
         shown = one | {"options": options, "explains": f"{one['explained']:.0%}"}
         proof = f"{one['proof']:.0%}" if one["wire"] == "serial" else "by CAN"
         table.add_row(*(str(shown[name]) for name in names), proof)
-    told.show("fits", found, table)
+    out.show("fits", found, table)
 
 
-def _show_identifiers(frames: "list[Any]", told: _Told) -> None:
+def _show_identifiers(frames: "list[Any]", out: _Output) -> None:
     counts = Counter((f.id, f.extended, len(f.data)) for f in frames)
     for (number, extended, length), n in counts.most_common(12):
-        told.say(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")
+        out.say(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")
 
 
-def _query(fields: dict[str, str]) -> str:
-    # what the shell and a URL leave as it is stays readable
+def _make_query(fields: dict[str, str]) -> str:
+    # characters that shells and URLs leave as they are stay readable
     return urlencode(fields, quote_via=quote, safe=":*,.{}()[]/ -_")

@@ -1,4 +1,4 @@
-"""`tactile-rt sweep`: make a sweep set in simulation; `objects`: what is swept, from elsewhere."""
+"""`tactile-rt sweep`: make a sweep set in simulation; `objects`: get and check objects."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,22 +61,22 @@ def sweep(
         from tactile_rt.sim_backend.world import PROFILES
     asked = {"profile": profile, "seed": seed}
     given = [f"{key}={value}" for key, value in asked.items() if value is not None]
-    chosen = _recipe(folder, recipe, [*given, *(sets or ())])
+    chosen = _choose_recipe(folder, recipe, [*given, *(sets or ())])
     splits = tuple(dict.fromkeys(s.strip() for s in split.split(","))) if split else ()
     names = dataset.describe_set(chosen).names(splits)
     if line := ringing(load_animals(chosen.array), PROFILES[chosen.profile]):
         typer.echo(line, err=True)
-    there = len(dataset.finished_objects(folder, names))
+    finished = len(dataset.finished_objects(folder, names))
     engine, address = "processes" if ray is None else "ray", None if ray == "auto" else ray
     made = dataset.make_sweeps(chosen, folder, processes or None, splits, engine, address)
-    with progress_bar("objects", len(names), there, counted=True) as update:
-        for k, name in enumerate(made):  # those that were there first
-            update(advance=int(k >= there), description=name)
+    with progress_bar("objects", len(names), finished, counted=True) as update:
+        for k, name in enumerate(made):  # finished objects come first
+            update(advance=int(k >= finished), description=name)
     found = tally(folder, names, len(chosen.sweeps))
-    told = {"set": folder, "sweeps": found.sweeps, "profile": chosen.profile}
-    told_as_json(told | {"shortcomings": found.shortcomings}, json)
-    but = f"; {found.shortcomings}" if found.shortcomings else ""
-    typer.echo(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{but}", err=True)
+    results = {"set": folder, "sweeps": found.sweeps, "profile": chosen.profile}
+    told_as_json(results | {"shortcomings": found.shortcomings}, json)
+    note = f"; {found.shortcomings}" if found.shortcomings else ""
+    typer.echo(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{note}", err=True)
     if card:
         _write_card(folder)
         typer.echo(f"{folder / 'README.md'} describes them", err=True)
@@ -92,8 +92,8 @@ def _write_card(folder: Path) -> None:
     write_card(folder, fit)
 
 
-def _recipe(folder: Path, name: str | None, sets: list[str]) -> "SweepRecipe":
-    """The recipe of a set that is there or to be made, with what is set otherwise."""
+def _choose_recipe(folder: Path, name: str | None, sets: list[str]) -> "SweepRecipe":
+    """Return the recipe of an existing or a new set, with the values of ``sets``."""
     from tactile_rt.sets.manifest import SweepManifest
     from tactile_rt.sim_backend.datasets.recipe_files import (
         DEFAULT_RECIPE,
@@ -132,11 +132,11 @@ def get(
         typer.echo(f"{typer.style(name, fg='red')}: {why}", err=True)
     licences = sorted({thing.files[0].licence for thing in listed})
     kinds = len({thing.files[0].category for thing in listed})
-    told = {
+    results = {
         "folder": folder, "objects": len(listed), "kinds": kinds, "missing": missing,
         "licences": licences,
     }  # fmt: skip
-    if not told_as_json(told, json):
+    if not told_as_json(results, json):
         typer.echo(
             f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in "
             f"{folder}; licences: {', '.join(licences)}, see objects.csv"

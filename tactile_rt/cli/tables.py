@@ -1,4 +1,4 @@
-"""Tables that survive a pipe and a narrow terminal, results as JSON, and bars of long work."""
+"""Tables for pipes and narrow terminals, results as JSON, and progress bars."""
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 WIDE = 10_000  # columns: more than any table has
 A_DAY_S = 86_400.0
-# Between lines where there is no terminal: at first, and at most; a fourth of the time so far.
+# Pause between progress lines without a terminal: first, longest, share of the time so far.
 LINE_S, LONGEST_S, SHARE = 10.0, 120.0, 0.25
 
 Update = Callable[..., None]
@@ -36,23 +36,23 @@ def show_table(
     """Print one line for each record, or write them all as JSON.
 
     Args:
-        records: what there is to tell of each; may hold more than is printed.
+        records: may have more keys than are printed.
         headings: the heading of every column, by the key of the records that it prints.
-        json: the file to write; `STDOUT`; or None, not to.
+        json: file to write, `STDOUT`, or None for a printed table.
     """
     if told_as_json(list(records), json):
         return
     table = Table(*headings.values(), box=None, header_style="bold", pad_edge=False)
     for record in records:
-        table.add_row(*(escape(_text(record[key])) for key in headings))
+        table.add_row(*(escape(_format_cell(record[key])) for key in headings))
     print_table(table)
 
 
 def show_records(records: "list[Record]", json: Path | None) -> bool:
-    """Print figures beside their bars, or write them as JSON.
+    """Print figures beside their bars (limits), or write them as JSON.
 
     Returns:
-        Whether stdout took the JSON, and nothing else may go there.
+        True if stdout took the JSON, where nothing else may be printed then.
     """
     from tactile_rt.models.evaluation.records import as_dicts, as_table
 
@@ -63,7 +63,7 @@ def show_records(records: "list[Record]", json: Path | None) -> bool:
 
 
 def print_table(table: Table, console: Console | None = None) -> None:
-    """Print a table: whole where nobody looks at it, one fact a line where it does not fit."""
+    """Print a table: complete in a pipe, one cell a line on a narrow terminal."""
     console = console or Console()
     if console.is_terminal:
         console.print(fitting(table, console))
@@ -73,24 +73,24 @@ def print_table(table: Table, console: Console | None = None) -> None:
 
 
 def fitting(table: Table, console: Console) -> RenderableType:
-    """The table, or where a terminal is too narrow for its longest words, a fact a line."""
+    """Return the table, or its cells as lines if its longest words do not fit."""
     needs = Measurement.get(console, console.options.update(max_width=WIDE), table)
-    return table if needs.minimum <= console.width else _facts(table)
+    return table if needs.minimum <= console.width else _list_cells(table)
 
 
 def told_as_json(what: Any, json: Path | None) -> bool:
-    """Write what a command has to tell as JSON, where that is asked for: whole or not at all.
+    """Write a command's results as JSON; a file is written whole or not at all.
 
     Args:
-        what: structs, dataclasses, mappings, sequences, arrays; a number that is none becomes null.
-        json: the file to write; `STDOUT`; or None, not to.
+        what: structs, dataclasses, mappings, sequences, arrays; NaN and infinity become null.
+        json: file to write, `STDOUT`, or None to write nothing.
 
     Returns:
-        Whether it went to stdout, where nothing else may go then.
+        True if stdout took the JSON, where nothing else may be printed then.
     """
     if json is None:
         return False
-    text = msgspec.json.format(msgspec.json.encode(what, enc_hook=_plain), indent=1) + b"\n"
+    text = msgspec.json.format(msgspec.json.encode(what, enc_hook=_convert), indent=1) + b"\n"
     if json == STDOUT:
         typer.echo(text, nl=False)
         return True
@@ -98,8 +98,8 @@ def told_as_json(what: Any, json: Path | None) -> bool:
     return False
 
 
-def _facts(table: Table) -> Text:
-    """Each row as lines "heading: cell"."""
+def _list_cells(table: Table) -> Text:
+    """Return every cell on a line of its own, as "heading: cell"."""
     columns = [(str(column.header), list(column.cells)) for column in table.columns]
     lines = [Text(str(table.title), style="bold")] if table.title else []
     for row in range(table.row_count):
@@ -113,19 +113,19 @@ def _facts(table: Table) -> Text:
     return Text("\n", overflow="fold").join(lines)
 
 
-def _text(value: Any) -> str:
-    """A cell: nothing for what is not known, four digits of a number, a list in a line."""
+def _format_cell(value: Any) -> str:
+    """Return a cell's text: "-" for None, four digits of a float, comma-separated lists."""
     if value is None:
         return "-"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(_text, value))
+        return ", ".join(map(_format_cell, value))
     return str(value)
 
 
-def _plain(value: Any) -> Any:
-    """As JSON has it what msgspec does not know."""
+def _convert(value: Any) -> Any:
+    """Convert a path, mapping or NumPy value, which msgspec cannot encode."""
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, Mapping):
@@ -142,21 +142,20 @@ def progress_bar(
     timed: bool = True,
     console: Console | None = None,
 ) -> Iterator[Update]:
-    """Show a bar with the time left, gone when the block is done or fails.
+    """Show a bar with the time left, which disappears when the block ends.
 
-    Where the console is no terminal a line takes its place after `LINE_S` seconds, and then more
-    and more seldom, so that who reads a log file sees that it goes on; what is done before then
-    says nothing.
+    Without a terminal, a line takes its place after `LINE_S` seconds, and then ever more rarely, so
+    that a log file shows that the work continues. Shorter work prints nothing.
 
     Args:
-        total: of the work; None where its end is not known.
-        completed: was done before, and says nothing about the time left.
-        counted: show how many of the total are done, not what share.
-        timed: show the time left; False where the description says it.
-        console: where to; None: standard error.
+        total: amount of work; None if unknown.
+        completed: amount that was done before and does not count for the time left.
+        counted: show how many of the total are done, not the share.
+        timed: show the time left; False if the description contains it.
+        console: None: standard error.
 
     Yields:
-        What to call as the work goes on: rich's `Progress.update` without the task
+        The function that updates the bar: rich's `Progress.update` without the task
         (``advance=1``, ``completed=7``, ``total=9``, ``description="mug-1"``).
     """
     console = console or Console(stderr=True)
@@ -166,7 +165,7 @@ def progress_bar(
         *((progress.MofNCompleteColumn(),) if counted else ()),
         *((progress.TimeRemainingColumn(),) if timed else ()),
     )
-    # Of rich's usual 30 s: a step may last minutes, and a rate takes two of them.
+    # Not rich's usual 30 s: a step may last minutes, and a rate needs two steps.
     with progress.Progress(
         *columns, console=console, transient=True, speed_estimate_period=A_DAY_S,
         disable=not console.is_terminal,
@@ -189,7 +188,7 @@ def progress_bar(
 
 @contextmanager
 def share_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Show the share of work that is done, 0 to 1, as a bar."""
+    """Show a bar; yield the function that sets the share done, 0 to 1."""
     with progress_bar(what, total=1.0) as update:
         yield lambda share: update(completed=share)
 
@@ -199,25 +198,25 @@ def _print_lines(
 ) -> None:
     pause = LINE_S
     while not done.wait(pause):
-        said = describe_task(task, counted, timed)
-        console.print(said, highlight=False, markup=False, soft_wrap=True)
+        line = describe_task(task, counted, timed)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
         pause = min(max(LINE_S, SHARE * (task.elapsed or 0.0)), LONGEST_S)
 
 
 def describe_task(task: progress.Task, counted: bool, timed: bool = True) -> str:
-    """Return a line that says how far the work is and how long it takes."""
-    said = f"{task.description}:"
+    """Return a line with the progress, the time so far and the time left."""
+    line = f"{task.description}:"
     if task.total and counted:
-        said += f" {task.completed:.0f} of {task.total:.0f},"
+        line += f" {task.completed:.0f} of {task.total:.0f},"
     elif task.total:
-        said += f" {task.percentage:.0f} %,"
-    said += f" {_span(task.elapsed or 0.0)} so far"
+        line += f" {task.percentage:.0f} %,"
+    line += f" {_format_time(task.elapsed or 0.0)} so far"
     left = task.time_remaining if timed else None
-    return f"{said}, about {_span(left)} left" if left else said
+    return f"{line}, about {_format_time(left)} left" if left else line
 
 
-def _span(seconds: float) -> str:
-    """Seconds below two minutes, then minutes, then hours."""
+def _format_time(seconds: float) -> str:
+    """Format a time in seconds below two minutes, then in minutes, then in hours."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     if seconds < 7200:

@@ -1,4 +1,4 @@
-"""`tactile-rt teach`: touches of any sensor, what each was, and a model that knows them."""
+"""`tactile-rt teach`: label touches of any sensor, and learn a model from them."""
 
 import queue
 import shlex
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from tactile_rt.teaching.teacher import Teacher
 
 POLL_S = 0.1
-REST_S = 2.0  # at rest, to measure the noise by
-HINT_S = 20.0  # without a touch, before it is said how strong the readings are; then twice as long
-SILENT_S = 3.0  # without a sample, in a lesson: it is said at once
-RESTS = 3  # tries to be at rest
-PAGE_S = 1.5  # a page asks twice a second
-DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
+REST_S = 2.0  # at rest, to measure the noise
+HINT_S = 20.0  # without a touch, before a hint on the readings' strength; then twice as long
+SILENT_S = 3.0  # without a sample during a lesson, before a warning
+RESTS = 3  # attempts to measure at rest
+PAGE_S = 1.5  # for a page, which asks twice a second, to get the last state
+DEAF_S = 10.0  # without a first sample, before the device counts as silent
 RESTING = f"touch nothing for {REST_S:g} s"
 HELP = (
     "type and press Enter: a name or its number, n the next, u takes a touch back, q learns; "
@@ -71,24 +71,24 @@ def teach(
     from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
-    wanted = [name.strip() for name in classes.split(",") if name.strip()]
-    at = _address(page) if page else None
-    _check_labels(wanted)
+    names = [name.strip() for name in classes.split(",") if name.strip()]
+    at = _parse_address(page) if page else None
+    _check_labels(names)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
     check_folder(folder)
     check_text(folder.absolute())
     base = shipped_model() if model == "shipped" else Path(model) if model else None
     own = (FEATURES, MODEL, LABELS)
-    kept = [*folder.glob("session-*"), *(folder / name for name in own), *filter(None, [base])]
-    if json is not None and json.resolve() in {one.resolve() for one in kept}:
+    files = [*folder.glob("session-*"), *(folder / name for name in own), *filter(None, [base])]
+    if json is not None and json.resolve() in {one.resolve() for one in files}:
         raise ConfigError(f"--json {json} is a file of the lesson, or its model: name another")
-    lesson = _begun_before(folder, base)
+    lesson = _load_lesson(folder, base)
     opened = open_url(source)
     with opened, alone_in(folder), Orders(at) as orders:
         with leaving(seconds):
-            lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
-            orders.teacher = Teacher(lesson, wanted, touches or lesson.taught.each)
+            lesson = lesson or (_begin(folder, opened) if base is None else Lesson.on(folder, base))
+            orders.teacher = Teacher(lesson, names, touches or lesson.taught.each)
             _teach(orders.teacher, opened, source, orders)
         teacher = orders.teacher
         if lesson is None or teacher is None or not lesson.taught_enough:
@@ -107,7 +107,7 @@ def teach(
         lost = f"{stats.corrupt} damaged, {stats.missing} missing samples"
         typer.echo(f"lost on the wire: {lost}")
     learnt = lesson.taught_enough
-    told = {
+    results = {
         "model": folder / MODEL,
         "classes": card.classes,
         "objects": [one.name for one in card.enrolled],
@@ -119,7 +119,7 @@ def teach(
         "corrupt": stats.corrupt,
         "missing": stats.missing,
     }
-    told_as_json(told, json)
+    told_as_json(results, json)
     others = len(card.classes) - (0 if card.enrolled else len(learnt))
     beside = f" beside {others} {'classes' if card.enrolled else 'others'}" if others else ""
     strange = "is none of these" if card.enrolled else "it does not know"
@@ -157,14 +157,14 @@ class Orders:
         if self._page is not None:
             self._page.close()
 
-    def end(self, said: str) -> None:
-        """Let the page show how the lesson ended, until it has asked for it."""
+    def end(self, message: str) -> None:
+        """Show on the page how the lesson ended; wait until it has asked."""
         if self.teacher is not None:
-            self.teacher.ended = said
+            self.teacher.ended = message
             time.sleep(PAGE_S if self._page else 0)
 
     def listen(self) -> None:
-        """Take lines of stdin from now on."""
+        """Start a thread that takes orders from stdin."""
         threading.Thread(target=self._take_lines, daemon=True).start()
 
     def next(self) -> str:
@@ -184,7 +184,7 @@ class Orders:
 
 
 def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
-    """Take touches until there are enough, the stream ends, or who teaches has had enough."""
+    """Take touches until there are enough, the stream ends, or the user stops."""
     from tactile_rt.core.stream import EndOfStream
     from tactile_rt.recording import Recording, StreamWriter
     from tactile_rt.teaching.lesson import BEFORE_NS
@@ -194,7 +194,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
         listener = lesson.listener(source.spec)
     except SpecMismatch as error:
         raise SpecMismatch(f"{error}, or teach in another folder") from None
-    typer.echo(_greeting(lesson, source))
+    typer.echo(_describe_lesson(lesson, source))
     _say(lesson.taught.note)
     if not source.live and teacher.wanted:
         order = f"{teacher.each} touches of each, in this order: {', '.join(teacher.wanted)}"
@@ -202,16 +202,16 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     before = lesson.folder.glob("session-*.mcap") if not source.live else ()
     if any(Recording(one).description.source == url for one in before):
         _say(f"{lesson.folder} holds touches of this recording: they are taken once more")
-    begun = len(lesson.touches)
+    earlier = len(lesson.touches)
     path = lesson.next_recording()
     orders.listen()
-    with StreamWriter(path, source, url=url) as writer, closing(_hear(source, orders)) as coming:
+    with StreamWriter(path, source, url=url) as writer, closing(_receive(source, orders)) as coming:
         if sys.stdin is not None and sys.stdin.isatty() and not teacher.done:
             typer.echo(HELP)
         typer.echo(teacher.prompt())
         label = teacher.label  # of the touch under way, or of the next
         quiet_since, patience_s = time.monotonic(), HINT_S
-        heard, silent = time.monotonic(), False
+        sampled_at, silent = time.monotonic(), False
         while not teacher.done:
             if time.monotonic() - quiet_since > patience_s:
                 _say(teacher.note(listener.hint()))
@@ -222,21 +222,21 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 break
             _say(teacher.obey(order) if order else "")
             if chunk is None:
-                if time.monotonic() - heard > SILENT_S and not silent:
+                if time.monotonic() - sampled_at > SILENT_S and not silent:
                     silent = True
                     _say(teacher.note(f"no sample for {SILENT_S:g} s: is the device plugged in?"))
                     teacher.watch(None)
                 continue
             if silent:
                 _say(teacher.note("samples come again"))
-            heard, silent = time.monotonic(), False
+            sampled_at, silent = time.monotonic(), False
             writer.push(chunk)
             if not listener.classifier.deciding:
                 label = teacher.label
             hasty = listener.hasty
             for onset, end, felt in listener.push(chunk):
                 quiet_since, patience_s = time.monotonic(), HINT_S
-                writer.flush()  # what a line of the labels tells of is there
+                writer.flush()  # the label refers to samples that must be in the file
                 span = listener.seconds(onset - BEFORE_NS), listener.seconds(end)
                 _say(teacher.take(label, felt, path.name, span))
                 label = teacher.label
@@ -244,15 +244,15 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
                 _say(teacher.note(HASTY))
             teacher.watch(listener.seconds(int(chunk.t_ns[-1])))
     if not source.live:
-        taken = Counter(touch.label for touch in lesson.touches[begun:])
+        taken = Counter(touch.label for touch in lesson.touches[earlier:])
         _say("found in it: " + (", ".join(f"{n} {label}" for label, n in taken.items()) or "none"))
         each, more = divmod(taken.total(), len(teacher.wanted) or 1)
-        if teacher.wanted and not begun and each not in (0, teacher.each) and not more:
+        if teacher.wanted and not earlier and each not in (0, teacher.each) and not more:
             _say(f"{taken.total()} touches: if each was touched {each} times, --touches {each}")
 
 
-def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
-    """Yield chunks with the orders that came; read a live source all the while."""
+def _receive(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
+    """Yield chunks with the orders that came; a thread reads a live source."""
     waiting = queue.SimpleQueue[tuple["Chunk | None", str] | Exception]()
     over = threading.Event()
 
@@ -260,7 +260,7 @@ def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, st
         try:
             while not over.is_set():
                 waiting.put((source.read(POLL_S), orders.next()))
-        except Exception as error:  # whatever it is, it belongs to who takes the chunks
+        except Exception as error:  # raised again where the chunks are taken
             waiting.put(error)
 
     while not source.live:
@@ -276,11 +276,11 @@ def _hear(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, st
         reader.join()
 
 
-def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":
-    """The lesson that a folder holds; None: none.
+def _load_lesson(folder: Path, base: Path | None) -> "Lesson | None":
+    """Load the lesson of a folder; None if the folder has no lesson.
 
     Args:
-        base: the network that objects are enrolled on, if one is.
+        base: network to enrol objects on, or None; a new one embeds the recordings again.
     """
     from tactile_rt.classifier.model_file import hash_of
     from tactile_rt.core.locks import alone_in
@@ -309,15 +309,15 @@ def _check_labels(names: list[str]) -> None:
             raise ConfigError(f"--classes names {name!r} twice")
 
 
-def _address(given: str) -> tuple[str, int]:
+def _parse_address(given: str) -> tuple[str, int]:
     host, colon, port = given.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise ConfigError(f"--page is HOST:PORT, as 127.0.0.1:8791, not {given!r}")
     return host, int(port)
 
 
-def _begun(folder: Path, source: "Source") -> "Lesson":
-    """A new lesson, with the noise of the array at rest."""
+def _begin(folder: Path, source: "Source") -> "Lesson":
+    """Begin a lesson; measure the noise of the array at rest."""
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.listener import find_motion, measure_changes, measured_floor
     from tactile_rt.teaching.model import FewShot
@@ -325,7 +325,7 @@ def _begun(folder: Path, source: "Source") -> "Lesson":
     chunks: list[Chunk] = []
     for _ in range(RESTS):
         typer.echo(RESTING)
-        chunks = _take_rest(source) or chunks
+        chunks = _record_rest(source) or chunks
         if not (moved := find_motion(chunks, source.spec)):
             break
         typer.echo(f"that was no rest: {moved} moved")
@@ -335,12 +335,12 @@ def _begun(folder: Path, source: "Source") -> "Lesson":
     return Lesson.begun(folder, taught)
 
 
-def _take_rest(source: "Source") -> "list[Chunk]":
+def _record_rest(source: "Source") -> "list[Chunk]":
     from tactile_rt.core.stream import EndOfStream
 
     chunks: list[Chunk] = []
     samples, needed = 0, REST_S * source.spec.rate_hz
-    heard = time.monotonic()
+    sampled_at = time.monotonic()
     while samples < needed:
         try:
             chunk = source.read(POLL_S)
@@ -349,13 +349,13 @@ def _take_rest(source: "Source") -> "list[Chunk]":
         if chunk is not None and len(chunk):
             chunks.append(chunk)
             samples += len(chunk)
-            heard = time.monotonic()
-        elif time.monotonic() - heard > DEAF_S:
+            sampled_at = time.monotonic()
+        elif time.monotonic() - sampled_at > DEAF_S:
             raise SourceError(f"no sample came for {DEAF_S:g} s: is the device on, and its codec?")
     return chunks
 
 
-def _greeting(lesson: "Lesson", source: "Source") -> str:
+def _describe_lesson(lesson: "Lesson", source: "Source") -> str:
     spec = source.spec
     size = f"{len(spec.elements)} elements x {len(spec.channels)} channels at {spec.rate_hz:g} Hz"
     noise = ", ".join(

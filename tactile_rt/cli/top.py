@@ -1,4 +1,4 @@
-"""`tactile-rt top`: a running daemon in the terminal."""
+"""`tactile-rt top`: show a running daemon in the terminal."""
 
 import sys
 import time
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tactile_rt.daemon.states import Latency, PartState, Snapshot
 
 LARGEST = 16 << 20  # bytes of a state
-EVERY_S = 1.0  # between looks
+EVERY_S = 1.0  # between requests
 COLOURS = {
     "running": "green", "streaming": "green", "ended": "dim", "stopped": "dim",
     "starting": "yellow", "connecting": "yellow", "waiting": "red", "stalled": "red",
@@ -46,7 +46,7 @@ def top(
         raise ConfigError("--json is of one look: give --once, too")
     console = Console()
     if once:
-        found = next(_looks(where))
+        found = next(_poll_snapshots(where))
         if not told_as_json(found, json):
             for part in picture(found).renderables:
                 if isinstance(part, Table):
@@ -55,7 +55,7 @@ def top(
                     console.print(part, soft_wrap=True)
         return
     with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
-        for snapshot in _looks(where):
+        for snapshot in _poll_snapshots(where):
             parts = picture(snapshot).renderables
             fit = [fitting(p, console) if isinstance(p, Table) else p for p in parts]
             live.update(Group(*fit), refresh=True)
@@ -65,8 +65,8 @@ def snapshot_at(url: str) -> "Snapshot":
     """Ask a daemon for its state over HTTP.
 
     Raises:
-        ConfigError: not an http URL, or not a daemon's.
-        SourceError: nobody answers.
+        ConfigError: the URL is not http, or the answer is not a daemon's.
+        SourceError: no daemon answers.
     """
     import http.client
 
@@ -78,7 +78,7 @@ def snapshot_at(url: str) -> "Snapshot":
         parts = urlsplit(url if "//" in url else f"http://{url}")
         host, port = parts.hostname or "", parts.port or 9464
         host.encode("idna")
-    except ValueError:  # which a name that is none is, too
+    except ValueError:  # raised for an invalid host name, too
         host = ""
     if not host or parts.scheme != "http":
         raise ConfigError(f"{url} is not like http://127.0.0.1:9464")
@@ -112,7 +112,7 @@ def read_snapshots(lines: Iterator[bytes]) -> "Iterator[Snapshot]":
             continue
 
 
-def _looks(where: str) -> "Iterator[Snapshot]":
+def _poll_snapshots(where: str) -> "Iterator[Snapshot]":
     if where == "-":
         found = False
         for snapshot in read_snapshots(iter(sys.stdin.buffer.readline, b"")):
@@ -127,7 +127,7 @@ def _looks(where: str) -> "Iterator[Snapshot]":
         try:
             yield snapshot_at(where)
         except SourceError:
-            continue  # it is being restarted; what was true last stays on the screen
+            continue  # it is being restarted; the last state stays on the screen
 
 
 def picture(now: "Snapshot") -> Group:
@@ -155,13 +155,13 @@ def _draw_head(now: "Snapshot") -> Text:
 
 
 def _make_table(headings: str) -> Table:
-    """Return a table with these headings; those that begin with > stand right."""
+    """Return a table with these headings; those that begin with > are right-aligned."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     *names, last = headings.split(", ")
     for name in names:
         right = name.startswith(">")
         table.add_column(name.lstrip(">"), justify="right" if right else "left", no_wrap=True)
-    table.add_column(last)  # which gives way where the terminal is narrow
+    table.add_column(last)  # shrinks if the terminal is narrow
     return table
 
 
@@ -208,8 +208,8 @@ def _draw_consumers(now: "Snapshot") -> Table:
         "CONSUMER, STATE, >STARTS, >WAIT, >TAKEN, >DROP, >P50 MS, >P99, >MAX, TELLS"
     )
     for c in now.consumers:
-        told = {k: f"{v:g}" if isinstance(v, float) else v for k, v in c.details.items() if v != ""}
-        tells = ", ".join(f"{key} {value}" for key, value in told.items())
+        data = {k: f"{v:g}" if isinstance(v, float) else v for k, v in c.details.items() if v != ""}
+        tells = ", ".join(f"{key} {value}" for key, value in data.items())
         table.add_row(
             c.part.name.removeprefix("publisher."), _draw_state(c.part), f"{c.part.starts}",
             f"{sum(c.queue.waiting.values())}", f"{sum(c.queue.taken.values())}",

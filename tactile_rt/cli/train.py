@@ -17,7 +17,7 @@ from tactile_rt.core.settings import take_sets
 if TYPE_CHECKING:
     from tactile_rt.models.training.config import Progress
 
-WAITING = 0.1  # share of an epoch: less says nothing that one could do something about
+WAITING = 0.1  # share of an epoch spent waiting for data: less is not worth reporting
 
 
 @app.command(epilog="tactile-rt train sweeps run --epochs 5 --set width=0.25")
@@ -52,28 +52,28 @@ def train(
 
     asked = {"encoder": encoder, "epochs": epochs, "seed": seed}
     if encoder is not None and encoder.endswith(".toml"):
-        asked |= {"encoder": "graph", "graph": _text(Path(encoder))}
+        asked |= {"encoder": "graph", "graph": _read_text(Path(encoder))}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     if also:
         given["also"] = tuple(map(str, also))
     if begin is not None:
         given = {**network_of(begin), **given, "begin": str(begin)}
     config = read_recipe(recipe, str(data), sets or (), **given)
-    first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, or alone
-    # What cannot be is refused before torch has taken its seconds.
+    first = os.environ.get("RANK", "0") == "0"  # the first of torchrun's processes, or the only one
+    # Refuse what cannot be trained before torch is imported, which takes seconds.
     config.check_sets()
     if config.begin:
         describe_checkpoint(Path(config.begin))
     check_folder(folder)
     if first:
-        with alone_in(folder):  # for a moment: the training takes it again
+        with alone_in(folder):  # only a check: the training locks it again
             pass
     with needing("train"):
         import torch
 
         from tactile_rt.models.training.loop import train as train_network
     torch.set_num_threads(threads)
-    # Under torchrun every process has the same to say.
+    # Under torchrun every process would print the same.
     console = Console(stderr=True, quiet=not first)
     history: list[dict[str, Any]] = []
     with progress_bar("finding onsets", console=console) as update:
@@ -86,7 +86,7 @@ def train(
             )
             if at.metrics:
                 history.append({"epoch": at.epoch, "update": at.update, **at.metrics})
-                console.print(_in_words(at))
+                console.print(_describe_epoch(at))
 
         with needing("train"):
             best = train_network(config, folder, show, device=accelerator)
@@ -95,22 +95,22 @@ def train(
     console.print(f"best network: {best}")
 
 
-def _in_words(at: "Progress") -> str:
+def _describe_epoch(at: "Progress") -> str:
     m = at.metrics
     if "validation_top1" in m:
-        found = _top1(m)
+        found = _describe_top1(m)
     else:
         found = f"validation loss {m['validation_loss']:.3f}"
     waited = f" ({100 * m['waiting']:.0f} % of the time waiting for data)"
     return f"epoch {at.epoch}: loss {m['loss']:.3f}, {found}" + waited * (m["waiting"] >= WAITING)
 
 
-def _top1(m: dict[str, float]) -> str:
+def _describe_top1(m: dict[str, float]) -> str:
     noisy = f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
     return f"validation top-1 {100 * m['validation_top1']:.1f} % clean, {noisy}"
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text()
     except UnicodeDecodeError:
@@ -162,7 +162,7 @@ def probe(
         best = fit(checkpoint, folder, config, show)
     m = shown[-1].metrics
     told_as_json({"best": best, **m}, json)
-    typer.echo(f"{best}: {_top1(m)}", err=True)
+    typer.echo(f"{best}: {_describe_top1(m)}", err=True)
 
 
 @app.command(epilog="tactile-rt export run/best.pt model.onnx")
@@ -199,14 +199,14 @@ def export(
     with progress_bar("calibrating, exporting and checking parity"):
         card = release(checkpoint, model, name or model.stem, precision, form, data or (), license)
     size, found = model.stat().st_size / 1e6, card.figures
-    told = {"model": model, "megabytes": size, "temperature": card.temperature, **found}
-    told_as_json(told, json)
+    results = {"model": model, "megabytes": size, "temperature": card.temperature, **found}
+    told_as_json(results, json)
     parity = f"parity {found['parity']:.1e}, temperature {card.temperature:.2f}"
     typer.echo(f"{model}: {size:.1f} MB, {parity}", err=True)
     if precision != "fp32":
-        kept = "{quantisation_agreement:.1f} % of {quantisation_sweeps} validation decisions as in "
-        kept += "fp32, top-1 {quantisation_top1_drop:.1f} points lower"
-        typer.echo(kept.format(**found), err=True)
+        line = "{quantisation_agreement:.1f} % of {quantisation_sweeps} validation decisions as in "
+        line += "fp32, top-1 {quantisation_top1_drop:.1f} points lower"
+        typer.echo(line.format(**found), err=True)
 
 
 @app.command(epilog="tactile-rt grid wide24 grid --processes 2")
@@ -227,16 +227,16 @@ def grid(
     from tactile_rt.sets.manifest import SweepManifest
 
     check_folder(folder)
-    wanted = read_grid(plan)
-    if waiting_tasks(wanted, folder):
-        SweepManifest.read(Path(wanted.data))
+    planned = read_grid(plan)
+    if waiting_tasks(planned, folder):
+        SweepManifest.read(Path(planned.data))
     with needing("train"):
         from tactile_rt.models.grid.picture import draw_grid
         from tactile_rt.models.grid.pool import run_grid
         from tactile_rt.models.grid.results import GridResults, gather, write_results
 
     def conclude() -> GridResults:
-        results = gather(wanted, folder)
+        results = gather(planned, folder)
         write_results(results, folder)
         draw_grid(results, folder / "task_performance.png")
         return results
@@ -244,15 +244,15 @@ def grid(
     def show(found: Outcome, done: int, total: int) -> None:
         update(completed=done, total=total)
         right = found.right()
-        said = found.failed or f"top-1 {100 * right.mean():.1f} %"
+        result = found.failed or f"top-1 {100 * right.mean():.1f} %"
         took = f", {found.seconds:.0f} CPU s" if found.seconds else ""
-        typer.echo(f"{done}/{total} {found.name}, seed {found.seed}: {said}{took}", err=True)
+        typer.echo(f"{done}/{total} {found.name}, seed {found.seed}: {result}{took}", err=True)
         if done % per_seed == 0:
             conclude()
 
-    per_seed = -(-len(wanted.tasks()) // wanted.seeds)
-    done = len(wanted.tasks()) - len(waiting_tasks(wanted, folder))
-    with progress_bar("tasks", len(wanted.tasks()), done, counted=True) as update:
-        run_grid(wanted, folder, processes, show, accelerator)
+    per_seed = -(-len(planned.tasks()) // planned.seeds)
+    done = len(planned.tasks()) - len(waiting_tasks(planned, folder))
+    with progress_bar("tasks", len(planned.tasks()), done, counted=True) as update:
+        run_grid(planned, folder, processes, show, accelerator)
     told_as_json(conclude(), json)
     typer.echo(f"{folder}: its tables and pictures", err=True)

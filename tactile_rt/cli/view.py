@@ -1,4 +1,4 @@
-"""`tactile-rt view`: a sweep as a picture or a video; `whisk`: what whisking whiskers feel."""
+"""`tactile-rt view`: draw a sweep as a picture or a video; `whisk`: simulate whisking."""
 
 import hashlib
 import os
@@ -58,7 +58,7 @@ def view(
             from tactile_rt.sim_backend.views import film
             from tactile_rt.sim_backend.views.footage import VIEWS, record
             from tactile_rt.sim_backend.world import PROFILES
-    except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver
+    except (AttributeError, RuntimeError) as error:  # raised by mujoco if it finds no such driver
         if "MUJOCO_GL" not in os.environ:
             raise
         raise ConfigError(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; unset it") from None
@@ -108,7 +108,7 @@ def view(
 
 @dataclass(frozen=True)
 class Spacing:
-    """How the stimuli stand."""
+    """Placement of the stimuli."""
 
     radius_mm: float = 63.6  # radius of the stimuli's arc, mm
     step_mm: str = "1,1,0"  # vector from a stimulus to the next further one: ``x,y,z``, mm
@@ -170,7 +170,7 @@ def whisk(
         sha256 = hashlib.sha256(trajectory.read_bytes()).hexdigest()
         followed = {"file": trajectory.name, "sha256": sha256}
     pieces, described = {}, {}
-    # The stimuli stand on the right of the head, those of an array of the left on its left.
+    # The stimuli stand on the right of the head; for an array of the left side, on the left.
     left = all(w.base[0] < 0 for w in animal.whiskers)
     head, mirror = (HEAD.mirrored(), np.array([-1.0, 1.0, 1.0])) if left else (HEAD, np.ones(3))
     if target is not None:
@@ -218,15 +218,15 @@ def whisk(
         base_angles(moves, times, animal.whiskers),
         parameters,
     )
-    told = [
+    results = [
         {
             "stimulus": name, "first_ms": what.first_ms,
             "whiskers": int(what.touch.any(axis=0).sum()),
         }
         for name, what in felt.items()
     ]  # fmt: skip
-    told_as_json(told, json)
-    for one in told:
+    told_as_json(results, json)
+    for one in results:
         typer.echo(
             f"{one['stimulus']}: first contact at {one['first_ms']} ms, {one['whiskers']} of "
             f"{len(animal.whiskers)} whiskers touch it",

@@ -1,7 +1,7 @@
-"""A project: a folder that goes from the description of an array to a robot that decides.
+"""A project: a folder with the description of an array and the model that is made for it.
 
-folder.py    what the folder holds, and how a new one begins
-plan.py      what fits into the time given
-making.py    sweeps, training, export, evaluation, one after the other, resumable
-report.py    what came of it, on one page
+folder.py    the files of a project folder, and how to create a new one
+budget.py    the numbers of objects, sweeps and updates that fit into the given time
+making.py    sweeps, training, export and evaluation, in this order, resumable
+report.py    the report card: the results on one page
 """

@@ -1,7 +1,7 @@
-"""What fits into the time that is given: how many objects and sweeps, how many updates.
+"""The numbers of objects, sweeps and training updates that fit into the given time.
 
-Measured on this machine with this array before it is decided, and then kept, so that a project
-that is interrupted goes on with the same set and the same training.
+Sweeps and updates are timed on this machine with this array. The numbers are stored, so that an
+interrupted project continues with the same set and the same training.
 """
 
 import hashlib
@@ -22,34 +22,34 @@ from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.transducer import device_spec
 
-SWEEPS_SHARE = 0.45  # of the time given; training has as much, and the rest is for the report
+SWEEPS_SHARE = 0.45  # of the given time; training gets about as much, and the report the rest
 PILOTS = 5  # sweeps that are timed
-AT_ONCE = 0.85  # what a further core adds
-ENOUGH = 60  # objects of a category, before they are swept more often
-FEWEST = 5  # objects of a category: three to learn from, one to choose by, one to test on
-TEST_OBJECTS = 60  # of all categories, where there is time for them
+AT_ONCE = 0.85  # share of its speed that each further core adds
+ENOUGH = 60  # objects of a category, before each is swept more often
+FEWEST = 5  # objects of a category: three for training, one for validation, one for test
+TEST_OBJECTS = 60  # of all categories together, if there is time for them
 TEST_SHARE, VALIDATION_SHARE = 0.18, 0.12  # of the objects of a category
-MEMORY_SHARE = 0.1  # of the machine's, for the set
+MEMORY_SHARE = 0.1  # of the machine's memory, for the sweep set
 
 
 class Budget(msgspec.Struct, forbid_unknown_fields=True):
-    """What was decided for a project.
+    """The numbers of objects, sweeps and updates chosen for a project.
 
     Attributes:
-        per_category, validation, test: The numbers of objects of a category, and of those held out.
-        updates: The number of updates of the training; 0: not decided yet.
+        per_category, validation, test: The number of objects of a category, and of those held out.
+        updates: The number of training updates; 0: not chosen yet.
     """
 
-    described: str
+    described: str  # fingerprint of array.toml and sweeps.toml
     per_category: int
     validation: int
     test: int
-    draws: int
+    draws: int  # sweeps of every combination of the recipe's `each` values
     updates: int = 0
 
 
 def read_budget(project: Project) -> Budget | None:
-    """The budget of a project that was begun before; None: it was not."""
+    """Return the stored budget of a project; None if it has none yet."""
     path, anew = project.build / "budget.json", f"remove {project.build} to begin anew"
     if not path.exists():
         return None
@@ -66,16 +66,16 @@ def read_budget(project: Project) -> Budget | None:
 
 
 def write_budget(project: Project, budget: Budget) -> None:
-    """Keep a budget."""
+    """Write the budget into the project folder."""
     project.build.mkdir(exist_ok=True)
     text = msgspec.json.format(msgspec.json.encode(budget), indent=1)
     write_whole(project.build / "budget.json", lambda file: file.write(text))
 
 
 def budget_sweeps(project: Project, seconds: float) -> Budget:
-    """Time some sweeps, and decide how many fit."""
+    """Time some sweeps, and return a budget of objects and sweeps that fit."""
     recipe = project.recipe()
-    each_s = _time_of_a_sweep(recipe)
+    each_s = _time_sweep(recipe)
     cores = 1 + AT_ONCE * ((os.cpu_count() or 1) - 1)
     sweeps = SWEEPS_SHARE * seconds * cores / each_s
     elements, channels = device_spec(load_animals(recipe.array)).shape
@@ -86,12 +86,12 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
     draws = recipe.sweeps.draws
     while draws > 1 and sweeps < kinds * ENOUGH * draws:
         draws -= 1
-    of_a_kind = max(FEWEST, int(sweeps / kinds / draws))
-    if not recipe.objects.generated:  # a folder's own objects: all of them, swept less often
+    affordable = max(FEWEST, int(sweeps / kinds / draws))
+    if not recipe.objects.generated:  # objects of a folder are all used, but swept less often
         chosen = recipe.objects
         most = max(1, int(sweeps / max(1, sum(map(len, objects.split.values())))))
         return Budget(described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most))
-    per_category = min(of_a_kind, recipe.objects.per_category)
+    per_category = min(affordable, recipe.objects.per_category)
     test = max(round(TEST_SHARE * per_category), math.ceil(TEST_OBJECTS / kinds))
     test = max(1, min(test, per_category // 3))
     validation = max(1, round(VALIDATION_SHARE * per_category))
@@ -99,7 +99,7 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
 
 
 def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
-    """The recipe with the budget's numbers of objects and sweeps."""
+    """Return the recipe with the budget's numbers of objects and sweeps."""
     objects = recipe.objects
     if budget.test:
         counts = {k: getattr(budget, k) for k in ("per_category", "validation", "test")}
@@ -107,8 +107,8 @@ def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
     return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=budget.draws))
 
 
-def _time_of_a_sweep(recipe: SweepRecipe) -> float:
-    """The time that one takes, s: the mean over some, after a first one for the compiler."""
+def _time_sweep(recipe: SweepRecipe) -> float:
+    """Return the mean time of a sweep in s, without the first, which compiles."""
     objects = choose_objects(recipe.objects)
     names = objects.split["train"][: PILOTS + 1]
     times = []
@@ -121,7 +121,7 @@ def _time_of_a_sweep(recipe: SweepRecipe) -> float:
 
 
 def described(project: Project) -> str:
-    """The fingerprint of what a project's set is made of."""
+    """Return a fingerprint of the files that define a project's sweep set."""
     digest = hashlib.sha256()
     for name in ("array.toml", "sweeps.toml"):
         digest.update((project.folder / name).read_bytes())

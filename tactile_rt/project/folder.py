@@ -1,12 +1,12 @@
-"""A project's folder: your whiskers, what touches them, your robot.
+"""The folder of a project: an array, the objects that touch it, a robot and a model.
 
-array.toml       your whiskers and what reads them
-array.json       the same as a robot knows them, which no device or model may differ from
-sweeps.toml      what touches them, and how
-robot.toml       the device and the model of `tactile-rt run robot.toml`
-test_robot.py    your robot's own code, driven by the device that does not exist yet
+array.toml       the whiskers of the array, and the sensor that reads them
+array.json       the same array as JSON, which every device and model must match
+sweeps.toml      the objects that touch the array, and how they pass it
+robot.toml       the device and the model for `tactile-rt run robot.toml`
+test_robot.py    a test of the robot's own code, driven by an emulated device
 README.md        the commands, in order
-model.onnx, report/, build/  what `tactile-rt make` makes
+model.onnx, report/, build/  output of `tactile-rt make`
 """
 
 import re
@@ -43,18 +43,18 @@ from tactile_rt.sim_backend.world import PROFILES
 
 RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
-NO_NAME = re.compile(r"[^\w.+-]+")  # what a URL or a file in TOML would take for something else
+NO_NAME = re.compile(r"[^\w.+-]+")  # characters with a meaning of their own in a URL or TOML
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
-# mm/s, of objects of 40 mm. Larger ones are faster: so in a window as much of the array is touched.
+# mm/s, for objects of 40 mm. Larger ones are faster: a window then covers as much of the array.
 SPEEDS = (28, 40)
 
 
 @dataclass(frozen=True)
 class DeviceLine:
-    """The line that a project's robot listens to.
+    """The line from which a project's robot reads its device.
 
     Attributes:
-        wire: The kind of line, ``serial`` or ``can``.
+        wire: ``serial`` or ``can``.
         port: The serial port, or INTERFACE:CHANNEL of a bus.
     """
 
@@ -65,12 +65,12 @@ class DeviceLine:
 
 
 class Project:
-    """A project's folder.
+    """The folder of a project.
 
     Attributes:
-        array: The description of the array.
-        model: The model that is made.
-        build: The folder of what is made on the way.
+        array: The file that describes the array, array.toml.
+        model: The model file that `make` writes.
+        build: The folder of intermediate results.
         report: The folder of the report card.
     """
 
@@ -88,33 +88,33 @@ class Project:
         self.build, self.report = folder / "build", folder / "report"
 
     def write_spec(self) -> None:
-        """Write array.json, the array as a source and a model have it."""
+        """Write array.json, the array as sources and models describe it."""
         spec = device_spec(load_animals(str(self.array)))
         _write(self.folder / "array.json", spec.to_json())
 
     def recipe(self) -> SweepRecipe:
-        """What is to be swept past the array; its numbers of objects and sweeps are the most."""
+        """Read the sweep recipe; its numbers of objects and sweeps are upper limits."""
         recipe = read_recipe(str(self.folder / "sweeps.toml"), self.folder)
         if Path(recipe.array).resolve() != self.array.resolve():
             raise ConfigError(f'{self.folder / "sweeps.toml"}: array must be "array.toml"')
         return recipe
 
     def source_url(self, objects: Sequence[str], seed: int = 0, **options: object) -> str:
-        """The URL of the simulated array with these objects, as its device would deliver it.
+        """Return the ``sim:`` URL of the array with these objects, as its device reads it.
 
-        They are swept past it as sweeps.toml says.
+        The objects are swept past the array as sweeps.toml says.
         """
         meshes = choose_objects(self.recipe().objects).mesh_options
         recipe = self.folder / "sweeps.toml"
-        named = ",".join(name.replace(",", "%2C") for name in objects)
-        asked = {"objects": named, "recipe": recipe, "seed": seed, **meshes, **options}
-        query = urlencode(asked, safe=",/", quote_via=quote)  # a + is no space in our URLs
+        names = ",".join(name.replace(",", "%2C") for name in objects)
+        fields = {"objects": names, "recipe": recipe, "seed": seed, **meshes, **options}
+        query = urlencode(fields, safe=",/", quote_via=quote)  # our URLs do not read + as a space
         return f"sim:{quote(str(self.array))}?{query}"
 
     def unseen(self) -> tuple[str, ...]:
-        """Objects that the model has never met, as a ``sim:`` URL calls them.
+        """Return objects that the model was not trained on, named as in ``sim:`` URLs.
 
-        Without a model, those that the sweeps hold out.
+        Without a model, these are the test objects of sweeps.toml.
         """
         objects = choose_objects(self.recipe().objects)
         names: Sequence[str] = objects.split["test"]
@@ -123,7 +123,7 @@ class Project:
         return tuple(objects.target(name) for name in names)
 
     def full_scale(self, codec: str) -> dict[str, str]:
-        """Options of a codec whose format rounds: the largest readings of the array's sensor."""
+        """Return range options of the native codec from the sensor; empty for other codecs."""
         sensor = sensor_of(load_animals(str(self.array)))
         if codec != "native" or sensor is None:
             return {}
@@ -134,7 +134,7 @@ class Project:
         return {name: f"{value:g}" for name, value in largest.items()}
 
     def line(self) -> DeviceLine:
-        """The line and the codec of the first source of robot.toml."""
+        """Return the line and codec of the first source in robot.toml."""
         file = self.folder / "robot.toml"
         url = load_config(file).config.source[0].url
         scheme, target, fields = split_url(url)
@@ -150,11 +150,11 @@ class Project:
     def spoken(
         self, codec: str | None = None, options: Mapping[str, str] = MappingProxyType({})
     ) -> tuple[str, dict[str, str]]:
-        """What the device speaks: the name of its codec, and the codec's options.
+        """Return the name of the device's codec, and the codec's options.
 
         Args:
-            codec: instead of that of robot.toml.
-            options: instead of those of robot.toml, or beside them.
+            codec: replaces that of robot.toml.
+            options: replace those of robot.toml, or add to them.
         """
         line = self.line()
         codec = codec or line.codec
@@ -163,19 +163,19 @@ class Project:
 
 
 def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> Project:
-    """Begin a project in a new or an empty folder.
+    """Create a project in a new or an empty folder.
 
     Args:
-        array: the name of an array, or a .toml file; a file or a robot's is copied. Empty: eight
-            nylon whiskers on a plate, to be changed into one's own.
+        array: name of an array, or a .toml file. A file, or that of a robot's array, is copied.
+            Empty: an example, eight nylon whiskers on a plate, to be edited.
 
     Raises:
-        ConfigError: the folder holds something, no such array or category, or an array that is
-            more than one file.
+        ConfigError: the folder is not empty, the array or a category is unknown, or the array
+            needs more than one file.
     """
     templates = resources.files("tactile_rt.project") / "templates"
     with resources.as_file(templates / "array.toml.txt") as example:
-        described = _described(array, folder) if array else example.read_text("utf-8")
+        array_text = _make_array_text(array, folder) if array else example.read_text("utf-8")
         animals = load_animals(array) if array else read_animals(example)
     spec = device_spec(animals)
     known = (*CATEGORIES, *added_categories())
@@ -212,17 +212,17 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
     try:
         for name, text in texts.items():
             _write(folder / name, Template(text).substitute(words))
-        _write(folder / "array.toml", described)
+        _write(folder / "array.toml", array_text)
         project = Project(folder)
         project.write_spec()
-    except OSError:  # the disk is full: the folder may be named again
+    except OSError:  # such as a full disk: leave the folder empty for another try
         for name in (*texts, "array.toml"):
             (folder / name).unlink(missing_ok=True)
         raise
     return project
 
 
-def _described(array: str, folder: Path) -> str:
+def _make_array_text(array: str, folder: Path) -> str:
     if array in ROBOTS:
         return robot_text(array)
     path = Path(array)

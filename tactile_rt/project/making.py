@@ -1,8 +1,8 @@
-"""From a project's folder to a model that decides, and a page that says how well.
+"""The stages that make a project's model and its report card.
 
     sweeps -> training -> export -> evaluation -> report
 
-Each part is made once: what is there is not made again, and what was interrupted goes on.
+Finished sweeps and training are not repeated; interrupted ones continue.
 """
 
 import os
@@ -45,24 +45,24 @@ from tactile_rt.sim_backend.views.contact_sheet import write_contact_sheet
 from tactile_rt.sim_backend.world import PROFILES
 
 LEAST_MINUTES = 1.0
-SWEPT_BY = 0.48  # of the time given, even where sweeps take longer than those that were timed
-TRAINED_BY = 0.87  # of the time given: the rest is for export, evaluation and report
+SWEPT_BY = 0.48  # of the given time: sweeping ends then, even if sweeps take longer than timed
+TRAINED_BY = 0.87  # of the given time: the rest is for export, evaluation and report
 PILOT = 24  # updates that are timed
 MOST_EPOCHS = 60
 FEWEST_UPDATES = 200
-RECIPE = "small"  # of the training
-PREVIEW_S, PREVIEWED = 50.0, 12  # for all sweeps of a preview; sweeps of a kind
+RECIPE = "small"  # training recipe
+PREVIEW_S, PREVIEWED = 50.0, 12  # time limit of a preview; its sweeps of each kind
 
 Splits = tuple[SweepSet, SweepSet]
 
 
 @dataclass(frozen=True)
 class MakeProgress:
-    """How far a project is.
+    """The progress of making a project.
 
     Attributes:
-        done, of: The amount of it that is there, and the amount that is to be.
-        left_s: The time that everything still takes, s.
+        done, of: The finished amount and the total amount of the stage called ``name``.
+        left_s: The rest of the given time, for all stages, s.
     """
 
     name: str
@@ -72,14 +72,14 @@ class MakeProgress:
 
 
 class _OutOfTime(Exception):
-    """Ends a training after an epoch; its best network is on disk."""
+    """Raised to end a training after an epoch; the best network is on disk."""
 
 
 Tell = Callable[[MakeProgress], None]
 
 
 def preview_sweeps(project: Project, picture: Path) -> dict[str, Tally]:
-    """Count some sweeps of each kind, and draw where its first one touches (.png)."""
+    """Simulate and count some sweeps of each kind; draw the first touches (.png)."""
     recipe, end = project.recipe(), time.monotonic() + PREVIEW_S
     objects, animals = choose_objects(recipe.objects), load_animals(recipe.array)
     kinds: dict[str, list[str]] = {}
@@ -92,7 +92,7 @@ def preview_sweeps(project: Project, picture: Path) -> dict[str, Tally]:
             break
         try:
             target = objects.load(kinds[kind][number % len(kinds[kind])])
-        except ConfigError:  # a mesh that the set leaves out, too
+        except ConfigError:  # a mesh that a sweep set leaves out, too
             continue
         found = simulate_sweep(recipe, target, number % len(recipe.sweeps)).parameters
         counts[kind].update(
@@ -111,15 +111,15 @@ def preview_sweeps(project: Project, picture: Path) -> dict[str, Tally]:
 
 
 def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[Record]:
-    """Make a project's model within a time, or go on with what was begun.
+    """Make a project's model within the given time, or continue an interrupted run.
 
     Args:
-        minutes: for everything, from now on. A little time makes a smaller set and a shorter
-            training, and so a worse model, but a model.
+        minutes: for all stages, from now on. Less time gives a smaller set and a shorter training,
+            and so a worse model.
     """
     if not minutes >= LEAST_MINUTES:
         raise ConfigError(f"--minutes must be at least {LEAST_MINUTES:g}, not {minutes:g}")
-    project.line()  # a mistake in robot.toml is told before the work, not after
+    project.line()  # reports a mistake in robot.toml before the work, not after
     end = time.monotonic() + 60 * minutes
     budget = read_budget(project)
     if budget is None:
@@ -141,41 +141,41 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
 
 
 def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tell) -> Path:
-    """Make the set, or as much of it as there is time for."""
+    """Make the sweep set, or as much as time permits; return its folder."""
     folder = project.build / "sweeps"
     recipe = sized(project.recipe(), budget)
     manifest = describe_set(recipe)
     left = manifest.names()
-    of, there = len(left), len(finished_objects(folder, left))
-    # All grow alike, the test twice as fast: of the smallest one object of a category is enough.
+    total, finished = len(left), len(finished_objects(folder, left))
+    # Splits grow in step, the test twice as fast. The smallest needs one object of each category.
     smallest = min(len(names) for names in manifest.split.values() if names)
     share = len(manifest.categories) / smallest
-    fewest = share * (of + len(manifest.split["test"])) + (os.cpu_count() or 1)
+    fewest = share * (total + len(manifest.split["test"])) + (os.cpu_count() or 1)
     with closing(make_sweeps(recipe, folder)) as made:
         for done, name in enumerate(made, start=1):
             left.remove(name)
-            if done > there:
-                tell(MakeProgress("sweeping", done, of, end - time.monotonic()))
-            if done > max(there, fewest) and time.monotonic() > until:
+            if done > finished:
+                tell(MakeProgress("sweeping", done, total, end - time.monotonic()))
+            if done > max(finished, fewest) and time.monotonic() > until:
                 break
-    if left:  # for which there was no time
+    if left:  # no time was left for these
         for name in left:
             (folder / f"{name}.part").unlink(missing_ok=True)
         write_skipped(
             folder, read_skipped(folder) | dict.fromkeys(left, "there was no time for it")
         )
         write_sums(folder)
-    counted = tally(folder, manifest.names(), len(recipe.sweeps))
-    if counted.shortcomings:
-        said = f"{counted.sweeps} sweeps: {counted.shortcomings}"
-        tell(MakeProgress(said, of, of, end - time.monotonic()))
+    counts = tally(folder, manifest.names(), len(recipe.sweeps))
+    if counts.shortcomings:
+        summary = f"{counts.sweeps} sweeps: {counts.shortcomings}"
+        tell(MakeProgress(summary, total, total, end - time.monotonic()))
     return folder
 
 
 def _train(
     project: Project, budget: Budget, sweeps: Path, until: float, end: float, tell: Tell
 ) -> Path:
-    # More would wait for each other: dozens of times slower where another program has a core.
+    # More threads wait for each other: dozens of times slower if another program uses a core.
     torch.set_num_threads(1)
     tell(MakeProgress("finding onsets", 0, 1, end - time.monotonic()))
     config = read_recipe(RECIPE, str(sweeps.resolve()))
@@ -184,7 +184,7 @@ def _train(
     twice = len(splits[0].sweeps) > len(set(splits[0].sweeps.objects.tolist()))
     config = replace(config, batch=batch, identity=config.identity if twice else 0.0)
     if not budget.updates:
-        each_s = _time_of_an_update(project, config, splits)
+        each_s = _time_update(project, config, splits)
         most = MOST_EPOCHS * len(splits[0].sweeps) // batch
         budget.updates = max(FEWEST_UPDATES, min(int((until - time.monotonic()) / each_s), most))
         write_budget(project, budget)
@@ -202,8 +202,8 @@ def _train(
     return run / "best.pt"
 
 
-def _time_of_an_update(project: Project, config: TrainingConfig, splits: Splits) -> float:
-    """The time that one takes with its share of the validation after every epoch, s."""
+def _time_update(project: Project, config: TrainingConfig, splits: Splits) -> float:
+    """Return the time of an update in s, with its share of validation."""
     at: list[float] = []
     with TemporaryDirectory(dir=project.build) as folder:
         pilot = replace(config, updates=PILOT)

@@ -1,4 +1,4 @@
-"""Where objects pass an array, so that they touch it: from where its whiskers reach."""
+"""Sizes and places at which objects touch an array, found from the reach of its whiskers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,11 +12,11 @@ from tactile_rt.sim_backend.sweep import Sweep, centrelines, draw_sweep, usual_d
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
 
-SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
-ABOUT_MM = 6.0  # how far an object of 40 mm passes above or below the middle of the tips
+SPREAD = (5.5 / 6.5, 8 / 6.5)  # relative range of the distances, as `draw_sweep` draws them
+ABOUT_MM = 6.0  # largest height of an object of 40 mm above or below the middle of the tips
 NEARER = (1.0, 0.8, 0.6, 0.45, 0.3)  # shares of the usual distance, tried in turn
-TRIALS, ENOUGH = 48, 0.97  # sweeps that are tried, and the share of them that is to touch
-_make_object = lru_cache(2 * TRIALS)(make_object)  # the same ones pass at every distance
+TRIALS, ENOUGH = 48, 0.97  # sweeps that are tried, and the share of them that should touch
+_make_object = lru_cache(2 * TRIALS)(make_object)  # the same objects pass at every distance
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class ObjectPlacing:
         size_mm: The largest extent of an object.
         distance_mm: The least and the largest distance from the bases of the whiskers.
         height_mm: The least and the largest height.
-        touching: The share of sweeps, drawn so, in which an object touches a whisker.
+        touching: The share of sweeps at these places in which an object touches a whisker.
     """
 
     size_mm: float
@@ -39,8 +39,8 @@ class ObjectPlacing:
 def place_objects(animals: tuple[WhiskerArray, ...], kinds: Sequence[str]) -> ObjectPlacing:
     """Find sizes and places at which nearly all sweeps touch; else those where most do.
 
-    Objects are as large as the tips are apart, at the height of the tips, and as near as need be:
-    nearer ones jam stiff whiskers.
+    Objects are as large as the tips are apart, at the height of the tips, and no nearer than
+    needed: nearer objects jam stiff whiskers.
 
     Args:
         kinds: categories of the objects.
@@ -66,7 +66,7 @@ def _share_touching(
     distance_mm: tuple[float, float],
     height_mm: tuple[float, float],
 ) -> float:
-    """Share of sweeps of new objects that touch; nothing is simulated."""
+    """Return the share of sweeps of new objects that touch, without a simulation."""
     rng, touching = np.random.default_rng(0), 0
     for number in range(TRIALS):
         distance, height = float(rng.uniform(*distance_mm)), float(rng.uniform(*height_mm))

@@ -1,4 +1,4 @@
-"""A project's report card: one page that says how far the model can be trusted, with pictures."""
+"""The report card of a project: one page, with pictures, on how far to trust the model."""
 
 import base64
 from collections.abc import Sequence
@@ -31,11 +31,11 @@ HEADLINES = {
     "calibration error": "how far its probabilities are from what they promise",
     "time to the final decision": "from the first touch until the decision stands",
 }
-CONFUSED = 0.05  # share of a kind's sweeps that are taken for another: more is told
+CONFUSED = 0.05  # least share of a kind's sweeps taken for another that is reported
 
 
 def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> Path:
-    """Write ``report/report.html`` beside the pictures of `evaluate_model`, and its confusions."""
+    """Write ``report/report.html`` and confusion.png beside the pictures of `evaluate_model`."""
     session, card = load_model(project.model)
     test = SweepSet.read(sweeps, "test")
     run = measures.run_steps(session, card)
@@ -72,10 +72,10 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
 def confused(
     table: NDArray[np.int64], labels: Sequence[str], share: float = CONFUSED
 ) -> list[tuple[str, str, float]]:
-    """What is taken for what, worst first: kind, what it is taken for, share of its sweeps.
+    """Return (kind, kind it is taken for, share of its sweeps), worst first.
 
     Args:
-        table: (true, decided) counts.
+        table: counts of sweeps, shape (true, decided).
     """
     shares = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
     pairs = [
@@ -88,12 +88,12 @@ def confused(
 
 def _describe_sweeps(folder: Path) -> str:
     manifest = SweepManifest.read(folder)
-    there = {s: [n for n in manifest.split[s] if has_object(folder, n)] for s in SPLITS}
+    stored = {s: [n for n in manifest.split[s] if has_object(folder, n)] for s in SPLITS}
     every = tally(
         folder, manifest.names(SPLITS), draws := len(recipe_of_set(manifest.recipe).sweeps)
     )
     learnt, chosen, tested = (
-        f"{draws * len(there[split])} sweeps of {len(there[split])}" for split in SPLITS
+        f"{draws * len(stored[split])} sweeps of {len(stored[split])}" for split in SPLITS
     )
     touching, beyond = every.shares
     return (

@@ -47,7 +47,7 @@ def test_without_the_rigs_it_is_one_line(strange):
 
 @pytest.mark.parametrize("area", bench.AREAS)
 def test_each_area_is_found_from_any_folder(area, strange):
-    code = f"from tactile_rt.cli import bench; rig = bench._rig({area!r}); print(rig.__file__)"
+    code = f"from tactile_rt.cli import bench; rig = bench._load_rig({area!r}); print(rig.__file__)"
     done = ask(code, strange, strange, bench.CHECKOUT)
     assert done.stdout.strip() == str(bench.CHECKOUT / "bench" / area / "area.py"), done.stderr
 
