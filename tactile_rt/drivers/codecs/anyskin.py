@@ -41,6 +41,8 @@ class AnySkinOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.magnetometers <= 64:
             raise ConfigError(f"magnetometers must be 1 to 64, not {self.magnetometers}")
+        if not 0 < self.rate_hz < np.inf:
+            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 class AnySkin(DescribedFrame):

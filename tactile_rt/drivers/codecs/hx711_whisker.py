@@ -3,6 +3,7 @@
 Frames (``frames/hx711_whisker.toml``) end with six bytes that occur in no possible reading.
 """
 
+import math
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -41,6 +42,8 @@ class Hx711WhiskerOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.whiskers <= MOST:
             raise ConfigError(f"whiskers must be 1 to {MOST}, not {self.whiskers}")
+        if not 0 < self.rate_hz < math.inf:
+            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 class Hx711Whisker(DescribedFrame):

@@ -20,7 +20,7 @@ from tactile_rt.core.errors import SourceError
 from tactile_rt.core.stream import rotation_matrices
 from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
 from tactile_rt.daemon.publishers.scene import turn_x_to
-from tactile_rt.daemon.publishers.sending import Repeated
+from tactile_rt.daemon.publishers.sending import Due
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
     FORCES,
@@ -124,7 +124,7 @@ def served():
     """(publisher, client, view) of a pair of whiskers; everything that came first is read."""
     publisher = FoxglovePublisher("fox", FoxgloveOptions(port=0, rate_hz=200, m_per_n=2.0))
     with running(publisher, View(FORCES, busy_snapshot())) as view:
-        publisher._repeated = Repeated(0)
+        publisher._repeat_due = Due(0)
         client = Client(publisher)
         client.subscribed()
         yield publisher, client, view
@@ -199,7 +199,7 @@ def test_what_cannot_be_trusted_is_not_shown(served):
 
 def test_bases_and_state_are_repeated_and_go_when_the_source_goes(served):
     publisher, client, _ = served
-    publisher._repeated = Repeated(1e-6)
+    publisher._repeat_due = Due(1e-6)
     publisher.handle([])
     found = client.read(SCENE, "/tactile/state", "/tactile/whiskers/array")
     ((_, update),) = client.scenes(found)
@@ -209,7 +209,7 @@ def test_bases_and_state_are_repeated_and_go_when_the_source_goes(served):
     assert points[2] == pytest.approx([0, 0.03, 0])
     assert points[3][1] > 0.03 and points[3][0] == pytest.approx(0)  # along its own x
     assert {"/tactile/state", "/tactile/whiskers/array"} <= {topic for topic, _, _ in found}
-    publisher._repeated = Repeated(0)
+    publisher._repeat_due = Due(0)
     publisher.handle([closed()])
     ((_, update),) = client.scenes(client.read(SCENE))
     assert {d.id for d in update.deletions} == {"whiskers/array", "whiskers/forces"}
