@@ -235,7 +235,7 @@ def _advance(
         began = root[sample if len(root) > 1 else 0]
         if within == 0 and len(answers) and (quiet or not (base[1].any() or base[3].any())):
             clear = NEAR_MM + moves * steps_per_sample + 4.0 * LITTLE * reach
-            if NEAR_MM <= soonest.min() - travelled[0] < clear:  # a wider search: bounds that last longer
+            if NEAR_MM <= soonest.min() - travelled[0] < clear:  # look wider: bounds last longer
                 _rotate_base(began, base, 0.0, here)
                 place_at(here, chain, q, pose)
                 find_near(pose, segments, thing, way[sample], LOOK_MM, seen, ends, now, near)
