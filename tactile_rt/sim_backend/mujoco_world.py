@@ -170,12 +170,12 @@ class MujocoWorld:
 
     @property
     def turns(self) -> Floats:
-        """(0, whisker, 2): this engine's bases are rigid."""
+        """An empty array, (0, whisker, 2), because this engine's bases are rigid."""
         return np.zeros((0, self._count, 2))
 
     @property
     def angles(self) -> Floats:
-        """(joint,) angles of all whiskers' hinges, rad."""
+        """The (joint,) angles of all whiskers' hinges, rad."""
         angles: Floats = self._data.qpos.copy()
         return angles
 

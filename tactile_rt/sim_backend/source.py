@@ -254,7 +254,7 @@ class SimSource(PacedSource):
         self._feels_turns = bool(described and described.feels_turns)
         super().__init__(spec, options.pace)
         self._options = options
-        self._objects = _name_objects(options) or [promised_object(name) for name in CATEGORIES]
+        self._objects = _make_factories(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
         # Its own generator, so that the objects are the same with and without randomisation.
         self._array_rng = np.random.default_rng([options.seed, 1])
@@ -275,10 +275,10 @@ class SimSource(PacedSource):
 
     @staticmethod
     def check(array: str, options: SimOptions) -> ArraySpec:
-        """Return the array without opening it; raise the `ConfigError` that opening would raise."""
+        """Return the spec without opening the array; raise the `ConfigError` that opening would."""
         animals = load_animals(array or "mouse")
         _make_sweep_draw(animals, options)
-        _name_objects(options)
+        _make_factories(options)
         return device_spec(animals)
 
     def close(self) -> None:
@@ -376,7 +376,7 @@ def _read_recipe(options: SimOptions) -> SweepRecipe | None:
     return read_recipe(options.recipe, Path(options.recipe).parent) if options.recipe else None
 
 
-def _name_objects(options: SimOptions) -> list[Callable[[], TactileObject]]:
+def _make_factories(options: SimOptions) -> list[Callable[[], TactileObject]]:
     """Return factories of the objects that the options name; empty: all categories."""
     names = [name.replace("%2C", ",") for name in options.objects.split(",") if name]
     return [promised_object(name, options) for name in names]

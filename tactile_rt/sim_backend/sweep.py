@@ -110,7 +110,7 @@ def way_to_contact(
 
 
 def _reduce_corners(piece: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Reduce the corners of a piece with many, within 0.3 % of its size."""
+    """Reduce the corners of a piece to at most `SIDES`, within 0.3 % of its size."""
     if len(piece.vertices) <= SIDES:
         return piece
     z, turn = np.linspace(-1, 1, SIDES), np.pi * (3 - np.sqrt(5)) * np.arange(SIDES)
@@ -260,7 +260,7 @@ class Sweep:
 
 
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
-    """Scale a mouse's sweep distance of 6.5 mm by the reach of an array's whiskers, mm.
+    """Scale a mouse's sweep distance, 6.5 mm, by the reach of an array's whiskers.
 
     So an object meets the same share of the whiskers: 20 of a mouse's 30 reach beyond its 6.5 mm,
     19 of a rat's 30 beyond its 8.75.
@@ -269,7 +269,7 @@ def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
 
 
 def usual_size(animals: Sequence[WhiskerArray]) -> float:
-    """Return an object size of 40 mm, or the extent of an array's tips if larger, mm.
+    """Return an object size: 40 mm, or the extent of the whisker tips if larger.
 
     So an object is at least as large as the region that the whiskers reach.
     """

@@ -36,7 +36,7 @@ CLEAR_MM = 5.0  # how far a sweep continues past the last whisker
 
 
 def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
-    """Return a warning about whiskers that ring too shortly at a profile; empty: none."""
+    """Return a warning about whiskers whose ringing decays too fast at a profile; empty: none."""
     if engine_of(profile) != "rods":
         return ""
     whiskers = [w for animal in animals for w in animal.whiskers]
@@ -55,7 +55,7 @@ def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
 
 
 def _find_damped(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, float, str]]:
-    """Find whiskers that ring too shortly: (target damping ratio, simulated ratio, name)."""
+    """Find whiskers whose ringing decays too fast: (target, simulated damping ratio, name)."""
     from tactile_rt.sim_backend.rods.rod import HEARD_HZ, make_rod
 
     steps = round(SAMPLE_MS / profile.timestep_ms)
@@ -79,11 +79,11 @@ class World(Protocol):
 
     @property
     def angles(self) -> Floats:
-        """(joint,) angles of all whiskers' hinges, rad, in the order of `sweep_model`'s."""
+        """The (joint,) angles of all whiskers' hinges, rad, in the order of `sweep_model`'s."""
 
     @property
     def turns(self) -> Floats:
-        """(sample, whisker, 2) turns of the bases in the samples of the last `advance`, rad."""
+        """The (sample, whisker, 2) turns of the bases in the last `advance`, rad."""
 
     def advance(
         self, way: Floats, look_every: int = 0, shaken: Floats | None = None
@@ -246,7 +246,7 @@ class SweepSimulation:
         self._base_turns = np.zeros((samples, self._elements, 2))
         self._samples += samples
         if len(self._simulated):
-            found = self._world.advance(way, every, self._accelerate_head(first, samples))
+            found = self._world.advance(way, every, self._compute_acceleration(first, samples))
             loads[:, self._simulated] = found[0] - self._tare
             contacts[:, self._simulated] = found[1]
             if len(self._world.turns):  # MuJoCo's bases are rigid
@@ -271,7 +271,7 @@ class SweepSimulation:
         place: Floats = self._start + (self._sweep.speed_mm_s * 1e-3 * way)[:, None] * self._heading
         return place
 
-    def _accelerate_head(self, first: int, samples: int) -> Floats | None:
+    def _compute_acceleration(self, first: int, samples: int) -> Floats | None:
         """Compute the (n, 3) acceleration of the head from a sample on, mm/ms^2; None: zero."""
         sweep, ramp = self._sweep, self._sweep.ramp_ms
         moves = bool(sweep.head_moves) and first * SAMPLE_MS < ramp
@@ -326,7 +326,7 @@ def draw_simulation(
 def _compute_start(
     lines: Sequence[Floats], outward: NDArray[np.bool_], shape: Floats, sweep: Sweep
 ) -> Floats:
-    """Compute a start far up the y axis on the whiskers' side, mm, of the object's centre."""
+    """Compute the object's initial centre, mm: far up the y axis, on the whiskers' side."""
     bases = np.array([line[0, 0] for line in lines])
     right = 2 * outward.sum() >= len(lines)
     face = bases[outward == right].mean()

@@ -72,7 +72,7 @@ class Whisk:
                 )
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """See `Trajectory`."""
+        """Compute turns, see `Trajectory`."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)[:, None]
         phase = 2 * np.pi * self.frequency_hz * t  # 0 is fully retracted
         middle = (self.protraction_deg - self.retraction_deg) / 2
@@ -103,7 +103,7 @@ class Recorded:
         return CubicSpline(self.times_s, self.turns - self.turns[0])
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """See `Trajectory`. The last posture is held after the end."""
+        """Compute turns, see `Trajectory`; the last posture is held after the end."""
         at = [self.names.index(w.name) for w in whiskers]
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
         moved = self._spline(t)

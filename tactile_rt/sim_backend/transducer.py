@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 
 def sensor_of(animals: Sequence[WhiskerArray]) -> SensorSpec | None:
-    """Return the sensor of all whiskers in one world; None: it reads base loads directly.
+    """Return the sensor of all whiskers in one world; None: base loads are delivered.
 
     Raises:
         ConfigError: the arrays have different sensors, or the sensor samples faster than the
@@ -106,7 +106,7 @@ class Transducer:
         self._last: tuple[int, Floats] | None = None  # time and readings of the newest sample
 
     def push(self, chunk: Chunk) -> Chunk | None:
-        """Return the sensor's samples that are due after these loads; None: not yet any.
+        """Return the sensor's samples that are due after these loads; None: none yet.
 
         Args:
             chunk: (n, element, load) loads at 1 kHz, the first six of `sensor_spec.LOADS` or all.

@@ -145,7 +145,7 @@ class Drive:
         return angle
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """See `Trajectory`; rows are coupled as in the rat."""
+        """Compute turns, see `Trajectory`; rows are coupled as in the rat."""
         theta = self.protraction(t_s)
         return coupled(np.repeat(theta[:, None], len(whiskers), axis=1), whiskers)
 

@@ -150,7 +150,7 @@ class WhiskingSource(PacedSource):
 
     @staticmethod
     def check(array: str, options: WhiskingOptions) -> ArraySpec:
-        """Return the array without keeping it open; raise the `ConfigError` of opening it."""
+        """Return the spec without keeping the array open; raise the `ConfigError` of opening it."""
         with WhiskingSource(array, options) as source:
             return source.spec
 

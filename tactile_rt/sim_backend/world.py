@@ -129,9 +129,9 @@ def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
 
 
 def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
-    """Describe the base loads of all arrays in one world, the element frames as in `array_spec`.
+    """Describe the base loads of all arrays in one world, as `array_spec` does for one.
 
-    For one array this is its `array_spec`; for several, the mount frame is the world.
+    With several arrays, the mount frame is the world; element frames are as in `array_spec`.
     """
     if len(animals) == 1:
         return array_spec(animals[0].whiskers, animals[0].name)

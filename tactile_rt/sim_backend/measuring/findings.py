@@ -101,7 +101,7 @@ def about(value: float, error: float) -> Figure:
 
 
 def pooled(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[int]]:
-    """Pool several figures into their median, and return the numbers of outliers.
+    """Pool several figures into their median, and return the indices of outliers.
 
     Its interval includes the uncertainty of each figure and their scatter.
 

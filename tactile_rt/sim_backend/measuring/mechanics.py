@@ -144,7 +144,7 @@ def _solve_stiffness(whisker: Whisker, field: str, hz: Figure) -> Figure | None:
 
 
 def _solve_damping(whisker: Whisker, field: str, target: Figure) -> Figure:
-    """Solve for the damping that gives a whisker the measured ratio, linear in it."""
+    """Solve for the damping that gives a whisker the measured ratio; the relation is linear."""
     unit = {"damping_ratio": 0.01, "mount_damping": 1e-9}[field]
     none, some = (_make_rod(_set_field(whisker, field, v)).wanted_ratio for v in (0.0, unit))
     value, low, high = (max((v - none) / (some - none), 0.0) * unit for v in target)

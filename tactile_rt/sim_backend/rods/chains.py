@@ -59,7 +59,7 @@ class Pose(NamedTuple):
 
 @compiled
 def place(chain: Chain, q: A, pose: Pose) -> None:
-    """Compute the pose of a chain from its first node and first resting frame in `pose`.
+    """Compute a chain's pose from the first node and first resting frame in `pose`.
 
     Args:
         q: (degree of freedom,) rad.
@@ -91,7 +91,7 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
 
 @compiled
 def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
-    """Compute the pose of a chain on a (4, 3) base: its point, and its frame below."""
+    """Compute the pose of a chain on a (4, 3) base: point in row 0, frame in the others."""
     for i in range(3):
         pose.nodes[0, i] = root[0, i]
         for k in range(3):

@@ -146,7 +146,7 @@ def move_on(free: float, state: A, root: A, shaken: A, x: A, felt: A) -> float:
     """Advance a whisker near rest by a whole sample, if nothing is in its way.
 
     Args:
-        free: distance around the whisker in which there is nothing, over its length.
+        free: distance from the whisker that is free of objects, divided by its length.
         state: see `stepping.RodState`; angles and rates are updated.
         root: (4, 3) see `stepping.advance`.
         shaken: (3,) acceleration of the base, mm/ms^2.

@@ -100,7 +100,7 @@ def advance(
             first link at rest, at the beginning of each sample; 1: it does not turn.
         bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1: the same for all.
             During a sample a frame turns with its base's angular velocity.
-        quiet: whether the bases do not move.
+        quiet: whether the bases stand still.
         gravity: (3,) mm/ms^2; `bases` contains it as the opposite acceleration.
         way: (sample + 1, 3) positions of the object at the beginning of each sample and at the end
             of the last, mm; it moves straight in between.

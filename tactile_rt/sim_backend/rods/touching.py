@@ -16,7 +16,7 @@ MOST_CONTACTS = 8  # of one whisker at one time: the nearest ones
 
 
 class Segments(NamedTuple):
-    """The segments of a whisker, each of which is searched for contacts with an object.
+    """The segments of a whisker that are searched for contacts with an object.
 
     The nearest place is searched along the chord; the arc's distance from the chord is
     approximated by a parabola.

@@ -165,7 +165,7 @@ class RodWorld:
         shaken: Floats | None = None,
         turning: Floats | None = None,
     ) -> tuple[Floats, Floats]:
-        """See `sweep_simulation.World`; loads and contacts are means over each sample.
+        """Simulate samples, see `sweep_simulation.World`; loads and contacts are sample means.
 
         Args:
             shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; `way` is then

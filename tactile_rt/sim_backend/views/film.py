@@ -226,7 +226,7 @@ def _open_gl(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoc
 
 
 def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:
-    """Aim a named view at the whiskers at rest and the object at the strongest moment."""
+    """Fit a named view to the resting whiskers and the object at its strongest touch."""
     dressed = Dressed(footage.model, footage.spec)
     footage.restore(0, dressed.data)
     left = all(x < 0 for x, _, _ in footage.spec.positions)
