@@ -100,7 +100,7 @@ class World(Protocol):
 
         Returns:
             (sample, whisker, 6) loads, N and N m, and (sample, whisker, 3) contacts, see
-            `contacts.CONTACT_CHANNELS`.
+            `mujoco_world.CONTACT_CHANNELS`.
         """
 
 
@@ -237,7 +237,7 @@ class SweepSimulation:
                 samples, from the first, and hold them until the next.
 
         Returns:
-            The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
+            The loads, and (samples, element, 3) contacts, see `mujoco_world.CONTACT_CHANNELS`.
         """
         loads = np.zeros((samples, self._elements, 6))
         contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))

@@ -66,7 +66,7 @@ IMPEDANCE = (0.2, 0.99)  # at the outside of the layer, and deep in it
 STIFFEST_AT = 1.2  # depth of full impedance, in thicknesses of both layers
 
 # MuJoCo would print and write MUJOCO_LOG.TXT into the working directory;
-# `SweepSimulation.advance` reads its warning counters instead.
+# `MujocoWorld.advance` reads its warning counters instead.
 mujoco.set_mju_user_warning(lambda message: None)
 
 
