@@ -1,4 +1,4 @@
-"""An array and an object as one MuJoCo model: the reference engine, and what pictures are drawn of.
+"""An array and an object as one MuJoCo model: the reference engine and the source of pictures.
 
 The object is a mocap body: prescribed motion leaves the whiskers independent of each other.
 """
@@ -27,7 +27,7 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 
-# Additive, so that they can be averaged over time as loads are.
+# Additive, so that they can be averaged over time like loads.
 CONTACT_CHANNELS = ("touching", "normal force, N", "normal force x arc length, N m")
 TOUCHING_SHARE = 0.5  # of a sample's time
 UNSTABLE = tuple(
@@ -41,7 +41,7 @@ UNSTABLE = tuple(
 
 
 class ContactProbe:
-    """Reads contacts off states of a simulation, in a copy of its own."""
+    """A reader of contacts from simulation states, on its own copy of the data."""
 
     def __init__(
         self, model: mujoco.MjModel, whiskers: Sequence[Whisker], profile: Profile
@@ -53,18 +53,18 @@ class ContactProbe:
         self._count = len(whiskers)
         for i, whisker in enumerate(whiskers):
             nodes = link_nodes(whisker, profile.links)
-            first = model.body(whisker.name).id + 1  # a chain's bodies follow one another
+            first = model.body(whisker.name).id + 1  # a chain's bodies are consecutive
             geoms = model.body_geomadr[first : first + len(nodes) - 1]
             self._owner[geoms] = i
             self._start[geoms], self._ends[geoms] = nodes[:-1], np.diff(nodes)
-            # Links are chords: along a curved whisker a mm of chord is more than a mm of arc.
+            # Links are chords: on a curved whisker a mm of chord is more than a mm of arc.
             self._stretch[geoms] = np.diff(nodes) / (2 * model.geom_size[geoms, 1])
 
     def read(self, state: Floats, place: Floats) -> Floats:
-        """Contacts of one state.
+        """Compute the contacts of one state.
 
         Args:
-            place: (3,) of the object during the step, mm.
+            place: (3,) position of the object during the step, mm.
 
         Returns:
             (whisker, 3) `CONTACT_CHANNELS`, summed over the whisker's contacts.
@@ -78,7 +78,7 @@ class ContactProbe:
         if not data.ncon:
             return felt
         pairs, row = data.contact.geom, data.contact.efc_address
-        # Of the two geoms of a contact one is a link; elliptic cones have the normal force first.
+        # One of a contact's two geoms is a link; elliptic cones have the normal force first.
         link = np.where(self._owner[pairs[:, 0]] >= 0, pairs[:, 0], pairs[:, 1])
         other = pairs.sum(axis=1) - link
         force = np.where(row >= 0, data.efc_force[np.maximum(row, 0)], 0.0) * 1e-3
@@ -99,9 +99,9 @@ class ContactProbe:
 
 
 def contact_distances(felt: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return arc lengths (m) from base to contact, weighed by force; NaN: none.
+    """Return force-weighted arc lengths (m) from base to contact; NaN: no contact.
 
-    A whisker touches that is in contact for at least half of the sample's time.
+    A whisker touches if it is in contact for at least half of the sample's time.
 
     Args:
         felt: (..., 3) `CONTACT_CHANNELS`, averaged over the time of each sample.
@@ -134,7 +134,7 @@ def sweep_model(
     pieces: Sequence[trimesh.Trimesh],
     profile: Profile,
 ) -> mujoco.MjModel:
-    """The model of a sweep."""
+    """Compile the MuJoCo model of a sweep, with the named whiskers only."""
     world = empty_world(profile)
     for animal in animals:
         some = tuple(w for w in animal.whiskers if w.name in names)
@@ -149,10 +149,10 @@ def sweep_model(
 
 
 class MujocoWorld:
-    """See `sweep_simulation.World`.
+    """A `sweep_simulation.World` that MuJoCo steps.
 
     Args:
-        start: (3,) where the object is at first, mm.
+        start: (3,) initial position of the object, mm.
     """
 
     def __init__(
@@ -163,26 +163,26 @@ class MujocoWorld:
         self._steps = round(SAMPLE_MS / profile.timestep_ms)
         self._probe = ContactProbe(model, whiskers, profile)
         self._data.mocap_pos[0] = start
-        # The solver takes a mocap body to stand still; friction must see its surface move. The
-        # flag is set at compile time by non-zero velocities only: without it they are ignored.
+        # The solver assumes that a mocap body stands still; friction needs its surface velocity.
+        # The compiler sets this flag only for non-zero velocities; without it they are ignored.
         model.flg_surfacevel = True
         mujoco.mj_forward(model, self._data)
 
     @property
     def turns(self) -> Floats:
-        """None are known: no samples."""
+        """An empty array, (0, whisker, 2), because this engine's bases are rigid."""
         return np.zeros((0, self._count, 2))
 
     @property
     def angles(self) -> Floats:
-        """(joint,) angles of all whiskers' hinges, rad."""
+        """The (joint,) angles of all whiskers' hinges, rad."""
         angles: Floats = self._data.qpos.copy()
         return angles
 
     def advance(
         self, way: Floats, look_every: int = 0, shaken: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """See `sweep_simulation.World`; the head stands still."""
+        """Simulate samples, see `sweep_simulation.World`; the head stands still."""
         assert shaken is None
         model, data, steps = self._model, self._data, self._steps
         samples = len(way) - 1

@@ -1,7 +1,7 @@
-"""Domain randomisation: an array that differs from the one that was asked for, as robots do.
+"""Domain randomisation: an array that differs from its description, as those of real robots do.
 
 Half-ranges of uniform distributions (Tobin et al. 2017), not standard deviations: no draw ever
-leaves the range that was stated, so no whisker in a million comes out unphysical.
+leaves the stated range, so no whisker comes out unphysical.
 """
 
 import math
@@ -20,12 +20,12 @@ SHAPE = ("length", "radius", "curvature")
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
-    """By how much an array may differ from its description; 0 switches a quantity off.
+    """The range in which an array may differ from its description; 0: not at all.
 
     Each value is the half-range of a uniform distribution: relative (0.1 is +-10 %) for material
-    and shape, in degrees or mm for poses. The material is drawn once for all whiskers, which are
-    made of the same stuff, and so is the mount; the geometry is drawn for each whisker. Names and
-    cells of the grid never change.
+    and shape, in degrees or mm for poses. The material is drawn once, because all whiskers are
+    made of the same, and so is the mount; the geometry is drawn for each whisker. Names and cells
+    of the grid never change.
 
     Attributes:
         young_modulus, density, damping_ratio, friction: The ranges of the material's properties,
@@ -62,12 +62,12 @@ class Randomisation:
                 raise ConfigError(f"{name} is relative and must be less than 1, not {value}")
 
     def draw(self, rng: np.random.Generator, array: WhiskerArray) -> WhiskerArray:
-        """An array like this one, drawn; the very same object when everything is off.
+        """Draw an array around this one; return the same object if everything is off.
 
-        Go on describing the stream by the array that was asked for (`array_spec`): a robot does
-        not know by how much its own differs. The draws come from a child of `rng`, so that what
-        else is drawn from it is the same with and without randomisation; and what one quantity
-        draws does not depend on the others.
+        The stream must still be described by the original array (`array_spec`): a robot does not
+        know by how much its own differs. The draws come from a child of `rng`, so that later
+        draws from it are the same with and without randomisation. No quantity's draw depends on
+        the ranges of the others.
 
         Raises:
             ConfigError: a whisker comes out too thick for its length, which takes both a stubby
@@ -76,20 +76,20 @@ class Randomisation:
         child = rng.spawn(1)[0]
         if self == Randomisation():
             return array
-        material = _around_one(child, [getattr(self, name) for name in MATERIAL])
+        material = _draw_factors(child, [getattr(self, name) for name in MATERIAL])
         position, turn = child.uniform(-1, 1, (2, 3))
         mount = Mount(
-            _moved(array.mount.position, self.mount_mm * position),
-            _moved(array.mount.roll_pitch_yaw, math.radians(self.mount_deg) * turn),
+            _shift(array.mount.position, self.mount_mm * position),
+            _shift(array.mount.roll_pitch_yaw, math.radians(self.mount_deg) * turn),
         )
-        whiskers = tuple(self._whisker(child, whisker, material) for whisker in array.whiskers)
+        whiskers = tuple(self._draw_whisker(child, whisker, material) for whisker in array.whiskers)
         return replace(array, whiskers=whiskers, mount=mount)
 
-    def _whisker(
+    def _draw_whisker(
         self, rng: np.random.Generator, whisker: Whisker, material: list[float]
     ) -> Whisker:
         young_modulus, density, damping_ratio, friction = material
-        length, radius, curvature = _around_one(rng, [getattr(self, name) for name in SHAPE])
+        length, radius, curvature = _draw_factors(rng, [getattr(self, name) for name in SHAPE])
         angles, base = rng.uniform(-1, 1, (2, 3))
         return replace(
             whisker,
@@ -102,20 +102,20 @@ class Randomisation:
             base_radius=whisker.base_radius * radius,
             tip_radius=whisker.tip_radius * radius,
             curvature=whisker.curvature * curvature,
-            angles=_moved(whisker.angles, math.radians(self.angles_deg) * angles),
-            base=_moved(whisker.base, self.base_mm * base),
+            angles=_shift(whisker.angles, math.radians(self.angles_deg) * angles),
+            base=_shift(whisker.base, self.base_mm * base),
         )
 
 
-def _around_one(rng: np.random.Generator, half_ranges: list[float]) -> list[float]:
-    """Factors, each drawn from 1 +- its half-range."""
+def _draw_factors(rng: np.random.Generator, half_ranges: list[float]) -> list[float]:
+    """Draw factors, each from 1 +- its half-range."""
     factors: list[float] = (
         1 + np.array(half_ranges) * rng.uniform(-1, 1, len(half_ranges))
     ).tolist()
     return factors
 
 
-def _moved(
+def _shift(
     point: tuple[float, float, float], by: NDArray[np.float64]
 ) -> tuple[float, float, float]:
     x, y, z = (np.array(point) + by).tolist()

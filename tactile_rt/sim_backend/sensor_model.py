@@ -1,4 +1,4 @@
-"""How a sensor falls short of the truth: the figures of `sensor`, all of them 0 at first."""
+"""Parameters of the sensor imperfections that `sensor` applies; all are off by default."""
 
 from dataclasses import dataclass, fields
 
@@ -10,11 +10,11 @@ LARGEST = 1e6  # of any value: beyond it time stamps and single precision overfl
 
 @dataclass(frozen=True, kw_only=True)
 class SensorModel:
-    """How a sensor falls short of the truth; 0 switches an effect off.
+    """Imperfections of a sensor; 0 switches an effect off.
 
-    Forces are in N, moments in N m, and apply to the channels of that unit; channels of other
-    units see only what concerns whole samples (time stamps, drops) or all channels (gain,
-    ``crosstalk_elements``, bandwidth, dead).
+    Forces are in N, moments in N m, and apply to the channels of that unit. Channels of other
+    units are affected only by what concerns whole samples (time stamps, drops) or all channels
+    (gain, ``crosstalk_elements``, bandwidth, dead).
 
     Attributes:
         gain: The calibration error: relative standard deviation of every channel's constant gain.
@@ -33,25 +33,23 @@ class SensorModel:
         bandwidth_hz: The corner frequency of a first-order low-pass on every channel, Hz.
         hysteresis_force, hysteresis_moment: Half the width of the loop between loading and
             unloading, N and N m: a reading follows its load only once that has moved so far.
-        dead_probability: The probability of each element to be dead, drawn once. A dead element
-            reads its bias (0 without one) for ever; its ``valid`` stays True, because a robot does
-            not know.
-        dead_row_probability: The probability of each row of the grid to be dead as a whole, drawn
-            once.
+        dead_probability: The probability that an element is dead, drawn once. A dead element reads
+            its constant bias, 0 by default; its ``valid`` stays True, because a robot does not
+            know.
+        dead_row_probability: The probability that a whole row of the grid is dead, drawn once.
         resolution_force, resolution_moment: The quantisation step, N and N m; readings round to the
             nearest.
         range_force, range_moment: The largest reading of either sign, where the sensor saturates, N
             and N m; also of rounded readings.
-        latency_ms: The time from the sample to its time stamp, which is that of the host's receipt,
-            ms.
+        latency_ms: The time from the sample to its time stamp, which the host gives on receipt, ms.
         jitter_ms: The mean (and standard deviation) of a further, exponentially distributed delay
             of each time stamp, ms. Delays of neighbours are alike where they are long against the
             sample's period, as in a queue: a sample is never received before its predecessor.
         drop_probability: The probability of each sample to be dropped, independently; dropped
             samples leave gaps in ``seq``.
 
-    The drift is an Ornstein-Uhlenbeck process and not a random walk: it stays within a stated
-    spread however long the stream runs, and is the same process whenever one starts to look.
+    The drift is a stationary Ornstein-Uhlenbeck process, not a random walk: its spread stays the
+    same however long the stream runs.
 
     Raises:
         ConfigError: a negative value or one beyond a million, a share or probability above 1, a

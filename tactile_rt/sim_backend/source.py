@@ -1,14 +1,14 @@
-"""The simulated array as a `Source`: object after object swept past it, without end.
+"""The simulated array as a `Source`: objects are swept past it one after another, without end.
 
-Like every simulated source (`PacedSource`) it is simulated when it is read, and delivered when due.
+Like every simulated source (`PacedSource`) it simulates when it is read, and delivers when due.
 
 sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 sim:mouse?recipe=wide24&speed_mm_s=34
 
-An array whose file has a [sensor] delivers what that sensor reads, at its own rate and in its own
-units; the options of `SensorModel` then act on its readings.
+An array whose file has a [sensor] delivers that sensor's readings, at its rate and in its units;
+the options of `SensorModel` then act on these readings.
 """
 
 import abc
@@ -52,23 +52,23 @@ from tactile_rt.sim_backend.world import (
 log = logging.getLogger("tactile_rt.sim_backend")
 CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
-DRAGGED_SAMPLES = 300  # more, while an object that has passed by still drags a whisker along
-LATEST_NS = 100_000_000  # how far a live simulation may be behind real time
-REST_SAMPLES = 600  # after an object its episode ends, contact is released; before one, a baseline
+DRAGGED_SAMPLES = 300  # added while an object that has passed still drags a whisker along
+LATEST_NS = 100_000_000  # largest lag of a live simulation behind real time
+REST_SAMPLES = 600  # between objects: the episode ends, contact is released, the baseline settles
 
 
 @dataclass(frozen=True)
 class PacedOptions(SensorModel, MeshDetail):
-    """What all simulated arrays have options for.
+    """Options of all simulated arrays.
 
-    The fields of `SensorModel` are options too; left out, the sensors are perfect. So are those of
-    `MeshDetail`, which hold for all mesh files named.
+    The fields of `SensorModel` are options too; without them, the sensors are perfect. So are those
+    of `MeshDetail`, which apply to all mesh files named.
 
     Attributes:
-        seed: The seed of all that is drawn; the same seed gives the same stream, and the same
+        seed: The seed of all random draws; the same seed gives the same stream, and the same
             objects and sweeps whatever the sensors.
         profile: The name of the simulation profile, one of `world.PROFILES`.
-        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+        pace: ``realtime`` delivers samples when they are due, ``fast`` once they are simulated.
     """
 
     seed: int = 0
@@ -87,15 +87,15 @@ class PacedOptions(SensorModel, MeshDetail):
 
 
 class PacedSource(Source):
-    """What all simulated arrays have in common; implementations give `_simulate`.
+    """Base class of all simulated arrays; subclasses implement `_simulate`.
 
     Time is simulated: it starts at the first read, and in real time the reader waits for it. A
-    simulation that is more than 0.1 s behind real time, as the processor was taken from it, stands
-    still for as long as it is behind and goes on from there: samples of the past help nobody. What
-    a device would have measured meanwhile counts as dropped.
+    simulation that falls more than 0.1 s behind real time, because the processor was busy, skips
+    the time that it is behind: late samples are useless. The samples that a device would have
+    measured meanwhile count as dropped.
 
     Attributes:
-        live: Whether samples wait for nobody (real-time pace).
+        live: Whether samples are due in real time.
     """
 
     def __init__(self, spec: ArraySpec, pace: str) -> None:
@@ -103,13 +103,13 @@ class PacedSource(Source):
         self.live = pace == "realtime"
         self._start_ns: int | None = None
         self._next: Chunk | None = None  # simulated, not yet due
-        self._begun = False
+        self._started = False
         self._skipped = 0  # samples that were not simulated in time
         self._closed = False
 
     @abc.abstractmethod
     def _simulate(self, start_ns: int) -> Chunk | None:
-        """The next samples; None when all of them are dropped."""
+        """Simulate the next samples; None if all of them are dropped."""
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         if self._start_ns is None:
@@ -119,7 +119,7 @@ class PacedSource(Source):
                 raise EndOfStream
             self._next = self._simulate(self._start_ns)
             if self._next is not None and self.live:
-                self._next = self._in_time(self._next)
+                self._next = self._catch_up(self._next)
         chunk = self._next
         if self.live:
             wait = (int(chunk.t_ns[-1]) - time.monotonic_ns()) / NS_PER_S
@@ -135,13 +135,13 @@ class PacedSource(Source):
         self._closed = True
         self._next = None
 
-    def _in_time(self, chunk: Chunk) -> Chunk:
-        """The chunk at a time that is not long past, numbered as if none had been left out."""
+    def _catch_up(self, chunk: Chunk) -> Chunk:
+        """Shift a late chunk to the present; its numbers count the skipped samples."""
         assert self._start_ns is not None
         behind_ns = time.monotonic_ns() - int(chunk.t_ns[-1])
         shift_ns = 0
-        if not self._begun:  # the first samples may wait for code to be compiled
-            self._begun, shift_ns = True, max(0, behind_ns)
+        if not self._started:  # the first samples may wait for code to be compiled
+            self._started, shift_ns = True, max(0, behind_ns)
             self._start_ns += shift_ns
         elif behind_ns > LATEST_NS:
             lost = round(behind_ns * self.spec.rate_hz / NS_PER_S)
@@ -154,10 +154,10 @@ class PacedSource(Source):
 
 @dataclass(frozen=True)
 class SimOptions(PacedOptions, Randomisation):
-    """What the simulated array meets, what its sensors make of it, how it differs from the design.
+    """Options of the simulated array: objects, sweeps, sensors and randomisation.
 
-    The fields of `PacedOptions` are options too, and those of `Randomisation`, whose array is
-    drawn afresh for every sweep.
+    The fields of `PacedOptions` are options too, and those of `Randomisation`, which draws a new
+    array for every sweep.
 
     Attributes:
         objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
@@ -165,15 +165,15 @@ class SimOptions(PacedOptions, Randomisation):
             a file's name is written ``%2C``, in a URL ``%252C``.
         sweeps: The number of different objects that pass before the stream ends; 0: endless.
         repeat: The number of sweeps of the same object in succession.
-        recipe: The name of a recipe (see `datasets.recipes`), or its .toml file, which names others
-            as seen from its folder: sweeps are drawn as its are, but for the parameters given here.
-            Empty: what is not given is drawn as below.
+        recipe: The name of a recipe (see `datasets.recipes`), or its .toml file, whose paths are
+            relative to its folder: sweeps are drawn as in the recipe, except for parameters given
+            here. Empty: parameters not given are drawn as below.
         size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
-            see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
+            see `sweep.Sweep`; by default, the size is 40 mm and the others are drawn every time.
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
             shake_hz, gravity_x_g, gravity_y_g, gravity_z_g, tilt_deg, tilt_axis_deg, tilt_ms: The
-            parameters of every sweep, see `sweep.Sweep`; left out, it is level, as fast at once and
-            not shaken.
+            parameters of every sweep, see `sweep.Sweep`; by default it is level, at full speed from
+            the start and not shaken.
     """
 
     objects: str = ""
@@ -211,19 +211,19 @@ class SimOptions(PacedOptions, Randomisation):
 
     @property
     def chosen(self) -> dict[str, float]:
-        """The parameters of every sweep that are not drawn."""
+        """The sweep parameters that are given instead of drawn."""
         every = {f.name: getattr(self, f.name) for f in fields(Sweep)}
         return {name: float(value) for name, value in every.items() if value is not None}
 
     @property
     def randomisation(self) -> Randomisation:
-        """The part of it that concerns the array."""
+        """The options that randomise the array."""
         return Randomisation(**{f.name: getattr(self, f.name) for f in fields(Randomisation)})
 
 
 @dataclass(frozen=True)
 class Pass:
-    """What really passed the array: the truth that a decision is scored against."""
+    """An object that passed the array: the ground truth that decisions are scored against."""
 
     start_ns: int
     name: str
@@ -241,7 +241,7 @@ class SimSource(PacedSource):
             .csv or .toml file.
 
     Attributes:
-        notes: What recordings note: the version of the engine.
+        notes: Metadata for recordings: the version of the engine.
     """
 
     Options = SimOptions
@@ -254,31 +254,31 @@ class SimSource(PacedSource):
         self._feels_turns = bool(described and described.feels_turns)
         super().__init__(spec, options.pace)
         self._options = options
-        self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
+        self._objects = _make_factories(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
-        # Of its own, so that the objects are the same with and without.
+        # Its own generator, so that the objects are the same with and without randomisation.
         self._array_rng = np.random.default_rng([options.seed, 1])
-        self._draw = _drawing(self._animals, options)
-        recipe = _recipe_of(options)
+        self._draw = _make_sweep_draw(self._animals, options)
+        recipe = _read_recipe(options)
         self._class_of = recipe.objects.class_of if recipe else {}
         self.notes = {"engine": engine_version(PROFILES[options.profile])}
         self.passes: list[Pass] = []
         if line := ringing(self._animals, PROFILES[options.profile]):
             log.warning(line)
         self._sent = 0  # samples simulated so far
-        self._rest = 0  # samples of rest still to deliver
+        self._rest_left = 0  # samples of rest still to deliver
         self._simulation: SweepSimulation | None = None
-        self._left = 0  # samples of the sweep still to deliver
+        self._sweep_left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
-        self._told_wedged: set[str] = set()
+        self._reported_wedged: set[str] = set()
         compile_simulator()
 
     @staticmethod
     def check(array: str, options: SimOptions) -> ArraySpec:
-        """The array that it would be; raises the `ConfigError` that opening it would raise."""
+        """Return the spec without opening the array; raise the `ConfigError` that opening would."""
         animals = load_animals(array or "mouse")
-        _drawing(animals, options)
-        _objects(options)
+        _make_sweep_draw(animals, options)
+        _make_factories(options)
         return device_spec(animals)
 
     def close(self) -> None:
@@ -286,7 +286,7 @@ class SimSource(PacedSource):
         self._simulation = None
 
     def _simulate(self, start_ns: int) -> Chunk | None:
-        true = self._true(start_ns)
+        true = self._simulate_loads(start_ns)
         if self._transducer is not None:
             sampled = self._transducer.push(true)
             if sampled is None:
@@ -296,33 +296,33 @@ class SimSource(PacedSource):
         self.stats.missing = self._sensor.dropped
         return read
 
-    def _true(self, start_ns: int) -> Chunk:
-        """What the array really feels next."""
-        if self._left == 0 and self._rest == 0:
+    def _simulate_loads(self, start_ns: int) -> Chunk:
+        """Simulate the next true loads, before any sensor."""
+        if self._sweep_left == 0 and self._rest_left == 0:
             self._begin_sweep(start_ns)
-        if self._rest:
-            n = min(CHUNK_SAMPLES, self._rest)
+        if self._rest_left:
+            n = min(CHUNK_SAMPLES, self._rest_left)
             channels = len(CHANNELS) + (2 if self._feels_turns else 0)
             values = np.zeros((n, len(self.spec.elements), channels), dtype=np.float32)
-            self._rest -= n
+            self._rest_left -= n
         else:
             assert self._simulation is not None
-            n = min(CHUNK_SAMPLES, self._left)
+            n = min(CHUNK_SAMPLES, self._sweep_left)
             loads, contacts = self._simulation.advance_with_contacts(n, every=n)
             values = loads.astype(np.float32)
             if self._feels_turns:
                 turns = self._simulation.turns().astype(np.float32)
                 values = np.concatenate([values, turns], axis=2)
-            self._left -= n
-            if wedged := self._simulation.wedged - self._told_wedged:
-                self._told_wedged |= wedged
+            self._sweep_left -= n
+            if wedged := self._simulation.wedged - self._reported_wedged:
+                self._reported_wedged |= wedged
                 log.warning(
                     "no room for whiskers %s in %s: their loads depend on the profile",
                     name_some(sorted(wedged), 8),
                     self.passes[-1].name,
                 )
-            if not self._left and contacts[-1, :, 0].any():
-                self._left = DRAGGED_SAMPLES
+            if not self._sweep_left and contacts[-1, :, 0].any():
+                self._sweep_left = DRAGGED_SAMPLES
         chunk = stamp_samples(values, self._sent, start_ns)
         self._sent += n
         return chunk
@@ -330,10 +330,10 @@ class SimSource(PacedSource):
     def _begin_sweep(self, start_ns: int) -> None:
         done = len(self.passes)
         if self._options.sweeps and done == self._options.sweeps * self._options.repeat:
-            if self._simulation is None:  # has rested after the last object, too
+            if self._simulation is None:  # the rest after the last object is over
                 self._closed = True
                 raise EndOfStream
-            self._simulation, self._rest = None, REST_SAMPLES
+            self._simulation, self._rest_left = None, REST_SAMPLES
             return
         if not self._order:
             order = self._rng.permutation(len(self._objects))
@@ -342,8 +342,8 @@ class SimSource(PacedSource):
         draw, profile = self._options.randomisation.draw, PROFILES[self._options.profile]
         animals = tuple(draw(self._array_rng, animal) for animal in self._animals)
         sweep, self._simulation = draw_simulation(self._rng, animals, target, profile, self._draw)
-        self._rest = REST_SAMPLES
-        self._left = round(self._simulation.duration_ms / SAMPLE_MS)
+        self._rest_left = REST_SAMPLES
+        self._sweep_left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         category = self._class_of.get(target.category, target.category)
         self.passes.append(Pass(now, target.name, category, sweep))
@@ -351,18 +351,18 @@ class SimSource(PacedSource):
 
 @cache
 def compile_simulator() -> None:
-    """Compile what steps a sweep, so that no stream waits for it."""
+    """Compile the code that steps sweeps, so that no stream waits for it."""
     target, rng = promised_object(next(iter(CATEGORIES)))(), np.random.default_rng(0)
     mouse = load_animals("mouse")
     _, sweep = draw_simulation(rng, mouse, target, PROFILES["realtime"], draw_sweep)
     sweep.advance(1)
 
 
-def _drawing(
+def _make_sweep_draw(
     animals: tuple[WhiskerArray, ...], options: SimOptions
 ) -> Callable[[np.random.Generator], Sweep]:
     chosen = options.chosen
-    if (recipe := _recipe_of(options)) is None:
+    if (recipe := _read_recipe(options)) is None:
         return partial(draw_sweep, distance_mm=usual_distance(animals), chosen=chosen)
     sweeps = recipe.sweeps
 
@@ -372,11 +372,11 @@ def _drawing(
     return draw
 
 
-def _recipe_of(options: SimOptions) -> SweepRecipe | None:
+def _read_recipe(options: SimOptions) -> SweepRecipe | None:
     return read_recipe(options.recipe, Path(options.recipe).parent) if options.recipe else None
 
 
-def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:
-    """The objects that the options name, each made when it comes by; none: all categories."""
+def _make_factories(options: SimOptions) -> list[Callable[[], TactileObject]]:
+    """Return factories of the objects that the options name; empty: all categories."""
     names = [name.replace("%2C", ",") for name in options.objects.split(",") if name]
     return [promised_object(name, options) for name in names]

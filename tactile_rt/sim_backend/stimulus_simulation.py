@@ -1,13 +1,13 @@
 """The six stimuli of the barrel-cortex recordings, and the model input that they give.
 
-Mice told a convex from a concave surface, each shown close, at a medium distance or far (Rodgers
-2022). Chung et al. (2025) whisk against the mesh of a bent sheet, of which both sides serve. Here
+Mice discriminated a convex from a concave surface, each presented close, at a medium distance or
+far (Rodgers 2022). Chung et al. (2025) whisk against both sides of the mesh of a bent sheet. Here
 the surface is an arc of a circle, extruded upward: approximate, with every number a parameter.
 
 - Size, from the published mesh at its published scale: chord 50.84 mm, height 17.43 mm, sagitta
   5.30 mm, so radius 63.6 mm (the mesh keeps within 0.5 mm of that arc), thickness 1.73 mm.
-- Place and turn, from the published run script and the published simulator's source: it puts the
-  sheet against its bounding box and the array 13 mm rostral and 1.5 mm dorsal of the head.
+- Position and rotation, from the published run script and the published simulator's source: it
+  puts the sheet against its bounding box and the array 13 mm rostral and 1.5 mm dorsal of the head.
 - From close to medium to far: (1, 1) mm each in the horizontal plane, 1.41 mm, from that script.
   In the recordings it was 2.7 mm (analysis code of Rodgers 2022): `step_mm=(1.91, 1.91, 0)`.
 """
@@ -82,7 +82,7 @@ class Surface:
         step_mm: tuple[float, float, float] = (1.0, 1.0, 0.0),
         radius_mm: float = 63.6,
     ) -> "Surface":
-        """One of `STIMULI`, its distance `step_mm` apart from the next."""
+        """Return one of `STIMULI`, whose distances are `step_mm` apart."""
         if name not in STIMULI:
             raise ConfigError(f"no stimulus {name!r}: there are {', '.join(STIMULI)}")
         shape, _, distance = name.partition("-")
@@ -92,17 +92,17 @@ class Surface:
 
     @property
     def largest_gap_mm(self) -> float:
-        """Furthest that the facets are from the arc, mm."""
+        """The largest distance between facets and arc, mm."""
         half = np.arcsin(self.chord_mm / 2 / self.radius_mm) / self.facets
         return float(self.radius_mm * (1 - np.cos(half)))
 
     def pieces(self) -> tuple[NDArray[np.float64], ...]:
-        """Corners (points, 3) of the convex pieces in the world frame, mm.
+        """Compute corners (points, 3) of the convex pieces in the world frame, mm.
 
-        One piece if the face is convex, which fills the hollow behind it. A concave face is kept
-        by a strip for each facet. Inside the sheet they overlap: where a facet's plane goes on
-        beyond its edge it is behind the next facet. Were they to end there, a whisker that is
-        pressed in near a seam would be pushed out sideways.
+        A convex face is one piece, which fills the hollow behind it. A concave face has a strip
+        for each facet. Inside the sheet the strips overlap: beyond its edge a facet's plane
+        continues behind the next facet. If the strips ended at the edge, a whisker pressed in
+        near a seam would be pushed out sideways.
         """
         half = np.arcsin(self.chord_mm / 2 / self.radius_mm)
         angles = np.linspace(-half, half, self.facets + 1)
@@ -110,18 +110,18 @@ class Surface:
         bulge = 1 if self.shape == "convex" else -1
         out = -bulge * self.radius_mm * (1 - np.cos(angles))
         face = np.stack([out, self.radius_mm * np.sin(angles), np.zeros_like(out)], axis=1)
-        outlines = [face] if bulge > 0 else [self._overlapping(face, i) for i in range(self.facets)]
+        outlines = [face] if bulge > 0 else [self._widen_facet(face, i) for i in range(self.facets)]
         up = np.array([0.0, 0.0, self.height_mm / 2])
         turn = rotation("z", np.radians(self.facing_deg)).T
         pieces = []
         for front in outlines:
-            # The back is the same arc, moved: as in the published mesh.
+            # The back is the same arc, shifted, as in the published mesh.
             corners = np.concatenate([front, front - np.array([self.thickness_mm, 0.0, 0.0])])
             pieces.append(np.concatenate([corners - up, corners + up]) @ turn + self.position_mm)
         return tuple(pieces)
 
-    def _overlapping(self, face: NDArray[np.float64], i: int) -> NDArray[np.float64]:
-        """Ends (2, 3) of facet i, moved on into the facets beside it."""
+    def _widen_facet(self, face: NDArray[np.float64], i: int) -> NDArray[np.float64]:
+        """Return the ends (2, 3) of facet i, extended into the facets beside it."""
         first, last = face[i], face[i + 1]
         further = self.thickness_mm * (last - first) / np.linalg.norm(last - first)
         return np.stack([first - further * (i > 0), last + further * (i < self.facets - 1)])
@@ -129,11 +129,11 @@ class Surface:
 
 @dataclass(frozen=True)
 class Touch:
-    """What an array felt while it whisked.
+    """The loads and contacts of an array that whisked.
 
     Attributes:
         loads: The (sample, element, channel) base loads at 1 kHz, N and N m.
-        touch: The (sample, element) bool that tells whether a whisker touched the object.
+        touch: The (sample, element) bool: the whisker touched the object.
     """
 
     loads: NDArray[np.float32]
@@ -141,7 +141,7 @@ class Touch:
 
     @property
     def first_ms(self) -> int | None:
-        """Sample of the first contact, None without one."""
+        """The sample of the first contact; None without contact."""
         touched = self.touch.any(axis=1)
         return int(touched.argmax()) if touched.any() else None
 
@@ -149,7 +149,7 @@ class Touch:
 def whisk_against(
     simulation: WhiskSimulation, progress: Callable[[int], None] = lambda samples: None
 ) -> Touch:
-    """Run a simulation to its end; `progress` is told of samples as they are done."""
+    """Run a simulation to its end, and report the number of new samples to `progress`."""
     loads: list[NDArray[np.float64]] = []
     touch: list[NDArray[np.bool_]] = []
     for _ in range(0, simulation.samples, AT_ONCE):
@@ -161,7 +161,7 @@ def whisk_against(
 
 
 def model_input(felt: Touch) -> NDArray[np.float32]:
-    """What the network sees: from the first contact on, every 9 ms.
+    """Resample a touch for the network: from the first contact on, every 9 ms.
 
     The first sample is centred on the first contact, through the same resampler as live data.
 
@@ -195,7 +195,7 @@ def write_input(
     angles: NDArray[np.float64],
     parameters: Mapping[str, Any],
 ) -> None:
-    """Write the model input of some stimuli, and beside it, as .json, how it was made.
+    """Write the model input of stimuli as .npz, and its provenance as .json.
 
     The .npz holds ``stimuli`` (names, in the order of the first axes), ``values`` (stimulus,
     sample, element, channel) from `model_input`, N and N m, ``values_1khz`` (the same, of the whole
@@ -203,7 +203,7 @@ def write_input(
     element, 3) rad, ``first_contact_ms`` (stimulus,), ``elements``, ``channels`` and ``units``.
 
     Args:
-        path: ends in .npz; both files appear whole or not at all.
+        path: ends in .npz; each file appears complete or not at all.
         angles: (sample, element, 3) base angles theta, phi, zeta at 1 kHz, rad.
     """
     windows = []

@@ -1,8 +1,7 @@
-"""How an object is swept past an array, and how that is drawn.
+"""The parameters of a sweep of an object past an array, and their random draw.
 
-World frame: z up, x away from the head, y rostral; its origin is where the published sweeps have
-it (see `whisker_array.MOUNT`). The object moves along -y, as things do past a head that moves
-forward.
+World frame: z up, x away from the head, y rostral; its origin is that of the published sweeps
+(see `whisker_array.MOUNT`). The object moves along -y, as it would past a head that moves forward.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,15 +21,15 @@ from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, rotation
 SPACING_MM = 0.25
 TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off the centreline
 PASSED_BY_MM = 0.5  # a miss by less is simulated
-SIDES = 500  # from which a piece of more corners is looked at
+SIDES = 500  # directions in which a piece of more corners keeps its furthest corner
 
 EARTH = 9.80665  # m/s^2
 NOTHING: Mapping[str, float] = MappingProxyType({})
 LIMITS = {
     "size_mm": (1e-3, 1e4),
-    "speed_mm_s": (1e-3, 3e3),  # faster, a step of the simulation would be too long
+    "speed_mm_s": (1e-3, 3e3),  # faster, it moves too far in a step of the simulation
     "gap_mm": (0.0, 1e4),
-    "heading_deg": (-60.0, 60.0),  # beyond, it comes at the head itself
+    "heading_deg": (-60.0, 60.0),  # beyond, it would hit the head itself
     "climb_deg": (-60.0, 60.0),
     "ramp_ms": (0.0, 1e4),
     "head_moves": (0.0, 1.0),
@@ -45,7 +44,7 @@ LIMITS = {
 
 
 def centrelines(whiskers: Sequence[Whisker], mount: Mount) -> list[Floats]:
-    """Points (point, 3) along every whisker at rest, base to tip, in the world, mm."""
+    """Sample every whisker at rest, base to tip: (point, 3) in the world, mm."""
     turn, origin = mount.rotation, np.array(mount.position)
     lines = []
     for whisker in whiskers:
@@ -56,20 +55,20 @@ def centrelines(whiskers: Sequence[Whisker], mount: Mount) -> list[Floats]:
 
 
 def faces_right(animals: Sequence[WhiskerArray], lines: Sequence[Floats]) -> NDArray[np.bool_]:
-    """(whisker,) whether the side of the head that each whisker is on faces world +x.
+    """Return (whisker,) flags: the whisker's side of the head faces world +x.
 
-    Whole sides do: on a turned head some whiskers of the far side point across.
+    Sides are judged as a whole: on a turned head some whiskers of the far side point across.
     """
     out = np.array([line[-1, 0] - line[0, 0] for line in lines])
-    sides = np.array([2 * k + _to_left(w) for k, a in enumerate(animals) for w in a.whiskers])
+    sides = np.array([2 * k + _points_left(w) for k, a in enumerate(animals) for w in a.whiskers])
     right = np.zeros(len(out), dtype=np.bool_)
     for side in np.unique(sides):
         right[sides == side] = out[sides == side].mean() > 0
     return right
 
 
-def _to_left(whisker: Whisker) -> bool:
-    """True if a whisker points to the left in the frame of its head."""
+def _points_left(whisker: Whisker) -> bool:
+    """Return whether a whisker points to the left in the frame of its head."""
     tip = whisker.orientation @ whisker.centreline(np.array([whisker.length]))[0]
     return bool(tip[0] < 0)
 
@@ -77,7 +76,7 @@ def _to_left(whisker: Whisker) -> bool:
 def lateral_reach(animals: Sequence[WhiskerArray]) -> float:
     """Return the median reach of whiskers from their bases along world x, mm.
 
-    Where they reach to both sides, of those on the side on which objects pass.
+    If whiskers reach to both sides, only those on the side where objects pass count.
     """
     lines = [line for animal in animals for line in centrelines(animal.whiskers, animal.mount)]
     right = faces_right(animals, lines)
@@ -95,23 +94,23 @@ def way_to_contact(
         pieces: convex, in the world, mm.
 
     Returns:
-        The way, mm, infinite when none is met; and which whiskers (whisker,) come so near to the
-        swept volume that they may be touched.
+        The distance, mm, infinite if none is met; and (whisker,) flags of the whiskers so near to
+        the swept volume that they may be touched.
     """
     points = np.concatenate(lines)
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     fractions = [np.linspace(0, w.length, len(n)) for w, n in zip(whiskers, lines, strict=True)]
     radii = np.concatenate([w.radius(s) for w, s in zip(whiskers, fractions, strict=True)])
-    pieces = [_thin(piece) for piece in pieces]
-    touching = _entry(points, radii + TOUCH_MM, pieces)
-    near = _entry(points, radii + PASSED_BY_MM, pieces)
+    pieces = [_reduce_corners(piece) for piece in pieces]
+    touching = _find_distances(points, radii + TOUCH_MM, pieces)
+    near = _find_distances(points, radii + PASSED_BY_MM, pieces)
     met = np.zeros(len(lines), dtype=np.bool_)
     met[owner[np.isfinite(near)]] = True
     return float(touching.min()), met
 
 
-def _thin(piece: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Thin out many corners of a piece, within 0.3 % of its size."""
+def _reduce_corners(piece: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Reduce the corners of a piece to at most `SIDES`, within 0.3 % of its size."""
     if len(piece.vertices) <= SIDES:
         return piece
     z, turn = np.linspace(-1, 1, SIDES), np.pi * (3 - np.sqrt(5)) * np.arange(SIDES)
@@ -121,8 +120,8 @@ def _thin(piece: trimesh.Trimesh) -> trimesh.Trimesh:
     return hull
 
 
-def _entry(points: Floats, radii: Floats, pieces: Sequence[trimesh.Trimesh]) -> Floats:
-    """Find the (point,) way along +y from balls to the nearest piece, mm."""
+def _find_distances(points: Floats, radii: Floats, pieces: Sequence[trimesh.Trimesh]) -> Floats:
+    """Find (point,) distances along +y from balls to the nearest piece, mm."""
     nearest = np.full(len(points), np.inf)
     widest = radii.max()
     for piece in pieces:
@@ -135,7 +134,7 @@ def _entry(points: Floats, radii: Floats, pieces: Sequence[trimesh.Trimesh]) -> 
             continue
         normals = piece.face_normals
         offsets = np.einsum("ij,ij->i", normals, piece.triangles[:, 0])
-        # Ahead of a plane by `gap`, and nearing it by normals . y per mm of way.
+        # Each ball is `gap` in front of a plane, and approaches it by `rate` per mm along +y.
         gap = points[at] @ normals.T - offsets - radii[at, None]  # (point, face)
         rate = -normals[:, 1]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -170,7 +169,7 @@ def within_reach(
 
 @dataclass(frozen=True)
 class Sweep:
-    """How an object is swept past the array (Chung et al. 2025, appendix A1), in any pose.
+    """A sweep of an object in any pose past the array (Chung et al. 2025, appendix A1).
 
     Attributes:
         size_mm: The largest extent of the object, mm.
@@ -178,32 +177,31 @@ class Sweep:
         yaw_deg: The rotation of the object about z, degrees.
         height_mm: The z of the object's centre in the world frame, mm.
         distance_mm: The distance from the mean of the whiskers' base points to the object's nearest
-            face, to the side of its way (along world x where it goes along -y), mm; below 5.5 the
-            stiff rostral whiskers of a mouse jam.
-        gap_mm: The way before first contact at which the object starts, mm.
+            face, across its path (along world x if it moves along -y), mm; below 5.5 the stiff
+            rostral whiskers of a mouse jam.
+        gap_mm: The distance that the object moves from its start to first contact, mm.
         roll_deg: The rotation of the object about its own x, degrees; first of the three.
         pitch_deg: The rotation of the object about its own y, degrees; after the roll, before the
             yaw.
-        heading_deg: The direction in which the object goes, turned about z from -y, degrees: from
-            the front where it is 0, from the front and the side on which the whiskers are where it
-            is negative on the right.
-        climb_deg: The rise of the object's way above the horizontal, degrees.
-        ramp_ms: The time in which the speed grows to its whole from the start on, ms; its
-            acceleration begins and ends at nothing.
+        heading_deg: The direction in which the object moves, turned about z from -y, degrees. At 0
+            it comes from the front; negative, for whiskers on the right, it comes from the front
+            and the whiskers' side.
+        climb_deg: The rise of the object's path above the horizontal, degrees.
+        ramp_ms: The time from the start to full speed, ms; the acceleration begins and ends at 0.
         head_moves: 1: the head moves past an object that stands still, and its whiskers feel its
             acceleration; 0: the object moves.
-        surface_friction: The friction of the object's surface, as a multiple of what the whiskers'
-            description says.
-        shake_g: The amplitude of the acceleration with which the head is shaken along (1, 1, 1), as
-            a robot's that walks or flies, in multiples of the Earth's (9.80665 m/s^2).
-        shake_hz: The frequency of that, Hz.
-        gravity_x_g, gravity_y_g, gravity_z_g: The gravity that is added to that of the array's
+        surface_friction: The friction of the object's surface, as a multiple of that in the
+            whiskers' description.
+        shake_g: The amplitude of the acceleration that shakes the head along (1, 1, 1), as on a
+            robot that walks or flies, in multiples of the Earth's (9.80665 m/s^2).
+        shake_hz: The frequency of the shaking, Hz.
+        gravity_x_g, gravity_y_g, gravity_z_g: The gravity added to that of the array's
             description, in the world, in multiples of the Earth's.
-        tilt_deg: The angle by which the head, and all that is described in the world with it, is
-            tilted after the tare, degrees. Loads are those above the tare, so that the weight of
-            the whiskers shows.
+        tilt_deg: The angle by which the head, with the object and the world's axes, is tilted
+            after the tare, degrees. Loads are relative to the tare, so that the weight of the
+            whiskers shows.
         tilt_axis_deg: The direction of the axis of that tilt in the x-y plane, from x, degrees.
-        tilt_ms: The time that the tilt takes, from the start of the sweep; 0: it is tilted before.
+        tilt_ms: The duration of the tilt from the start of the sweep; 0: it is tilted before.
     """
 
     size_mm: float = 40.0
@@ -238,13 +236,13 @@ class Sweep:
 
     @property
     def turn(self) -> Floats:
-        """(3, 3) rotation of the object."""
+        """The (3, 3) rotation of the object."""
         roll, pitch, yaw = np.radians((self.roll_deg, self.pitch_deg, self.yaw_deg))
         return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
 
     @property
     def across(self) -> Floats:
-        """(3, 3) rotation into a frame in which the object's way is along -y."""
+        """The (3, 3) rotation into a frame in which the object moves along -y."""
         heading, climb = np.radians((self.heading_deg, self.climb_deg))
         return rotation("x", climb) @ rotation("z", -heading)
 
@@ -252,35 +250,35 @@ class Sweep:
         """Compute gravity in the world, m/s^2, with a share of the tilt.
 
         Args:
-            described: (3,) that of the array's description, m/s^2.
+            described: (3,) gravity in the array's description, m/s^2.
         """
         added = np.array([self.gravity_x_g, self.gravity_y_g, self.gravity_z_g]) * EARTH
         axis = rotation("z", np.radians(self.tilt_axis_deg))
-        # The world turns with the head, so that gravity turns the other way.
+        # The world frame turns with the head, so gravity turns the other way.
         back = axis @ rotation("x", -np.radians(self.tilt_deg) * tilt) @ axis.T
         return np.asarray(back @ (described + added))
 
 
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
-    """A mouse's 6.5 mm, for other arrays as much more as their whiskers reach further, mm.
+    """Scale a mouse's sweep distance, 6.5 mm, by the reach of an array's whiskers.
 
-    So an object comes to the same share of the whiskers: 20 of a mouse's 30 reach beyond its
-    6.5 mm, 19 of a rat's 30 beyond its 8.75.
+    So an object meets the same share of the whiskers: 20 of a mouse's 30 reach beyond its 6.5 mm,
+    19 of a rat's 30 beyond its 8.75.
     """
-    return round(Sweep.distance_mm * lateral_reach(animals) / _mouse_reach(), 2)
+    return round(Sweep.distance_mm * lateral_reach(animals) / _measure_mouse_reach(), 2)
 
 
 def usual_size(animals: Sequence[WhiskerArray]) -> float:
-    """A mouse's 40 mm, or as far as the tips of an array are apart where that is more, mm.
+    """Return an object size: 40 mm, or the extent of the whisker tips if larger.
 
-    So an object is no smaller than where whiskers reach.
+    So an object is at least as large as the region that the whiskers reach.
     """
     tips = [line[-1, 1:] for a in animals for line in centrelines(a.whiskers, a.mount)]
     return max(Sweep.size_mm, round(float(np.ptp(tips, axis=0).max())))
 
 
 @cache
-def _mouse_reach() -> float:
+def _measure_mouse_reach() -> float:
     return lateral_reach(load_animals("mouse"))
 
 

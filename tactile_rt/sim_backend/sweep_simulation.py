@@ -1,4 +1,4 @@
-"""A sweep, simulated: the world, the motion, the base loads at 1 kHz."""
+"""Simulation of a sweep: the world, the motion, the base loads at 1 kHz."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -26,36 +26,36 @@ from tactile_rt.sim_backend.sweep import (
 )
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, engine_of
 
-TOO_MUCH = 1.1  # a damping ratio so many times the wanted one is told
+TOO_MUCH = 1.1  # a damping ratio more than this many times its target is reported
 FINER = ("dataset", "accurate")
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
-DRAWS = 20  # tries to draw parameters with which an object meets the array at all
-SHAKEN_IN_MS = 50.0  # in which shaking grows to its whole
-WEDGED_MM, WEDGED_MS = 0.02, 25  # deeper and longer a whisker overlaps only without room
-CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
+DRAWS = 20  # tries to draw parameters with which an object meets the array
+SHAKEN_IN_MS = 50.0  # time in which shaking grows to its full amplitude
+WEDGED_MM, WEDGED_MS = 0.02, 25  # only a whisker without room overlaps deeper for longer
+CLEAR_MM = 5.0  # how far a sweep continues past the last whisker
 
 
 def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
-    """Say which whiskers ring too shortly at a profile; empty: none."""
+    """Return a warning about whiskers whose ringing decays too fast at a profile; empty: none."""
     if engine_of(profile) != "rods":
         return ""
     whiskers = [w for animal in animals for w in animal.whiskers]
-    off = _off(whiskers, profile)
+    off = _find_damped(whiskers, profile)
     if not off:
         return ""
-    wanted, had, worst = max(off, key=lambda one: one[1] / one[0])
-    left = {key: len(_off(whiskers, PROFILES[key])) for key in FINER}
+    target, had, worst = max(off, key=lambda found: found[1] / found[0])
+    left = {key: len(_find_damped(whiskers, PROFILES[key])) for key in FINER}
     best = min(left, key=lambda key: left[key])
     better = f"; at profile {best} {left[best] or 'none'}" if left[best] < len(off) else ""
     return (
         f"{len(off)} of {len(whiskers)} whiskers ring shorter than they should at steps of "
         f"{profile.timestep_ms:g} ms, {worst} with a damping ratio of {had:.2g} instead of "
-        f"{wanted:.2g}{better}"
+        f"{target:.2g}{better}"
     )
 
 
-def _off(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, float, str]]:
-    """Return (ratio wanted, ratio had, name) of the whiskers that ring too shortly."""
+def _find_damped(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, float, str]]:
+    """Find whiskers whose ringing decays too fast: (target, simulated damping ratio, name)."""
     from tactile_rt.sim_backend.rods.rod import HEARD_HZ, make_rod
 
     steps = round(SAMPLE_MS / profile.timestep_ms)
@@ -75,15 +75,15 @@ def check_sweep(sweep: Sweep, profile: Profile) -> None:
 
 
 class World(Protocol):
-    """What steps whiskers while an object goes by."""
+    """An engine that steps whiskers while an object passes."""
 
     @property
     def angles(self) -> Floats:
-        """(joint,) angles of all whiskers' hinges, rad, in the order of `sweep_model`'s."""
+        """The (joint,) angles of all whiskers' hinges, rad, in the order of `sweep_model`'s."""
 
     @property
     def turns(self) -> Floats:
-        """(sample, whisker, 2) turns of the bases in the samples of the last `advance`, rad."""
+        """The (sample, whisker, 2) turns of the bases in the last `advance`, rad."""
 
     def advance(
         self, way: Floats, look_every: int = 0, shaken: Floats | None = None
@@ -91,35 +91,35 @@ class World(Protocol):
         """Simulate some samples of 1 ms.
 
         Args:
-            way: (sample + 1, 3) where the object is at the beginning of each sample and at the end
-                of the last, mm.
-            look_every: look for contacts at every so many samples; 0: not at all. An engine that
-                knows them anyway gives those of every sample.
-            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; the object's way is
-                then relative to the head. None: it is not accelerated.
+            way: (sample + 1, 3) positions of the object at the beginning of each sample and at the
+                end of the last, mm.
+            look_every: interval in samples at which contacts are computed; 0: never. An engine
+                that has them anyway returns those of every sample.
+            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; `way` is then
+                relative to the head. None: it is not accelerated.
 
         Returns:
             (sample, whisker, 6) loads, N and N m, and (sample, whisker, 3) contacts, see
-            `contacts.CONTACT_CHANNELS`.
+            `mujoco_world.CONTACT_CHANNELS`.
         """
 
 
 class SweepSimulation:
     """One sweep, simulated on demand: `advance` steps it, `loads` runs it to its end.
 
-    Whiskers do not touch each other, so those that the object passes by stay at rest and are not
-    simulated, nor are pieces of the object that no whisker could reach.
+    Whiskers do not touch each other, so whiskers that the object misses stay at rest and are not
+    simulated. Pieces of the object that no whisker can reach are left out.
 
     Args:
         array: the whiskers; a tuple of arrays for several animals in one world
             (`whisker_array.place`). The object passes on the side to which most of the whiskers
             reach.
-        whole: simulate everything all the same: the loads are those, and a picture is complete.
+        whole: simulate everything: the loads stay the same, and a picture is complete.
 
     Attributes:
-        touches: False when the object passes without meeting any resting whisker.
-        duration_ms: The simulated time after which the object has passed where all whiskers rest,
-            ms; it may still drag one along.
+        touches: False if the object passes without meeting any resting whisker.
+        duration_ms: The simulated time until the object has passed all resting whiskers, ms; it
+            may still drag a whisker along.
         wedged: The names of whiskers that had no room between parts of the object: their loads
             depend on the profile.
     """
@@ -134,19 +134,19 @@ class SweepSimulation:
     ) -> None:
         check_sweep(sweep, profile)
         animals = array if isinstance(array, tuple) else (array,)
-        animals = tuple(_on_surface(animal, sweep.surface_friction) for animal in animals)
+        animals = tuple(_scale_friction(animal, sweep.surface_friction) for animal in animals)
         whiskers = [w for animal in animals for w in animal.whiskers]
         rods = engine_of(profile) == "rods"
         level = sweep.gravity(animals[0].gravity) * 1e-3 * rods  # mm/ms^2; MuJoCo's has none
         gravity = level if sweep.tilt_ms else sweep.gravity(animals[0].gravity, 1.0) * 1e-3 * rods
         resting = _bend_lines(animals, profile, tuple(gravity.tolist()))
         outward = faces_right(animals, resting)
-        # All that follows is in the frame in which the object goes along -y.
+        # All that follows is in the frame in which the object moves along -y.
         across = sweep.across
         lines = [line @ across.T for line in resting]
         turned = [piece.vertices * sweep.size_mm @ sweep.turn.T for piece in target.pieces]
         shape = [points @ across.T for points in turned]
-        start = _beside(lines, outward, np.concatenate(shape), sweep)
+        start = _compute_start(lines, outward, np.concatenate(shape), sweep)
         pieces = [
             trimesh.Trimesh(points + start, piece.faces, process=False)
             for points, piece in zip(shape, target.pieces, strict=True)
@@ -172,49 +172,49 @@ class SweepSimulation:
         self._pieces = [
             trimesh.Trimesh(turned[i], target.pieces[i].faces, process=False) for i in kept
         ]
-        self._sweep, self._start, self._ahead = sweep, across.T @ start, across.T @ (0, -1, 0)
-        self._samples, self._felt = 0, felt
-        self._level, self._gravity = level, gravity
+        self._sweep, self._start, self._heading = sweep, across.T @ start, across.T @ (0, -1, 0)
+        self._samples, self._whiskers = 0, felt
+        self._level_gravity, self._gravity = level, gravity
         self._tare: Floats | float = 0.0  # loads of the whiskers' weight before a tilt, N and N m
         self._tilts = tilted and bool(sweep.tilt_ms)
-        self._turned, self.wedged = np.zeros((0, len(whiskers), 2)), set[str]()
-        self._overlapping = np.zeros(len(felt), dtype=np.int64)
+        self._base_turns, self.wedged = np.zeros((0, len(whiskers), 2)), set[str]()
+        self._overlap_samples = np.zeros(len(felt), dtype=np.int64)
         rear = start[1] + max(points[:, 1].max() for points in shape)
         last = min(line[:, 1].min() for line in lines)
-        # with a ramp it has gone half as far by its end
+        # During a ramp the object covers half the distance.
         whole = (rear - last + CLEAR_MM) / (sweep.speed_mm_s * 1e-3)
         self.duration_ms = float(whole + sweep.ramp_ms / 2)
 
     @cached_property
     def _world(self) -> World:
-        """Step the whiskers; made with the first sample, not for a rejected draw."""
+        """The engine, made with the first sample, so not for a rejected draw."""
         profile = self._profile
         if engine_of(profile) != "rods":
-            return MujocoWorld(self.model, self._felt, profile, self._start)
+            return MujocoWorld(self.model, self._whiskers, profile, self._start)
         from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 
         parts = [Piece.of(piece) for piece in self._pieces]
-        roots = _roots(self._animals)[self._simulated]
+        roots = _compute_roots(self._animals)[self._simulated]
         steps = round(SAMPLE_MS / profile.timestep_ms)
         if self._gravity.any():
-            level = RodWorld(self._felt, roots, (), profile.links, steps, self._level)
+            level = RodWorld(self._whiskers, roots, (), profile.links, steps, self._level_gravity)
             self._tare = level.rest_loads()
-        return RodWorld(self._felt, roots, parts, profile.links, steps, self._gravity)
+        return RodWorld(self._whiskers, roots, parts, profile.links, steps, self._gravity)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The MuJoCo model of the sweep, also where another engine steps it: for pictures."""
+        """The MuJoCo model of the sweep, for pictures even if another engine steps it."""
         return sweep_model(self._animals, self._names, self._pieces, self._profile)
 
     def first_touch(self) -> list[trimesh.Trimesh]:
         """Place the object's pieces where it first touches a whisker, in the world, mm."""
-        place = self._start + self._sweep.gap_mm * self._ahead
+        place = self._start + self._sweep.gap_mm * self._heading
         return [trimesh.Trimesh(p.vertices + place, p.faces, process=False) for p in self._pieces]
 
     def show(self, data: mujoco.MjData) -> None:
-        """Put the whiskers and the object of a `model` where they are now."""
+        """Set the whiskers and the object in data of `model` to their present positions."""
         data.qpos[:] = self._world.angles
-        data.mocap_pos[0] = self._place(np.array([self._samples]))[0]
+        data.mocap_pos[0] = self._compute_positions(np.array([self._samples]))[0]
         data.time = self._samples * SAMPLE_MS
 
     def advance(self, samples: int) -> Floats:
@@ -230,49 +230,49 @@ class SweepSimulation:
         return self.advance_with_contacts(samples, 0)[0]
 
     def advance_with_contacts(self, samples: int, every: int = 1) -> tuple[Floats, Floats]:
-        """As `advance`, and where each whisker touches.
+        """Simulate the next samples like `advance`, and find where each whisker touches.
 
         Args:
-            every: where looking costs as much as a step, look only at every so many samples, from
-                the first, and take what is seen to last until the next look.
+            every: if finding contacts costs as much as a step, find them only at every so many
+                samples, from the first, and hold them until the next.
 
         Returns:
-            The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
+            The loads, and (samples, element, 3) contacts, see `mujoco_world.CONTACT_CHANNELS`.
         """
         loads = np.zeros((samples, self._elements, 6))
         contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))
         first = self._samples
-        way = self._place(first + np.arange(samples + 1))
-        self._turned = np.zeros((samples, self._elements, 2))
+        way = self._compute_positions(first + np.arange(samples + 1))
+        self._base_turns = np.zeros((samples, self._elements, 2))
         self._samples += samples
         if len(self._simulated):
-            found = self._world.advance(way, every, self._shaken(first, samples))
+            found = self._world.advance(way, every, self._compute_acceleration(first, samples))
             loads[:, self._simulated] = found[0] - self._tare
             contacts[:, self._simulated] = found[1]
-            if len(self._world.turns):  # MuJoCo's bases do not give
-                self._turned[:, self._simulated] = self._world.turns
+            if len(self._world.turns):  # MuJoCo's bases are rigid
+                self._base_turns[:, self._simulated] = self._world.turns
             self._note_wedged(getattr(self._world, "overlap", np.zeros((0, 0))))
         return loads, contacts
 
     def _note_wedged(self, overlap: Floats) -> None:
         for sample in overlap > WEDGED_MM:  # (whisker,) each
-            self._overlapping = np.where(sample, self._overlapping + 1, 0)
+            self._overlap_samples = np.where(sample, self._overlap_samples + 1, 0)
             self.wedged |= {
-                self._felt[i].name for i in np.flatnonzero(self._overlapping > WEDGED_MS)
+                self._whiskers[i].name for i in np.flatnonzero(self._overlap_samples > WEDGED_MS)
             }
 
-    def _place(self, samples: NDArray[np.int64]) -> Floats:
-        """(n, 3) where the object is after so many samples, mm, from the head."""
+    def _compute_positions(self, samples: NDArray[np.int64]) -> Floats:
+        """Compute (n, 3) positions of the object relative to the head, mm, after some samples."""
         t, ramp = samples * SAMPLE_MS, self._sweep.ramp_ms
         way = np.asarray(t, dtype=np.float64)
         if ramp:
             x = np.minimum(t / ramp, 1.0)
             way = np.maximum(t - ramp, 0.0) + ramp * (x**3 - x**4 / 2)
-        place: Floats = self._start + (self._sweep.speed_mm_s * 1e-3 * way)[:, None] * self._ahead
+        place: Floats = self._start + (self._sweep.speed_mm_s * 1e-3 * way)[:, None] * self._heading
         return place
 
-    def _shaken(self, first: int, samples: int) -> Floats | None:
-        """(n, 3) acceleration of the head from sample `first` on, mm/ms^2; None: it has none."""
+    def _compute_acceleration(self, first: int, samples: int) -> Floats | None:
+        """Compute the (n, 3) acceleration of the head from a sample on, mm/ms^2; None: zero."""
         sweep, ramp = self._sweep, self._sweep.ramp_ms
         moves = bool(sweep.head_moves) and first * SAMPLE_MS < ramp
         if not (moves or sweep.shake_g or self._tilts):
@@ -281,28 +281,28 @@ class SweepSimulation:
         shaken = np.zeros((samples, 3))
         if moves:
             x = np.minimum(times / ramp, 1.0)
-            # the head goes against the object's way: of x^3 - x^4 / 2, the second derivative
-            shaken += np.outer(sweep.speed_mm_s * 1e-3 * (6 * x - 6 * x**2) / ramp, -self._ahead)
+            # The head moves against `_heading`: the second derivative of x^3 - x^4 / 2.
+            shaken += np.outer(sweep.speed_mm_s * 1e-3 * (6 * x - 6 * x**2) / ramp, -self._heading)
         if sweep.shake_g:
             grown = np.minimum(times / SHAKEN_IN_MS, 1.0)
             wave = grown * np.sin(2 * np.pi * sweep.shake_hz * 1e-3 * times)
             shaken += np.outer(sweep.shake_g * EARTH * 1e-3 * wave, np.ones(3) / np.sqrt(3))
-        if self._tilts:  # what gravity is more than at the tare
+        if self._tilts:  # the difference of gravity from that at the tare
             x = np.minimum(times / sweep.tilt_ms, 1.0)
             described = self._animals[0].gravity
             turned = [sweep.gravity(described, share) * 1e-3 for share in x**2 * (3 - 2 * x)]
-            shaken -= np.array(turned) - self._level
+            shaken -= np.array(turned) - self._level_gravity
         return shaken
 
     def turns(self) -> Floats:
-        """(sample, element, 2) turns of bases that give, about the elements' y and z, rad.
+        """Return (sample, element, 2) turns of compliant bases about the elements' y and z, rad.
 
-        Of the samples of the last `advance`, means; zero of mounts that do not give.
+        Means over the samples of the last `advance`; zero for rigid mounts.
         """
-        return self._turned
+        return self._base_turns
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
-        """Advance in pieces until the object has passed."""
+        """Yield the loads in chunks until the object has passed."""
         while self._samples * SAMPLE_MS < self.duration_ms:
             yield self.advance(samples_at_once)
 
@@ -314,7 +314,7 @@ def draw_simulation(
     profile: Profile,
     draw: Callable[[np.random.Generator], Sweep] = draw_sweep,
 ) -> tuple[Sweep, SweepSimulation]:
-    """Draw sweeps until the object meets the array; give up, with a miss, after many tries."""
+    """Draw sweeps until the object meets the array; after many tries, return a miss."""
     for _ in range(DRAWS):
         sweep = draw(rng)
         simulation = SweepSimulation(array, target, sweep, profile)
@@ -323,10 +323,10 @@ def draw_simulation(
     return sweep, simulation
 
 
-def _beside(
+def _compute_start(
     lines: Sequence[Floats], outward: NDArray[np.bool_], shape: Floats, sweep: Sweep
 ) -> Floats:
-    """Where the object's centre is far up the y axis, mm, on the side that whiskers reach to."""
+    """Compute the object's initial centre, mm: far up the y axis, on the whiskers' side."""
     bases = np.array([line[0, 0] for line in lines])
     right = 2 * outward.sum() >= len(lines)
     face = bases[outward == right].mean()
@@ -339,7 +339,7 @@ def _beside(
 def _bend_lines(
     animals: Sequence[WhiskerArray], profile: Profile, gravity: tuple[float, ...]
 ) -> list[Floats]:
-    """Find the lines (point, 3) of whiskers at rest, bent by their weight, mm."""
+    """Find the centrelines (point, 3) of whiskers at rest, bent by their weight, mm."""
     from tactile_rt.sim_backend.rods.world import RodWorld
 
     lines = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
@@ -347,7 +347,7 @@ def _bend_lines(
         return lines
     whiskers = [w for animal in animals for w in animal.whiskers]
     steps = round(SAMPLE_MS / profile.timestep_ms)
-    world = RodWorld(whiskers, _roots(animals), (), profile.links, steps, np.array(gravity))
+    world = RodWorld(whiskers, _compute_roots(animals), (), profile.links, steps, np.array(gravity))
     for whisker, line, sag in zip(whiskers, lines, world.sag, strict=True):
         s = np.linspace(0, whisker.length, len(line))
         nodes = link_nodes(whisker, profile.links)
@@ -355,16 +355,16 @@ def _bend_lines(
     return lines
 
 
-def _on_surface(animal: WhiskerArray, friction: float) -> WhiskerArray:
-    """The array on a surface of so many times the friction."""
+def _scale_friction(animal: WhiskerArray, friction: float) -> WhiskerArray:
+    """Multiply the friction of all whiskers of an array."""
     if friction == 1:
         return animal
     whiskers = tuple(replace(w, friction=w.friction * friction) for w in animal.whiskers)
     return replace(animal, whiskers=whiskers)
 
 
-def _roots(animals: Sequence[WhiskerArray]) -> Floats:
-    """(whisker, 4, 3) base points, mm, and the elements' frames, both in the world."""
+def _compute_roots(animals: Sequence[WhiskerArray]) -> Floats:
+    """Compute (whisker, 4, 3) base points, mm, and elements' frames, both in the world."""
     return np.array(
         [
             np.concatenate(

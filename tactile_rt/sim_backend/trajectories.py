@@ -1,4 +1,4 @@
-"""How whiskers move: regular whisking, or a recorded trajectory.
+"""Trajectories of the whiskers' bases: regular whisking, or a recorded trajectory.
 
 The base of a whisker turns in azimuth (theta, protraction), elevation (phi) and torsion (zeta);
 the last two follow the first with a slope that differs from row to row.
@@ -22,32 +22,32 @@ ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
 TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)
 ANGLES = ("theta", "phi", "zeta")
 COLUMN = re.compile(r"(theta|phi|zeta)_deg(?:_(.+))?")
-LARGEST_DEG = 120.0  # beyond it is an absolute angle or another unit, not a whisk
+LARGEST_DEG = 120.0  # more must be an absolute angle or another unit, not a turn from rest
 
 
 class Trajectory(Protocol):
-    """Anything that says how the bases turn."""
+    """A motion of the bases in time."""
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts, s; infinite if it has no end."""
+        """Duration in s; infinite if it has no end."""
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """Turn from the resting angles, (len(t_s), whisker, 3) rad, at times from 0 on.
+        """Compute turns from the resting angles, (len(t_s), whisker, 3) rad, at times from 0 on.
 
-        Protraction, elevation and torsion; positive protraction is rostral on both sides. It
-        stands still at time 0 and before.
+        Protraction, elevation and torsion; positive protraction is rostral on both sides. The
+        bases stand still at time 0 and before.
         """
 
 
 @dataclass(frozen=True)
 class Whisk:
-    """Regular whisking: every cycle protracts and retracts smoothly, rows coupled as in the rat.
+    """Regular sinusoidal whisking, with rows coupled as in the rat.
 
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
         protraction_deg, retraction_deg: The furthest turn forward and backward of rest, degrees.
-        ramp_s: The time from rest until the whisking is whole, s.
+        ramp_s: The time from rest to full amplitude, s.
         duration_s: The length of the whole trajectory, s.
     """
 
@@ -72,7 +72,7 @@ class Whisk:
                 )
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """See `Trajectory`."""
+        """Compute turns, see `Trajectory`."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)[:, None]
         phase = 2 * np.pi * self.frequency_hz * t  # 0 is fully retracted
         middle = (self.protraction_deg - self.retraction_deg) / 2
@@ -86,7 +86,7 @@ class Recorded:
     """A recorded trajectory, interpolated by a cubic spline: see `read_trajectory`.
 
     Attributes:
-        turns: The (sample, whisker, 3) turn from the resting angles, rad.
+        turns: The (sample, whisker, 3) turns from the resting angles, rad.
     """
 
     times_s: Floats
@@ -95,7 +95,7 @@ class Recorded:
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts, s."""
+        """Duration in s."""
         return float(self.times_s[-1])
 
     @cached_property
@@ -103,7 +103,7 @@ class Recorded:
         return CubicSpline(self.times_s, self.turns - self.turns[0])
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """See `Trajectory`. The last posture is kept after the end."""
+        """Compute turns, see `Trajectory`; the last posture is held after the end."""
         at = [self.names.index(w.name) for w in whiskers]
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
         moved = self._spline(t)
@@ -112,20 +112,20 @@ class Recorded:
 
 
 def _ramp(x: Floats) -> Floats:
-    """From 0 (x <= 0) to 1 (x >= 1), its first two derivatives continuous."""
+    """Rise smoothly from 0 (x <= 0) to 1 (x >= 1), with continuous first two derivatives."""
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
 def coupled(theta: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-    """Protractions (n, whisker) with each row's elevation and torsion: (n, whisker, 3) rad."""
+    """Add each row's elevation and torsion to protractions (n, whisker): (n, whisker, 3) rad."""
     slopes = np.array([[1.0, *_slopes(w.row)] for w in whiskers])
     turns: Floats = theta[:, :, None] * slopes
     return turns
 
 
 def _slopes(row: int) -> tuple[float, float]:
-    # A robot may have more rows than an animal: they protract, no more.
+    # A robot may have more rows than an animal: those only protract.
     known = row < len(ELEVATION_SLOPES)
     return (ELEVATION_SLOPES[row], TORSION_SLOPES[row]) if known else (0.0, 0.0)
 
@@ -134,9 +134,9 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...]) -> Recorded:
     """Read a recorded trajectory of base angles.
 
     The file has a header and one line for each time: ``time_s``, then turns from rest in degrees,
-    protraction being rostral: ``theta_deg`` of all whiskers, ``theta_deg_C`` of a row,
-    ``theta_deg_C2`` of one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg``
-    likewise; without them elevation and torsion follow theta (Knutsen et al. 2008).
+    rostral positive: ``theta_deg`` of all whiskers, ``theta_deg_C`` of a row, ``theta_deg_C2`` of
+    one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg`` likewise; without
+    them elevation and torsion follow theta (Knutsen et al. 2008).
     """
     table = read_csv(path)
     columns, lines = table.columns, [row.line for row in table.rows]
@@ -184,7 +184,7 @@ def _letter(row: int) -> str:
 
 
 def base_angles(trajectory: Trajectory, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-    """Base angles theta, phi, zeta in the morphology's convention, (len(t_s), whisker, 3) rad.
+    """Compute base angles theta, phi, zeta in the morphology's convention, (time, whisker, 3) rad.
 
     On the left side, where azimuth and torsion are mirrored, protraction lowers theta.
     """
@@ -194,6 +194,6 @@ def base_angles(trajectory: Trajectory, t_s: Floats, whiskers: tuple[Whisker, ..
 
 
 def mirror(whiskers: tuple[Whisker, ...]) -> Floats:
-    """(whisker, 3) signs of theta, phi and zeta for a rostral turn: by the side of the base."""
+    """Return (whisker, 3) signs of theta, phi and zeta for a rostral turn, by side."""
     sides = [-1.0 if w.base[0] < 0 else 1.0 for w in whiskers]
     return np.array([(side, 1.0, side) for side in sides])

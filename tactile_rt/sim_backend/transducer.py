@@ -1,8 +1,8 @@
-"""From the loads of whiskers to what an array's own sensor reads, at the sensor's own rate.
+"""Conversion of whisker loads into the readings of an array's own sensor, at the sensor's rate.
 
     loads, turns at 1 kHz -> sensitivity, or the field of a magnet -> low-pass -> sampling
 
-What is random (noise, offset, drift), rounds or saturates comes after it: see `sensor.Sensor`.
+Noise, offset, drift, rounding and saturation come after it: see `sensor.Sensor`.
 """
 
 from collections.abc import Sequence
@@ -25,12 +25,12 @@ Floats = NDArray[np.float64]
 
 
 def sensor_of(animals: Sequence[WhiskerArray]) -> SensorSpec | None:
-    """The sensor of all whiskers in one world; None: their base loads are read as they are.
+    """Return the sensor of all whiskers in one world; None: base loads are delivered.
 
     Raises:
-        ConfigError: arrays of one world with different sensors, one that samples faster than the
-            simulation, one that reads the turns of mounts that do not give, or a matrix of a
-            whisker that is not there.
+        ConfigError: the arrays have different sensors, or the sensor samples faster than the
+            simulation, reads the rotation of rigid mounts, or has a matrix for a whisker that
+            does not exist.
     """
     sensors = [animal.sensor for animal in animals]
     first = sensors[0]
@@ -63,7 +63,7 @@ def sensor_of(animals: Sequence[WhiskerArray]) -> SensorSpec | None:
 
 
 def device_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
-    """Describe what the sensors of all arrays in one world deliver; without any, the base loads."""
+    """Describe the output of all arrays in one world: sensor readings, else base loads."""
     spec, sensor = world_spec(animals), sensor_of(animals)
     if sensor is None:
         return spec
@@ -90,7 +90,7 @@ def sensor_drift(animals: Sequence[WhiskerArray], period_ms: float) -> float:
 
 
 class Transducer:
-    """An array's sensor at work on one stream of loads, without its noise and its limits.
+    """A sensor applied to one stream of loads, without its noise and limits.
 
     The result does not depend on how the samples were cut into chunks.
     """
@@ -99,28 +99,27 @@ class Transducer:
         self._sensor = sensor
         self._sensitivity = np.array([sensor.sensitivity(name) for name in elements])
         self._axes = [FIELD.index(c.field) if c.field else -1 for c in sensor.channels]
-        self._keeps = np.exp(-2e-3 * np.pi * sensor.bandwidth_hz * SAMPLE_MS)
-        self._passed: Floats | None = None
+        self._decay = np.exp(-2e-3 * np.pi * sensor.bandwidth_hz * SAMPLE_MS)
+        self._filtered: Floats | None = None
         self._start_ns: int | None = None
         self._taken = 0  # of the device's samples
         self._last: tuple[int, Floats] | None = None  # time and readings of the newest sample
 
     def push(self, chunk: Chunk) -> Chunk | None:
-        """Take loads, return what the sensor has sampled meanwhile; None: nothing yet.
+        """Return the sensor's samples that are due after these loads; None: none yet.
 
         Args:
-            chunk: (n, element, load) loads at 1 kHz, the first six of
-                `sensor_spec.LOADS` or all.
+            chunk: (n, element, load) loads at 1 kHz, the first six of `sensor_spec.LOADS` or all.
         """
         readings = self.read(chunk.values.astype(np.float64))
         if self._sensor.bandwidth_hz:
-            from scipy.signal import lfilter  # which takes longer to import than all else here
+            from scipy.signal import lfilter  # imported here, because the import is slow
 
-            keeps = self._keeps
-            if self._passed is None:  # as it is now for ever before
-                self._passed = keeps * readings[:1]
-            readings, self._passed = lfilter(
-                [1 - keeps], [1, -keeps], readings, axis=0, zi=self._passed
+            keeps = self._decay
+            if self._filtered is None:  # starts in steady state
+                self._filtered = keeps * readings[:1]
+            readings, self._filtered = lfilter(
+                [1 - keeps], [1, -keeps], readings, axis=0, zi=self._filtered
             )
         times = chunk.t_ns
         if self._start_ns is None:
@@ -129,10 +128,10 @@ class Transducer:
             times = np.concatenate([[self._last[0]], times])
             readings = np.concatenate([self._last[1], readings])
         self._last = (int(times[-1]), readings[-1:])
-        due = self._due(int(times[-1]))
+        due = self._take_due(int(times[-1]))
         if not len(due):
             return None
-        # Between two samples of the simulation lies a straight line.
+        # Linear interpolation between the simulation's samples.
         at = np.searchsorted(times, due, side="right") - 1
         after = np.minimum(at + 1, len(times) - 1)
         share = (due - times[at]) / np.maximum(times[after] - times[at], 1)
@@ -141,8 +140,8 @@ class Transducer:
         valid = np.ones(values.shape[:2], dtype=np.bool_)
         return Chunk(seq, due, values.astype(np.float32), valid)
 
-    def _due(self, until_ns: int) -> NDArray[np.int64]:
-        """The times, ns, of the samples that are due by then and not yet taken."""
+    def _take_due(self, until_ns: int) -> NDArray[np.int64]:
+        """Take the samples that are due by a time, and return their times, ns."""
         assert self._start_ns is not None
         period = 1e9 / self._sensor.rate_hz
         count = int((until_ns - self._start_ns) / period) + 2 - self._taken
@@ -152,7 +151,7 @@ class Transducer:
         return due
 
     def read(self, loads: Floats) -> Floats:
-        """Return readings (n, element, channel) of loads (n, element, load), before any filter."""
+        """Convert loads (n, element, load) to readings (n, element, channel), before filtering."""
         readings = np.zeros((*loads.shape[:2], self._sensitivity.shape[1]))
         # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
         for load in range(loads.shape[2]):
@@ -166,15 +165,15 @@ class Transducer:
 
 
 def dipole_field(magnet: MagnetSpec, turns: Floats) -> Floats:
-    """(..., 3) field, T, in the element's frame, of a magnet whose base is turned.
+    """Compute the (..., 3) field, T, of a magnet on a turned base, in the element's frame.
 
     Args:
-        turns: (..., 2) turns of the base about the element's y and z, rad: a rotation vector.
+        turns: (..., 2) rotation vector of the base about the element's y and z, rad.
     """
     axis = np.array(magnet.axis) / np.linalg.norm(magnet.axis)
     vector = np.concatenate([np.zeros_like(turns[..., :1]), turns], axis=-1)
-    moment = magnet.moment_a_m2 * _turned(axis, vector)
-    apart = 1e-3 * (np.array(magnet.sensor_mm) - _turned(np.array(magnet.position_mm), vector))
+    moment = magnet.moment_a_m2 * _rotate(axis, vector)
+    apart = 1e-3 * (np.array(magnet.sensor_mm) - _rotate(np.array(magnet.position_mm), vector))
     distance = np.linalg.norm(apart, axis=-1, keepdims=True)
     along = apart / distance
     field: Floats = MU0_4PI * (
@@ -183,8 +182,8 @@ def dipole_field(magnet: MagnetSpec, turns: Floats) -> Floats:
     return field
 
 
-def _turned(point: Floats, vector: Floats) -> Floats:
-    """(..., 3) a point turned by (..., 3) rotation vectors, rad (Rodrigues)."""
+def _rotate(point: Floats, vector: Floats) -> Floats:
+    """Rotate a point by (..., 3) rotation vectors, rad (Rodrigues), to (..., 3)."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     axis = np.divide(vector, angle, out=np.zeros_like(vector), where=angle > 0)
     along = (axis * point).sum(axis=-1, keepdims=True) * axis

@@ -2,12 +2,12 @@
 
 protraction = offset(t) + amplitude(t) sin(phase(t)), d phase / dt = 2 pi frequency(t)
 
-Frequency, amplitude and offset glide to what was commanded last, each through three lags of first
-order in series, 40 ms each: 99 % of a change is there after a third of a second. Such a filter
-never overshoots, so no sequence of commands turns a base further than the commands themselves do;
-and its output has a continuous second derivative, so neither angle, velocity nor acceleration ever
-jump. Between two commands all of it has a closed form: the angle at a time does not depend on when
-or in which pieces it is asked for.
+Frequency, amplitude and offset follow the last command, each through three first-order lags of
+40 ms in series: 99 % of a change is complete after a third of a second. Such a filter never
+overshoots, so no sequence of commands turns a base further than the commands themselves do; and
+its output has a continuous second derivative, so angle, velocity and acceleration never jump.
+Between two commands the motion has a closed form: the angle at a time does not depend on when or
+in which pieces it is computed.
 """
 
 import math
@@ -24,15 +24,15 @@ LAG_S: Final = 0.04
 FASTEST_HZ: Final = 30.0  # a mouse explores at up to 25
 LARGEST_RAD: Final = 1.05  # 60 degrees to either side of rest
 STEEPEST: Final = 1e4  # rad/s^2 of a steady whisk: 23 degrees at 25 Hz
-# rad/s^2 that no sequence of commands exceeds. With w, a, o the gliding values, W, L their largest:
-# a w^2 <= 1.37e4 on the chords of what may be commanded, 2 a' w <= 2 (L / lag) W,
+# rad/s^2 that no sequence of commands exceeds. With w, a, o the filtered values, W, L their limits:
+# a w^2 <= 1.37e4 on chords between permitted commands, 2 a' w <= 2 (L / lag) W,
 # a w' <= L W / lag, and o'' + a'' <= 4 L / lag^2.
 MOST: Final = 3.2e4
 
 
 @dataclass(frozen=True)
 class Whisking:
-    """What an active array is told to do: protraction = offset + amplitude sin(2 pi f t).
+    """A whisking command: protraction = offset + amplitude sin(2 pi f t).
 
     Attributes:
         frequency_hz: The cycles per second, 0 to 30; at 0 the whiskers are held at the offset.
@@ -75,19 +75,18 @@ class Whisking:
 
     @property
     def _aim(self) -> Floats:
-        """What the lags run towards."""
+        """The (3,) target of the lags: frequency, amplitude, offset."""
         amplitude = self.amplitude_rad if self.frequency_hz else 0.0
         return np.array([self.frequency_hz, amplitude, self.offset_rad])
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """From one command to the next.
+    """The motion from one command to the next.
 
     Attributes:
         aim: The (3,) frequency, amplitude and offset commanded.
-        away: The (lag, 3) distance of each lag's output from the aim at the start, the last lag
-            last.
+        away: The (lag, 3) differences of the lags' outputs from the aim at the start, in series.
         phase: The phase of the whisking at the start, rad.
     """
 
@@ -97,35 +96,35 @@ class _Segment:
     phase: float
 
     def at(self, t_s: Floats) -> tuple[Floats, Floats]:
-        """((n, lag, 3) how far each lag is from the aim, (n,) phase) at these times."""
+        """Compute the lags' (n, lag, 3) differences from the aim, and (n,) phases, at times."""
         k = ((t_s - self.start_s) / LAG_S)[:, None]
         first, second, third = self.away
         away = np.stack(
             [first + 0 * k, second + k * first, third + k * (second + k / 2 * first)], axis=1
         )
         away *= np.exp(-k)[:, None]
-        # What a lag is away from the aim, over all time, is the lag's time constant times the sum
-        # of what it and those before it are away now.
+        # The integral over all time of a lag's difference from the aim is the time constant times
+        # the sum of the present differences of that lag and the lags before it.
         ahead = LAG_S * (self.away[:, 0].sum() - away[:, :, 0].sum(axis=1))
         turns = self.aim[0] * (t_s - self.start_s) + ahead
         return away, self.phase + 2 * np.pi * turns
 
 
 class Drive:
-    """A `Trajectory` without end that commands change."""
+    """An endless `Trajectory` that commands change."""
 
     duration_s = math.inf
 
     def __init__(self, whisking: Whisking) -> None:
         aim = whisking._aim
         still = np.zeros((3, 3))
-        still[:, 1:] = -aim[1:]  # amplitude and offset grow; there is no frequency to begin from
+        still[:, 1:] = -aim[1:]  # amplitude and offset grow from 0; the frequency starts at its aim
         self._segments = [_Segment(0.0, aim, still, 0.0)]
 
     def command(self, whisking: Whisking, t_s: float) -> None:
-        """Glide towards another motion from this time on, which is not before the last one's.
+        """Glide to another motion from a time on, at or after the last command's.
 
-        The angles at earlier times stay what they were, as far back as the command before.
+        Angles at earlier times stay the same, as far back as the command before.
         """
         last = self._segments[-1]
         if t_s < last.start_s:
@@ -136,22 +135,22 @@ class Drive:
         self._segments = [last, _Segment(t_s, aim, away[0] + last.aim - aim, turned)]
 
     def protraction(self, t_s: Floats) -> Floats:
-        """(n,) turn of the bases from rest at these times, rad, rostral positive."""
+        """Compute the bases' (n,) turns from rest at times, rad, rostral positive."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)
         now = self._segments[-1]
-        angle = _angle(now, np.maximum(t, now.start_s))
+        angle = _compute_angle(now, np.maximum(t, now.start_s))
         early = t < now.start_s
         if early.any():
-            angle[early] = _angle(self._segments[0], t[early])
+            angle[early] = _compute_angle(self._segments[0], t[early])
         return angle
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """See `Trajectory`; rows are coupled as in the rat."""
+        """Compute turns, see `Trajectory`; rows are coupled as in the rat."""
         theta = self.protraction(t_s)
         return coupled(np.repeat(theta[:, None], len(whiskers), axis=1), whiskers)
 
 
-def _angle(segment: _Segment, t_s: Floats) -> Floats:
+def _compute_angle(segment: _Segment, t_s: Floats) -> Floats:
     away, phase = segment.at(t_s)
     _, amplitude, offset = (segment.aim + away[:, -1]).T
     angle: Floats = offset + amplitude * np.sin(phase)

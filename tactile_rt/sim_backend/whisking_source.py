@@ -1,4 +1,4 @@
-"""The simulated array that whisks, as a `Source` without end.
+"""The simulated array that whisks, as an endless `Source`.
 
 whisking:mouse?frequency_hz=8&amplitude_deg=20&offset_deg=0
 whisking:mouse?object=mug-50&position_mm=25,5,0&size_mm=20&yaw_deg=30&pace=fast&noise_force=1e-5
@@ -27,7 +27,7 @@ LARGEST_MM = 1e3  # of an object and its position
 
 @dataclass(frozen=True)
 class Placing:
-    """Where the object that an array whisks against stands.
+    """The pose of the object that an array whisks against.
 
     Attributes:
         position_mm: The position of the object's centre: ``x,y,z``, x lateral (away from the head),
@@ -69,16 +69,16 @@ def parse_point(text: str, key: str) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class WhiskingOptions(PacedOptions, Placing):
-    """How the array whisks at first, against what, and what its sensors make of it.
+    """Options of the whisking array: its first motion, its object and its sensors.
 
-    The fields of `PacedOptions` are options too, and concern the loads; angles are true. So are
-    those of `Placing`.
+    The fields of `PacedOptions` are options too; they concern the loads, while angles are true.
+    So are those of `Placing`.
 
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
         amplitude_deg, offset_deg: The protraction is offset + amplitude sin(2 pi f t) from rest,
             rostral positive, degrees. See `Whisking` for the ranges.
-        object: The name (``mug-50``), category or mesh file of what stands beside the array; empty:
+        object: The name (``mug-50``), category or mesh file of the object beside the array; empty:
             the array whisks in air.
         seconds: The length of the stream, s; 0: without end.
     """
@@ -106,16 +106,16 @@ class WhiskingOptions(PacedOptions, Placing):
 class WhiskingSource(PacedSource):
     """An array in MuJoCo that whisks, alone or against an object that stands beside it.
 
-    Its channels are the six base loads, in the frame of each base, which turns, and ``angle``: the
+    Its channels are the six base loads, in the turning frame of each base, and ``angle``: the
     protraction of each base from rest, rad, rostral positive; each the mean over its millisecond.
-    Two sources that are given the same commands at the same samples deliver the same.
+    Two sources with the same commands at the same samples deliver the same.
 
     Args:
         array: which array, see `files.load_array`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
 
     Attributes:
-        commands: The pairs (first sample that it concerns, command), in order.
+        commands: The pairs (first sample affected, command), in order.
 
     Raises:
         ConfigError: no such array or object, or whiskers begin inside the object.
@@ -145,27 +145,27 @@ class WhiskingSource(PacedSource):
         self._steps_s = steps * (profile.timestep_ms * 1e-3)
         self._samples = round(options.seconds * 1e3 / SAMPLE_MS) or None
         self._sent = 0  # samples simulated so far
-        self._wanted: Whisking | None = None
+        self._next_command: Whisking | None = None
         self.commands: list[tuple[int, Whisking]] = [(0, options.whisking)]
 
     @staticmethod
     def check(array: str, options: WhiskingOptions) -> ArraySpec:
-        """The array that it would be; raises the `ConfigError` that opening it would raise."""
+        """Return the spec without keeping the array open; raise the `ConfigError` of opening it."""
         with WhiskingSource(array, options) as source:
             return source.spec
 
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
-        """Whisk like this from the next sample that is not yet simulated on; from any thread.
+        """Change the whisking from the next sample to simulate on; callable from any thread.
 
-        The motion glides there, see `whisking_drive`.
+        The motion changes smoothly, see `whisking_drive`.
 
         Raises:
             ConfigError: out of range; the array goes on as before.
         """
-        self._wanted = Whisking(frequency_hz, amplitude_rad, offset_rad)
+        self._next_command = Whisking(frequency_hz, amplitude_rad, offset_rad)
 
     def may_whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> bool:
-        """Whether `set_whisking` takes this."""
+        """Return whether `set_whisking` accepts this motion."""
         try:
             Whisking(frequency_hz, amplitude_rad, offset_rad)
         except ConfigError:
@@ -181,15 +181,15 @@ class WhiskingSource(PacedSource):
         simulation = self._simulation
         if left <= 0 or simulation is None:
             raise EndOfStream
-        wanted, self._wanted = self._wanted, None
-        if wanted is not None:
-            self._drive.command(wanted, self._sent * SAMPLE_MS * 1e-3)
-            self.commands.append((self._sent, wanted))
+        command, self._next_command = self._next_command, None
+        if command is not None:
+            self._drive.command(command, self._sent * SAMPLE_MS * 1e-3)
+            self.commands.append((self._sent, command))
         n = min(CHUNK_SAMPLES, left)
         seq = self._sent + np.arange(n, dtype=np.int64)
         values, _ = simulation.advance(n)
         self._sent += n
-        angles = self._angles(seq)
+        angles = self._compute_angles(seq)
         felt = self._sensor.push(stamp_samples(values.astype(np.float32), seq[0], start_ns))
         self.stats.missing = self._sensor.dropped
         if felt is None:
@@ -198,8 +198,8 @@ class WhiskingSource(PacedSource):
         angle[:] = angles[felt.seq - seq[0], None, None]
         return Chunk(felt.seq, felt.t_ns, np.concatenate([felt.values, angle], 2), felt.valid)
 
-    def _angles(self, seq: NDArray[np.int64]) -> NDArray[np.float64]:
-        """(n,) mean protraction over each sample's physics steps, rad."""
+    def _compute_angles(self, seq: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Compute the (n,) mean protractions over each sample's physics steps, rad."""
         times = seq[:, None] * (SAMPLE_MS * 1e-3) + self._steps_s
         means: NDArray[np.float64] = (
             self._drive.protraction(times.ravel()).reshape(times.shape).mean(axis=1)

@@ -51,36 +51,36 @@ __all__ = [
 CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 SAMPLE_MS = 1.0  # output period: 1 kHz
-ENGINE = "2"  # version of `rods`: the numbers of another one differ
+ENGINE = "2"  # version of `rods`; other versions give other numbers
 JAMMED = (
     "the simulation has become unstable: a whisker jams that is too stiff for this profile; "
     "sweep at a larger distance, or at a finer profile"
 )
 WHISKER_BIT, OBJECT_BIT = 1, 2  # collision groups: whiskers touch objects, never each other
 
-# Contact is a soft layer on both surfaces that whiskers sink through by most of it under a usual
-# load, so that on the mean they bend where the hard surfaces would bend them. Its impedance rises
-# from next to nothing. Were it hard at its outside, a light tip would leave it after every touch,
-# fall back by a whole time step's bend, and strike: forces a hundredfold too large.
+# Contact is a soft layer on both surfaces. Whiskers sink through most of it under a usual load, so
+# that on average they bend where the hard surfaces would bend them. Its impedance rises from a low
+# value: if it were hard at its outside, a light tip would leave it after every touch, fall back by
+# a whole time step's bend, and strike with a hundredfold force.
 IMPEDANCE = (0.2, 0.99)  # at the outside of the layer, and deep in it
-STIFFEST_AT = 1.2  # depth at which it is all there, in thicknesses of both layers
+STIFFEST_AT = 1.2  # depth of full impedance, in thicknesses of both layers
 
-# MuJoCo would print and write MUJOCO_LOG.TXT where the user works; `SweepSimulation.advance`
-# looks at the counters instead.
+# MuJoCo would print and write MUJOCO_LOG.TXT into the working directory;
+# `MujocoWorld.advance` reads its warning counters instead.
 mujoco.set_mju_user_warning(lambda message: None)
 
 
 @dataclass(frozen=True)
 class Profile:
-    """How finely an array is simulated.
+    """The resolution of a simulation, and its engine.
 
     Attributes:
-        links: The number of cells that every whisker is cut into, whatever its length.
+        links: The number of cells of every whisker, whatever its length.
         timestep_ms: The length of a physics step, ms; divides the 1 ms output period.
         layer_mm: The thickness of the soft layer that MuJoCo's contacts need on each of two
-            touching surfaces, mm: thin for the right moments at a light touch, thick against
+            touching surfaces, mm: thin for accurate moments at a light touch, thick against
             chatter at a coarse step.
-        engine: The name of what steps sweeps: ``rods`` (the folder of that name) or ``mujoco``.
+        engine: The engine that steps sweeps: ``rods`` (the folder of that name) or ``mujoco``.
     """
 
     links: int
@@ -98,12 +98,12 @@ PROFILES = {
 
 
 def engine_of(profile: Profile) -> str:
-    """The engine that steps a sweep: MuJoCo where no compiler for `rods` is installed."""
+    """Return the engine that steps sweeps: MuJoCo if numba, which compiles `rods`, is missing."""
     return profile.engine if find_spec("numba") is not None else "mujoco"
 
 
 def engine_version(profile: Profile) -> str:
-    """The version of the engine that steps a sweep, for sets and recordings; or ``mujoco``."""
+    """Return the version of the `rods` engine, for sets and recordings; else ``mujoco``."""
     return ENGINE if engine_of(profile) == "rods" else "mujoco"
 
 
@@ -129,9 +129,9 @@ def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
 
 
 def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
-    """Describe the base loads of all arrays in one world, the element frames as in `array_spec`.
+    """Describe the base loads of all arrays in one world, as `array_spec` does for one.
 
-    Of one array this is its `array_spec`; several have the world for their mount frame.
+    With several arrays, the mount frame is the world; element frames are as in `array_spec`.
     """
     if len(animals) == 1:
         return array_spec(animals[0].whiskers, animals[0].name)
@@ -146,38 +146,38 @@ def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
 
 
 def stamp_samples(values: NDArray[np.float32], first: int = 0, start_ns: int = 0) -> Chunk:
-    """Make a chunk of values at the simulator's rate, all valid, from sample `first` on."""
+    """Make a chunk of valid values at the simulator's rate, from sample `first` on."""
     seq = first + np.arange(len(values), dtype=np.int64)
     valid = np.ones(values.shape[:2], dtype=np.bool_)
     return Chunk(seq, start_ns + seq * round(SAMPLE_MS * 1e6), values, valid)
 
 
 def quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation."""
+    """Compute the unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation."""
     q = np.empty(4)
     mujoco.mju_mat2Quat(q, np.ascontiguousarray(matrix, dtype=np.float64).ravel())
     q = q if q[0] >= 0 else -q
-    # Rounding keeps a spec equal to itself after a trip through another machine's libm.
+    # Rounding makes specs equal that were computed with different machines' libm.
     w, x, y, z = np.round(q, 9).tolist()
     return w, x, y, z
 
 
 def empty_world(profile: Profile) -> mujoco.MjSpec:
-    """A MuJoCo world without bodies, with the solver settings that whisker contact needs."""
+    """Make a MuJoCo world without bodies, with solver settings for whisker contact."""
     world = mujoco.MjSpec()
     option = world.option
     option.timestep = profile.timestep_ms
-    # Implicit in stiffness: a stable step that is long against the period of a short whisker.
+    # Implicit in stiffness: stable although the step is long against a short whisker's period.
     option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     option.gravity = (0.0, 0.0, 0.0)  # a whisker sags by less than its own diameter
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = 5.0  # less lets slow slip creep, at the cost of 15-40 % of the force
+    option.impratio = 5.0  # below, contacts creep under slow slip and lose 15-40 % of the force
     option.enableflags |= mujoco.mjtEnableBit.mjENBL_DIAGEXACT
     default = world.default.geom
     default.solref = (2 * profile.timestep_ms, 1.0)
     default.solimp = (*IMPEDANCE, STIFFEST_AT * 2 * profile.layer_mm, 0.5, 2.0)
     default.margin = profile.layer_mm
-    default.friction = (0.0, 0.0, 0.0)  # of whatever a whisker touches: the whisker's own counts
+    default.friction = (0.0, 0.0, 0.0)  # of objects: only the whisker's own friction counts
     default.condim = 3
     return world
 
@@ -230,7 +230,7 @@ def _add_whisker(
             quat=quaternion(rotation("z", turn)),
         )
         heading, origin = headings[i], nodes[i]
-        # The first half cell is clamped, or turns on what the whisker stands on.
+        # The first half cell is clamped, or turns on a compliant mount.
         if i > 0 or whisker.mount_stiffness:
             for axis in ((0, 1, 0), (0, 0, 1)):
                 body.add_joint(
@@ -260,11 +260,11 @@ def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict
     """Give every whisker Rayleigh damping at the damping ratio of its first mode.
 
     Stiffness-proportional: c = beta k with beta = 2 zeta / omega_1. The integrator itself adds
-    h k, which is taken off; where that alone is more than wanted (short whiskers, coarse steps)
+    h k, which is subtracted; where that alone exceeds the target (short whiskers, coarse steps)
     the whisker stays over-damped.
 
     Args:
-        whiskers: where the damping ratios are from; of whiskers not among them, the published one.
+        whiskers: whose damping ratios are used; other whiskers of the model get the published one.
 
     Returns:
         First resonance of every whisker, Hz.
@@ -296,9 +296,9 @@ def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict
 
 
 def read_base_loads(sensors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Turn MuJoCo's sensor readings (..., 6 elements) into (..., element, 6) N and N m.
+    """Convert MuJoCo's sensor readings (..., 6 elements) into (..., element, 6) N and N m.
 
-    MuJoCo reports what the follicle exerts on the whisker, in mN and uN m; we report the reaction.
+    MuJoCo reports the load of the follicle on the whisker, in mN and uN m; this is the reaction.
     """
     to_si = np.array([1e-3] * 3 + [1e-6] * 3)
     loads: NDArray[np.float64] = -sensors.reshape(*sensors.shape[:-1], -1, 6) * to_si

@@ -157,7 +157,7 @@ def test_tracking_is_exact_even_in_contact():
     worst, touched = 0.0, 0
     for _ in range(100):
         touched += sim.advance(1)[1].sum()
-        worst = max(worst, np.abs(sim.data.qpos[sim._positions] - sim._turns(1)[1]).max())
+        worst = max(worst, np.abs(sim.data.qpos[sim._positions] - sim._compute_turns(1)[1]).max())
     assert touched > 20
     assert 0 < worst < 1e-7
 

@@ -1,10 +1,10 @@
-"""Active touch as Gymnasium environments (extra ``gym``): agents that move a whisker array.
+"""Active touch as Gymnasium environments (extra ``gym``): agents move a whisker array.
 
     import gymnasium
 
     env = gymnasium.make("tactile_rt.sim_backend.environments:tactile_rt/ActiveWhisking-v0")
 
-Gymnasium imports the module that stands before the colon, and this one registers the environment.
+Gymnasium imports the module before the colon, which registers the environment.
 """
 
 from contextlib import suppress
@@ -19,7 +19,7 @@ WHISKERS: Final = tuple(f"{row}{column}" for row in "BCD" for column in (1, 2, 3
 
 
 def register() -> None:
-    """Make `ENVIRONMENT` known to Gymnasium; what is known already stays as it is."""
+    """Register `ENVIRONMENT` with Gymnasium, unless it is registered already."""
     from gymnasium.envs import registration
 
     if ENVIRONMENT in registration.registry:
@@ -33,5 +33,5 @@ def register() -> None:
         )
 
 
-with suppress(ModuleNotFoundError):  # without the extra, nothing to be known to
+with suppress(ModuleNotFoundError):  # without the extra there is no Gymnasium
     register()

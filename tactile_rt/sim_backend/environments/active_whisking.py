@@ -1,4 +1,4 @@
-"""`ActiveWhisking`: move a head, whisk, and say what or where the object is that one touches."""
+"""`ActiveWhisking`: an agent moves a head, whisks, and guesses identity or place of an object."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,17 +28,17 @@ SIDE, MARGIN_MM = 320, 25.0
 PAPER, THING, EDGE = (255, 255, 255), (214, 186, 140), (170, 130, 80)
 WHISKER, TOUCHING = (60, 60, 70), (200, 40, 40)
 VIEWS = ((0, 1), (1, 2))  # from above: x to the right, y up; from the side: y to the right, z up
-# Kinds of the catalogue that differ in what whiskers can feel of them: edges, rims, gaps, curves.
+# Kinds of the catalogue with differences that whiskers can feel: edges, rims, gaps, curves.
 KINDS: Final = ("bottle", "bowl", "car", "chair", "gear", "mug", "mushroom", "table")
 FREQUENCY_HZ: Final = 8.0
 AMPLITUDE_RAD: Final = 0.45
 OFFSET_RAD: Final = 0.45
 SPEED_MM_S: Final = 60.0
 MOTION: Final = ("amplitude", "offset", "velocity x", "velocity y", "velocity z")
-LOGITS: Final = 5.0  # a guess of +1 for one kind and -1 for another sets them apart by 2 x 5
-FRAMES: Final = 5  # in which the samples of a step are averaged
-FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: beyond, a reading saturates
-DRAWS: Final = 100  # tries to stand an object where the array meets it
+LOGITS: Final = 5.0  # guesses of +1 for a kind and -1 for another differ by 2 x 5 in their logits
+FRAMES: Final = 5  # means of samples in a step
+FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: larger readings saturate
+DRAWS: Final = 100  # tries to place an object where the array meets it
 Observation = dict[str, NDArray[np.float32]]
 
 
@@ -60,7 +60,7 @@ def whisker_nodes(head: WhiskingHead) -> list[Floats]:
 
 
 def picture(head: WhiskingHead) -> NDArray[np.uint8]:
-    """(320, 640, 3) the array, red where whiskers touch, and the object."""
+    """Draw the array, red where whiskers touch, and the object: (320, 640, 3) RGB."""
     from PIL import Image, ImageDraw
 
     placed = head.placed
@@ -84,17 +84,17 @@ def picture(head: WhiskingHead) -> NDArray[np.uint8]:
 
 
 class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """Touch an object with whiskers that one moves, and say at every step what it is, or where.
+    """Active touch with whiskers: move, whisk, and guess an object's kind or place.
 
-    At `reset` an object of one of the kinds, in any yaw, stands ahead of the array and to the side
-    to which its whiskers reach, just out of their reach at rest. In each step the head goes and
-    the whiskers whisk, 8 times a second, as the action says; both glide there, see
-    `whisking_drive`. The head stays in a box beside the object, so that it never runs into it.
+    `reset` places an object of one of the kinds, at a random yaw, ahead of the array on the side
+    to which its whiskers reach, just out of their reach at rest. In each step the action sets the
+    velocity of the head and the whisking at 8 Hz; both change smoothly, see `whisking_drive`. The
+    head stays in a box beside the object, so that it never runs into it.
 
     **Action**, (5 + guess,) in [-1, 1]:
 
     ==== ====================================================================================
-    0    amplitude of the whisking: -1 is 0, the whiskers held still; 1 is 0.45 rad (26 degrees)
+    0    amplitude of the whisking: -1 is 0, whiskers held still; 1 is 0.45 rad (26 degrees)
     1    offset of the whisking from rest, times 0.45 rad, rostral positive
     2-4  velocity of the head in the world, times 60 mm/s for a mouse: x lateral, y rostral
          (towards the object at first), z up
@@ -105,10 +105,10 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     **Observation**, a dictionary of float32 arrays in SI units:
 
     ========= =============================================================================
-    loads     (5, element, channel) means over fifths of the step of what `array_spec` says:
-              forces (N) and moments (N m) at the whiskers' bases, with the sensor's noise
-    angle     (5,) mean protraction from rest in the same times, rad
-    head      (6,) where the head is from where it started (m), and its velocity (m/s)
+    loads     (5, element, channel) means over fifths of the step of the channels in
+              `array_spec`: forces (N) and moments (N m) at the bases, with the sensor's noise
+    angle     (5,) mean protraction from rest in the same fifths, rad
+    head      (6,) displacement of the head from its start (m), and its velocity (m/s)
     ========= =============================================================================
 
     **Reward** of each step: ``classify``, the logarithm of the probability that the guess gives the
@@ -116,21 +116,21 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     in units of `reach_mm`.
 
     An episode ends (terminated) when whiskers have begun to touch `touches` times, or (truncated)
-    after the number of steps with which it was registered, 40, or if whiskers jam so that the
-    simulation fails. Given the same seed and actions it is the same on every machine.
+    after the registered number of steps, 40, or if whiskers jam so that the simulation fails. With
+    the same seed and actions it is the same on every machine.
 
     Args:
-        whiskers: the names of those of the array that there are; none: all.
+        whiskers: the names of the array's whiskers to include; empty: all.
         kinds: categories of objects, see `objects.catalogue`; a label is an index into them.
-        instances: the first number of an object of a kind, and the one after the last.
-        touches: how many touches end an episode; 0: none do.
-        step_ms: how long a step lasts, a multiple of 5 ms.
+        instances: the first number of an object of a kind, and the last plus one.
+        touches: the number of touches that ends an episode; 0: no limit.
+        step_ms: the length of a step, a multiple of 5 ms.
         noise: of the sensor, in multiples of the rated noise of 10 uN and 0.05 uN m a sample.
         render_mode: ``rgb_array`` for pictures (extra ``view``).
 
     Attributes:
         reach_mm: The distance that a guess of 1 stands for, mm.
-        speed_mm_s: The fastest that the head is told to go along an axis, mm/s.
+        speed_mm_s: The largest commanded speed of the head along an axis, mm/s.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (as Gymnasium has it)
@@ -153,7 +153,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         if len(kinds) < 2:
             raise ConfigError("kinds: name two or more, there is nothing to tell apart")
         for kind in kinds:
-            promised_object(f"{kind}-0")  # an error if there is none
+            promised_object(f"{kind}-0")  # raises if the kind does not exist
         if not 0 <= instances[0] < instances[1]:
             raise ConfigError(
                 f"instances must be the first and the one after the last, not {instances}"
@@ -168,14 +168,14 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ConfigError(f"render_mode must be rgb_array, not {render_mode!r}")
         self.render_mode = render_mode
         whole = load_array(array)
-        self._array = _some(whole, whiskers)
+        self._array = _select_whiskers(whole, whiskers)
         self._task, self._kinds, self._instances = task, tuple(kinds), instances
         self._touches, self._samples = touches, round(step_ms / SAMPLE_MS)
         self._profile = PROFILES[profile]
         self._sensors = SensorModel(noise_force=1e-5 * noise, noise_moment=5e-8 * noise)
         self._distance_mm = usual_distance((whole,))
         self._size_mm = usual_size((whole,))
-        self._scale = self._distance_mm / 6.5  # of a mouse
+        self._scale = self._distance_mm / 6.5  # relative to a mouse
         self.array_spec = array_spec(self._array.whiskers, self._array.name)
         self.reach_mm = 2 * self._size_mm
         self.speed_mm_s = SPEED_MM_S * self._scale
@@ -198,10 +198,10 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Stand another object there.
+        """Place a new object, and return the first observation and info.
 
         Args:
-            options: ``{"object": "mug-50"}`` names the object, of one of the kinds.
+            options: ``{"object": "mug-50"}`` names the object, which must be of one of the kinds.
 
         Raises:
             ConfigError: no such object, or one that no whisker meets.
@@ -234,46 +234,46 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         )
         self._sensor = Sensor(self._sensors, self.array_spec, int(rng.integers(1 << 62)))
         felt = self._head.advance(self._samples)  # at rest: nothing touches
-        return self._observed(felt), self._told(felt)
+        return self._make_observation(felt), self._make_info(felt)
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Whisk and go on for a step, and judge the guess by what is there.
+        """Move and whisk for a step, and score the guess against the object.
 
         Raises:
-            ConfigError: before the first `reset`, or an action that is not of `action_space`.
+            ConfigError: before the first `reset`, or the action has another shape or is not finite.
         """
         head = self._head
-        wanted = np.asarray(action, dtype=np.float64)
+        values = np.asarray(action, dtype=np.float64)
         if head is None:
             raise ConfigError("reset the environment before its first step")
-        if wanted.shape != self.action_space.shape or not np.isfinite(wanted).all():
+        if values.shape != self.action_space.shape or not np.isfinite(values).all():
             raise ConfigError(
                 f"an action is {self.action_space.shape} finite numbers, see ActiveWhisking"
             )
-        wanted = np.clip(wanted, -1.0, 1.0)
-        amplitude = (wanted[0] + 1) / 2 * AMPLITUDE_RAD
-        head.command(Whisking(FREQUENCY_HZ, float(amplitude), float(wanted[1] * OFFSET_RAD)))
-        guess = wanted[len(MOTION) :]
+        values = np.clip(values, -1.0, 1.0)
+        amplitude = (values[0] + 1) / 2 * AMPLITUDE_RAD
+        head.command(Whisking(FREQUENCY_HZ, float(amplitude), float(values[1] * OFFSET_RAD)))
+        guess = values[len(MOTION) :]
         try:
-            felt = head.advance(self._samples, wanted[2:5] * self.speed_mm_s)
+            felt = head.advance(self._samples, values[2:5] * self.speed_mm_s)
             jammed = False
         except SourceError:
             nothing = np.zeros((self._samples, *self.array_spec.shape))
             felt = Stretch(nothing, np.zeros(self._samples), nothing[..., 0] > 0, 0)
             jammed = True
         done = bool(self._touches and head.touches >= self._touches)
-        told = self._told(felt) | {"jammed": jammed}
-        return self._observed(felt), self._reward(guess), done, jammed, told
+        info = self._make_info(felt) | {"jammed": jammed}
+        return self._make_observation(felt), self._compute_reward(guess), done, jammed, info
 
     def render(self) -> Any:
-        """A picture (height, width, 3) from above and from the side, or None without a mode."""
+        """Draw top and side views (height, width, 3); None without a render mode."""
         if self.render_mode is None or self._head is None:
             return None
         return picture(self._head)
 
-    def _observed(self, felt: Stretch) -> Observation:
+    def _make_observation(self, felt: Stretch) -> Observation:
         assert self._head is not None and self._sensor is not None
         loads = felt.loads.astype(np.float32)
         read = self._sensor.push(stamp_samples(loads, self._head.samples - len(loads)))
@@ -286,30 +286,30 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
             for key, value in (("loads", means), ("angle", angle), ("head", head))
         }
 
-    def _told(self, felt: Stretch) -> dict[str, Any]:
+    def _make_info(self, felt: Stretch) -> dict[str, Any]:
         assert self._head is not None
         return {
             "object": self._object,
             "label": self._label,
-            "centre_mm": self._centre(),
+            "centre_mm": self._get_centre(),
             "touches": self._head.touches,
             "touching": felt.touching.any(axis=0),
         }
 
-    def _centre(self) -> Floats:
-        """(3,) where the object's centre is from the head's origin, mm, along the world's axes."""
+    def _get_centre(self) -> Floats:
+        """Return the (3,) object's centre from the head's origin, mm, in world axes."""
         assert self._head is not None
         return self._head.placed.centre - self._head.position
 
-    def _reward(self, guess: Floats) -> float:
+    def _compute_reward(self, guess: Floats) -> float:
         if self._task == "classify":
             logits = guess * LOGITS
             return float(logits[self._label] - np.log(np.exp(logits).sum()))
-        return -float(np.linalg.norm(guess * self.reach_mm - self._centre())) / self.reach_mm
+        return -float(np.linalg.norm(guess * self.reach_mm - self._get_centre())) / self.reach_mm
 
 
-def _some(array: WhiskerArray, names: Sequence[str]) -> WhiskerArray:
-    """The array with some of its whiskers; without names, all of them."""
+def _select_whiskers(array: WhiskerArray, names: Sequence[str]) -> WhiskerArray:
+    """Return the array with the named whiskers only; without names, with all."""
     if not names:
         return array
     known = {w.name: w for w in array.whiskers}

@@ -1,11 +1,11 @@
-"""A head that goes where it is told beside an object that stands still, and whisks meanwhile.
+"""A head that moves on command beside an object that stands still, and whisks.
 
-The whiskers are stepped by `rods`, whose world is that of the head: the object moves the other way,
-and whiskers feel the head's acceleration. How the bases turn is `whisking_drive`'s.
+`rods` steps the whiskers in the frame of the head: the object moves the other way, and whiskers
+feel the head's acceleration. `whisking_drive` turns the bases.
 
-The head goes after a point that moves at the commanded velocity and stays within its workspace,
-through the three lags of first order that whisking has too: position, velocity and acceleration
-never jump, and nothing takes the head out of its workspace.
+The head follows a point that moves at the commanded velocity within the workspace, through three
+first-order lags like those of whisking: position, velocity and acceleration never jump, and the
+head never leaves its workspace.
 """
 
 from collections.abc import Sequence
@@ -28,18 +28,18 @@ from tactile_rt.sim_backend.whisking_drive import LAG_S, Drive, Whisking
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile
 
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
-APART_MS = 10  # a whisker that was free for as long touches anew
+APART_MS = 10  # a contact after so long without contact is a new touch
 LAG_MS = LAG_S * 1e3
-BELOW_MM, ASIDE_MM, PAST_MM = 15.0, 12.0, 5.0  # a workspace, for an array of a mouse's size
+BELOW_MM, ASIDE_MM, PAST_MM = 15.0, 12.0, 5.0  # the workspace for an array of a mouse's size
 
 
 @dataclass(frozen=True)
 class Placed:
-    """An object beside an array, and where the head may go.
+    """An object beside an array, and the head's workspace.
 
     Attributes:
-        centre: The (3,) place of the object's centre in the world, mm.
-        low, high: The (3,) corners of the box in which the head may move, from where it starts, mm.
+        centre: The (3,) position of the object's centre in the world, mm.
+        low, high: The (3,) corners of the head's workspace, a box, relative to its start, mm.
     """
 
     name: str
@@ -51,12 +51,12 @@ class Placed:
 
 @dataclass(frozen=True)
 class Stretch:
-    """What a stretch of time brought.
+    """The loads, angles and contacts of consecutive samples.
 
     Attributes:
         loads: The (sample, element, 6) base loads, N and N m, in the elements' frames, which turn.
         angle: The (sample,) protraction from rest, mean over the sample, rad, rostral positive.
-        touching: The (sample, element) bool that tells which whiskers touched the object.
+        touching: The (sample, element) bool: the whisker touched the object.
     """
 
     loads: Floats
@@ -66,7 +66,7 @@ class Stretch:
 
 
 @lru_cache(maxsize=128)
-def _object(name: str) -> TactileObject:
+def _load_object(name: str) -> TactileObject:
     return load_object(name)
 
 
@@ -80,17 +80,17 @@ def place_beside(
     distance_mm: float,
     gap_mm: float,
 ) -> Placed | None:
-    """Stand an object ahead of an array, to the side to which its whiskers reach.
+    """Place an object ahead of an array, on the side to which its whiskers reach.
 
     Returns:
-        Where it stands; None if the head would go past it without a touch.
+        The placed object; None if the head would pass it without a touch.
     """
     lines = centrelines(array.whiskers, array.mount)
     right = faces_right((array,), lines).mean() >= 0.5
     turn = rotation("z", np.radians(yaw_deg))
     parts = [
         trimesh.Trimesh(p.vertices * size_mm @ turn.T, p.faces, process=False)
-        for p in _object(name).pieces
+        for p in _load_object(name).pieces
     ]
     corners = np.concatenate([part.vertices for part in parts])
     face = np.mean([line[0, 0] for line in lines])
@@ -115,11 +115,11 @@ class WhiskingHead:
     """An array on a head that moves and whisks, beside an object that stands still.
 
     Args:
-        array: the whiskers, on their head; it looks along +y of the world.
-        profile: how finely to simulate; by `rods`, whatever the profile's engine.
+        array: the whiskers, on their head, which faces +y of the world.
+        profile: the resolution; the engine is always `rods`, whatever the profile's.
 
     Attributes:
-        position, velocity: The (3,) place of the head from where it started, mm, and its velocity,
+        position, velocity: The (3,) displacement of the head from its start, mm, and its velocity,
             mm/s, in the world.
     """
 
@@ -139,29 +139,29 @@ class WhiskingHead:
             round(SAMPLE_MS / profile.timestep_ms),
         )
         self._drive = Drive(whisking)
-        self._aim = np.zeros(3)
+        self._target = np.zeros(3)
         self._lags = np.zeros((3, 3))  # (lag, axis), the last the head's position, mm
         self._free = np.full(len(array.whiskers), APART_MS)
         self.touching = np.zeros(len(array.whiskers), dtype=np.bool_)
 
     @property
     def position(self) -> Floats:
-        """(3,) from where it started, mm."""
+        """The (3,) displacement of the head from its start, mm."""
         here: Floats = self._lags[2].copy()
         return here
 
     @property
     def velocity(self) -> Floats:
-        """(3,) mm/s."""
+        """The (3,) velocity of the head, mm/s."""
         found: Floats = (self._lags[1] - self._lags[2]) / LAG_MS * 1e3
         return found
 
     def command(self, whisking: Whisking) -> None:
-        """Whisk like this from now on; the motion glides there."""
+        """Change the whisking from now on; the motion changes smoothly."""
         self._drive.command(whisking, self.samples * SAMPLE_MS * 1e-3)
 
     def frames(self, samples: NDArray[np.int64]) -> Floats:
-        """(sample, whisker, 3, 3) frames of the elements in the world as these samples begin."""
+        """Compute elements' (sample, whisker, 3, 3) world frames at the start of samples."""
         times = samples.astype(np.float64) * (SAMPLE_MS * 1e-3)
         angles = base_angles(self._drive, times, self.array.whiskers)
         signs, offsets = np.array([1.0, -1.0, 1.0]), np.array([-np.pi / 2, 0.0, np.pi / 2])
@@ -169,62 +169,62 @@ class WhiskingHead:
         return self._turn @ rotation("z", z) @ rotation("y", y) @ rotation("x", x)
 
     def advance(self, samples: int, velocity_mm_s: Sequence[float] | Floats = (0, 0, 0)) -> Stretch:
-        """Go and whisk for some samples of 1 ms.
+        """Move and whisk for some samples of 1 ms.
 
         Args:
-            velocity_mm_s: (3,) commanded to the head, mm/s, in the world.
+            velocity_mm_s: (3,) commanded velocity of the head, mm/s, in the world.
 
         Raises:
             SourceError: the simulation has become unstable: whiskers jam.
         """
         at = np.arange(self.samples - 1, self.samples + samples + 2)
-        way, shaken = self._go(samples, np.asarray(velocity_mm_s, dtype=np.float64))
+        way, shaken = self._move(samples, np.asarray(velocity_mm_s, dtype=np.float64))
         loads, contacts = self.world.advance(
             self.placed.centre - way, shaken=shaken, turning=self.frames(at)
         )
-        # At the middle of a sample: its mean, but for a part in ten thousand at 8 Hz.
+        # The value at the middle of a sample is its mean within 1e-4 at 8 Hz.
         times = (at[1:-2].astype(np.float64) + 0.5) * (SAMPLE_MS * 1e-3)
         angle = self._drive.protraction(times)
         touching = contacts[..., 0] > TOUCHING_SHARE
-        touches = self._begun(touching)
+        touches = self._count_touches(touching)
         self.samples += samples
         self.touches += touches
         self.touching = touching[-1]
         return Stretch(loads, angle, touching, touches)
 
-    def _begun(self, touching: NDArray[np.bool_]) -> int:
-        """How often (sample, element) a whisker began to touch that had been free for a while."""
+    def _count_touches(self, touching: NDArray[np.bool_]) -> int:
+        """Count new touches in (sample, element): after `APART_MS` or more without contact."""
         at = np.arange(len(touching))[:, None]
         last = np.maximum.accumulate(np.where(touching, at, -self._free - 1), axis=0)
         before = np.concatenate([-self._free[None] - 1, last[:-1]])
         self._free = len(touching) - 1 - last[-1]
         return int((touching & (at - before > APART_MS)).sum())
 
-    def _go(self, samples: int, velocity_mm_s: Floats) -> tuple[Floats, Floats]:
-        """(sample + 1, 3) where the head is, mm, and (sample, 3) its acceleration, mm/ms^2."""
+    def _move(self, samples: int, velocity_mm_s: Floats) -> tuple[Floats, Floats]:
+        """Compute the head's (sample + 1, 3) path, mm, and (sample, 3) acceleration, mm/ms^2."""
         steps = np.arange(1, samples + 1)[:, None] * velocity_mm_s * (SAMPLE_MS * 1e-3)
-        aims = np.clip(self._aim + steps, self.placed.low, self.placed.high)
-        fading, following = _lagging(samples)
+        aims = np.clip(self._target + steps, self.placed.low, self.placed.high)
+        fading, following = _compute_response(samples)
         lags = fading @ self._lags + np.einsum("kli,ia->kla", following, aims)
         pulls = (lags[:, 0] - 2 * lags[:, 1] + lags[:, 2]) / LAG_MS**2
-        self._aim, self._lags = aims[-1], lags[-1]
+        self._target, self._lags = aims[-1], lags[-1]
         return lags[:, 2], (pulls[1:] + pulls[:-1]) / 2
 
 
 @lru_cache(maxsize=8)
-def _lagging(samples: int) -> tuple[Floats, Floats]:
-    """What three lags make of a course.
+def _compute_response(samples: int) -> tuple[Floats, Floats]:
+    """Compute the discrete response of the three lags to their aim.
 
     Returns:
-        (sample + 1, lag, lag) what is left of where the lags began, and (sample + 1, lag, sample)
-        the share of the aim that stood during each sample.
+        (sample + 1, lag, lag) shares of the lags' initial outputs, and (sample + 1, lag, sample)
+        shares of the aim during each sample.
     """
     decay = expm((np.diag([1.0, 1.0], -1) - np.eye(3)) * SAMPLE_MS / LAG_MS)
     fading = np.empty((samples + 1, 3, 3))
     fading[0] = np.eye(3)
     for k in range(samples):
         fading[k + 1] = decay @ fading[k]
-    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) of an aim so long ago
+    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) share of an aim so long ago
     following = np.zeros((samples + 1, 3, samples))
     for k in range(1, samples + 1):
         following[k, :, :k] = gained[:k][::-1].T

@@ -1,7 +1,7 @@
-"""A real array measured from a recording of it, and how far it is from its description.
+"""Measurement of a real array from a recording, and comparison with its description.
 
-    recording -> rest, rings -> figures -> beside the description -> its file
+    recording -> rest, rings -> figures -> comparison with the description -> its file
 
-What is measured has an interval, in which the truth lies in 19 cases of 20. What cannot be measured
-is said, and stays as it was described.
+Every measured figure has a 95 % interval. A quantity that cannot be measured is reported, and its
+description stays as it is.
 """

@@ -1,6 +1,6 @@
-"""What was measured beside what was described, and so for the channels of a sensor at rest.
+"""Measured figures compared with described values, and those of a sensor's channels at rest.
 
-An interval holds the truth in 19 cases of 20.
+Intervals are 95 % confidence intervals.
 """
 
 import math
@@ -18,14 +18,14 @@ from tactile_rt.sim_backend.measuring.resting import FORGETS_S, TO_SIGMA, Rest, 
 from tactile_rt.sim_backend.transducer import FASTEST_HZ
 
 MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mean
-SIGMAS = 1.96  # of an interval's half
-EVEN = 1.2  # how much longer one half of an interval may be than the other to be told as one
-MANY = 6  # whiskers that are named
-NOISIER = 1.5  # than most whiskers: it is named
-FEWEST = 4  # whiskers that an offset's spread is told from
-STRANGE = 5.0  # an offset so many times as large as most are
-OTHER = 8.0  # of a log-likelihood: a whisker whose drift is surely not that of most
-SURE = 1.92  # of a log-likelihood, at the ends of an interval
+SIGMAS = 1.96  # half of an interval, in standard errors
+EVEN = 1.2  # largest ratio of an interval's halves that is written as +- one number
+MANY = 6  # largest number of whiskers that are named
+NOISIER = 1.5  # times the noise of most whiskers: such a whisker is named
+FEWEST = 4  # whiskers needed to estimate the spread of offsets
+STRANGE = 5.0  # times the usual offset: such a whisker is named
+OTHER = 8.0  # drop of log-likelihood at which a whisker's drift certainly differs from most
+SURE = 1.92  # drop of log-likelihood at the ends of an interval
 DRIFTS = np.geomspace(1e-3, 1e3, 560)  # in standard deviations of the noise
 SAME_RATE = 1e-3  # clocks differ by less
 HIDDEN = "noise is less than half a step: rounding hides it"
@@ -35,7 +35,7 @@ class Figure(NamedTuple):
     """A measured quantity that is not negative.
 
     Attributes:
-        value: The best estimate; 0 where only a limit is known.
+        value: The best estimate; 0 if only a limit is known.
         high: The upper end of the interval, or the limit.
     """
 
@@ -58,11 +58,11 @@ class Figure(NamedTuple):
 
 
 class Edit(NamedTuple):
-    """A value that is to stand in an array's file.
+    """A value to write into an array's file.
 
     Attributes:
-        path: The place of the value in the file: tables by name, one of several by its number
-            from 0, and the key, e.g. ``("sensor", "channel", 0, "drift")``.
+        path: The place of the value in the file: names of tables, the number from 0 in an array of
+            tables, and the key, e.g. ``("sensor", "channel", 0, "drift")``.
     """
 
     path: tuple[str | int, ...]
@@ -72,11 +72,11 @@ class Edit(NamedTuple):
 
 @dataclass(frozen=True)
 class ArrayFinding:
-    """One quantity of an array.
+    """A quantity of an array as described and as measured.
 
     Attributes:
         what: The name of the quantity, e.g. ``noise density of mz``.
-        described: The value that the array's file gives; None: it gives none.
+        described: The value in the array's file; None: it has none.
     """
 
     what: str
@@ -87,27 +87,27 @@ class ArrayFinding:
     edits: tuple[Edit, ...] = ()
 
     def words(self) -> tuple[str, str, str, str, str]:
-        """What it is, its unit, what is described, what was measured, and the ratio of the two."""
+        """Return name, unit, described value, measured value, and their ratio as text."""
         described = "" if self.described is None else f"{self.described:.4g}"
         measured = "-" if self.measured is None else str(self.measured)
-        told = self.described and self.measured and self.measured.value
-        ratio = f"{told / self.described:.3g}" if told and self.described else ""
+        value = self.described and self.measured and self.measured.value
+        ratio = f"{value / self.described:.3g}" if value and self.described else ""
         return self.what, self.unit, described, measured, ratio
 
 
 def about(value: float, error: float) -> Figure:
-    """A figure with a relative error: half of its interval."""
+    """Make a figure from a value and a relative error, which is half of its interval."""
     return Figure(value, value / (1 + error), value * (1 + error))
 
 
 def pooled(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[int]]:
-    """One figure for several of one kind, and which of them are none of the kind.
+    """Pool several figures into their median, and return the indices of outliers.
 
-    It is their median; its interval tells the uncertainty of each and how they scatter.
+    Its interval includes the uncertainty of each figure and their scatter.
 
     Args:
         figures: at least one, none of them a mere limit.
-        apart: the factor from which on one that is surely off the median counts as another kind.
+        apart: the factor from the median above which a figure, if significant, is an outlier.
     """
     logs = np.log([f.value for f in figures])
     errors = np.array([math.log(f.high / f.value) for f in figures])
@@ -121,10 +121,10 @@ def pooled(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[int]]:
 
 
 def spread_of(values: Sequence[float], known: float) -> Figure:
-    """The standard deviation from which several values about 0 were drawn.
+    """Estimate the standard deviation of values drawn about 0.
 
     Args:
-        known: the variance that something else adds to them.
+        known: the variance from other causes, which is subtracted.
     """
     total, n = float(np.square(values).sum()), len(values)
     least, most = (total / float(stats.chi2.ppf(p, n)) for p in (0.975, 0.025))
@@ -136,9 +136,9 @@ def spread_of(values: Sequence[float], known: float) -> Figure:
 def change(
     path: tuple[str | int, ...], described: float | None, found: Figure, why: str = ""
 ) -> tuple[Edit, ...]:
-    """What of a file's value is to change: nothing where it lies in the interval.
+    """Return the edit of a file's value; none if it lies in the interval.
 
-    A description beyond a limit is brought to the limit.
+    A described value beyond a limit is set to the limit.
     """
     if described is not None and found.low <= described <= found.high:
         return ()
@@ -151,10 +151,10 @@ def compare_sensor(
     rests: Mapping[str, Rest],
     untouched: Mapping[str, NDArray[np.float64]],
 ) -> list[ArrayFinding]:
-    """Rate, and noise, resolution, drift and offset of every channel.
+    """Compare the rate, and the noise, resolution, drift and offset of every channel.
 
     Args:
-        untouched: (channel,) readings at rest by whisker, as the description has them.
+        untouched: (channel,) readings at rest by whisker, as predicted by the description.
     """
     edits = change(("sensor", "rate_hz"), sensor.rate_hz, about(rate.value, SAME_RATE))
     note = ""
@@ -163,21 +163,21 @@ def compare_sensor(
     findings = [ArrayFinding("rate", "Hz", sensor.rate_hz, rate, note, edits)]
     passed_hz = replace(sensor, rate_hz=rate.value).noise_bandwidth_hz
     for c, channel in enumerate(sensor.channels):
-        said = _Channel(c, channel, rests)
-        drift = said.drift()
+        resting = _ChannelAtRest(c, channel, rests)
+        drift = resting.drift()
         known = drift.measured.value if drift.measured else 0.0
-        findings += [said.noise(passed_hz, known), said.resolution()]
-        findings += [drift, said.offset(untouched, known)]
+        findings += [resting.noise(passed_hz, known), resting.resolution()]
+        findings += [drift, resting.offset(untouched, known)]
     return findings
 
 
-class _Channel:
+class _ChannelAtRest:
     """One channel of all whiskers at rest."""
 
     def __init__(self, number: int, channel: ChannelSpec, rests: Mapping[str, Rest]) -> None:
         self._number, self._channel = number, channel
         self._rests = rests
-        # Readings that never change tell of a broken wire, not of a quiet sensor.
+        # Readings that never change mean a broken wire, not a quiet sensor.
         self._live = [n for n, r in rests.items() if r.noise[number] > 0 or r.step[number] > 0]
         self._fine = [n for n in self._live if not rests[n].coarse[number]]
 
@@ -189,10 +189,10 @@ class _Channel:
             most = float(np.median(steps)) / 2 / math.sqrt(passed_hz) if steps else 0.0
             note = HIDDEN if steps else "every whisker always reads the same"
             found = Figure(0.0, 0.0, most) if steps else None
-            return self._finding("noise_density", found, note, "per root of a hertz")
+            return self._report("noise_density", found, note, "per root of a hertz")
         for name in self._fine:
             rest = self._rests[name]
-            # What a drift leaves in a block, from which a line was taken, is no noise.
+            # The residual of drift in a detrended block is not noise.
             left = drift**2 * rest.block_s / (7.5 * FORGETS_S) + rest.step[c] ** 2 / 12
             white = math.sqrt(max(rest.noise[c] ** 2 - left, 0.1 * rest.noise[c] ** 2))
             counted = len(rest.levels) * (rest.size - 2)
@@ -203,24 +203,24 @@ class _Channel:
         notes = [f"unlike most: {name_some(unlike, MANY)}"] if unlike else []
         if dead := [name for name in self._rests if name not in self._live]:
             notes.append(f"always read the same: {name_some(dead, MANY)}")
-        return self._finding("noise_density", figure, "; ".join(notes), "per root of a hertz")
+        return self._report("noise_density", figure, "; ".join(notes), "per root of a hertz")
 
     def resolution(self) -> ArrayFinding:
         steps = np.array([self._rests[name].step[self._number] for name in self._live])
         if not len(steps):
-            return self._finding("resolution", None, "every whisker always reads the same")
+            return self._report("resolution", None, "every whisker always reads the same")
         step = float(np.median(steps))
         note = "" if step else "readings lie on no grid"
-        return self._finding("resolution", Figure(step, 0.999 * step, 1.001 * step), note)
+        return self._report("resolution", Figure(step, 0.999 * step, 1.001 * step), note)
 
     def drift(self) -> ArrayFinding:
         c, rests = self._number, [self._rests[name] for name in self._fine]
         if 2 * len(rests) <= len(self._live):
-            return self._finding("drift", None, HIDDEN if self._live else "")
+            return self._report("drift", None, HIDDEN if self._live else "")
         span_s = float(np.median([np.ptp(rest.at_s) for rest in rests]))
         if span_s < FORGETS_S:
             note = f"rest spans {span_s:.0f} s, and a drift takes {FORGETS_S:g} s"
-            return self._finding("drift", None, note)
+            return self._report("drift", None, note)
         sizes = DRIFTS * float(np.median([rest.noise[c] for rest in rests]))
         each = np.array([drift_likelihood(rest, c, sizes) for rest in rests])
         alike = np.full(len(each), True)
@@ -234,26 +234,26 @@ class _Channel:
             found = Figure(float(sizes[total.argmax()]), float(sizes[low]), float(sizes[high]))
         strange = [self._fine[k] for k in np.flatnonzero(~alike)]
         note = f"unlike most: {name_some(strange, MANY)}" if strange else ""
-        return self._finding("drift", found, note)
+        return self._report("drift", found, note)
 
     def offset(self, untouched: Mapping[str, NDArray[np.float64]], drift: float) -> ArrayFinding:
         c, names = self._number, self._live
         off = np.array([self._rests[name].level[c] - untouched[name][c] for name in names])
-        if self._channel.field and len(off):  # what all share is the magnet's
+        if self._channel.field and len(off):  # the common offset is due to the magnet
             off -= np.median(off)
         usual = TO_SIGMA * np.median(np.abs(off)) if len(off) else 0.0
         errors = np.array([self._rests[name].level_error[c] for name in names])
         alike = np.abs(off) <= STRANGE * np.maximum(usual, errors)
         if alike.sum() < FEWEST:
             note = f"{len(off)} whiskers, and a spread takes {FEWEST}"
-            return self._finding("offset", None, note)
-        # The levels themselves are not known better than this.
+            return self._report("offset", None, note)
+        # Subtract the errors of the levels themselves.
         figure = spread_of(off[alike].tolist(), drift**2 + float(np.mean(errors**2)))
-        strange = [name for name, one in zip(names, alike, strict=True) if not one]
+        strange = [name for name, normal in zip(names, alike, strict=True) if not normal]
         note = f"unlike most: {name_some(strange, MANY)}" if strange else ""
-        return self._finding("offset", figure, note)
+        return self._report("offset", figure, note)
 
-    def _finding(self, key: str, found: Figure | None, note: str, per: str = "") -> ArrayFinding:
+    def _report(self, key: str, found: Figure | None, note: str, per: str = "") -> ArrayFinding:
         described = getattr(self._channel, key)
         edits = change(("sensor", "channel", self._number, key), described, found) if found else ()
         what = f"{key.replace('_', ' ')} of {self._channel.name}"

@@ -1,4 +1,4 @@
-"""An array's file brought to what a recording of the device tells."""
+"""Fit of an array's file to a recording of the device."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -35,14 +35,14 @@ MEASURED = re.compile(r"(;\s*|#\s*)measured: .*")
 
 
 class Fitted(NamedTuple):
-    """An array's description beside a recording of the array."""
+    """The comparison of an array with its recording, and the text of the fitted file."""
 
     findings: list[ArrayFinding]
     text: str
 
 
 def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
-    """The array of a file, if a recording can be compared with it."""
+    """Read the array of a file, and check that a recording can be compared with it."""
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"{path}: an array that says what reads it is a .toml file")
     array = load_array(str(path))
@@ -64,30 +64,30 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
 
 
 def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
-    """Measure an array, and bring its description to that; nothing is written.
+    """Measure an array, and fit its description to that; no file is written.
 
     Raises:
-        ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or as
+        ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or see
             `read_described`.
     """
     array = read_described(path, spec)
     sensor = array.sensor
     assert sensor is not None
     rate = _measure_rate(recorded)
-    rests, rings = _measure(spec, recorded, rate.value, sensor.bandwidth_hz)
+    rests, rings = _measure_whiskers(spec, recorded, rate.value, sensor.bandwidth_hz)
     text = read_text(path)
     whiskers = [w for w in array.whiskers if w.name in spec.elements]
     untouched = {name: _predict_rest(sensor, name) for name in rests}
     findings = [
         *compare_sensor(sensor, rate, rests, untouched),
-        *compare_whiskers(whiskers, rings, rate.value, _tables(text)),
+        *compare_whiskers(whiskers, rings, rate.value, _read_tables(text)),
     ]
     if restless := [e for e in spec.elements if e not in rests]:
         note = f"never at rest for 3 s, or often invalid: {name_some(restless, MANY)}"
         findings.append(ArrayFinding("rest", "", None, None, note))
-    findings += _beyond_range(sensor, recorded)
+    findings += _find_out_of_range(sensor, recorded)
     text = edit_text(path, text, [e for f in findings for e in f.edits])
-    read_animals(path, text)  # what no array can have is told now, not when the file is written
+    read_animals(path, text)  # invalid values raise now, not when the file is written
     return Fitted(findings, text)
 
 
@@ -99,8 +99,8 @@ def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
     return np.asarray(read.values[0, 0].astype(np.float64))
 
 
-def _beyond_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
-    """The channels that read what they cannot by their description, even after a tare."""
+def _find_out_of_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
+    """Find channels whose readings exceed the described range, even after a tare."""
     largest = np.nanmax(np.abs(recorded.values[recorded.valid]), axis=0, initial=0.0)
     return [
         ArrayFinding(
@@ -112,8 +112,8 @@ def _beyond_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
     ]  # fmt: skip
 
 
-def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
-    """The number and the content of every whisker's table, by its name in the stream."""
+def _read_tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
+    """Return the number and the content of each whisker's table, by its name in the stream."""
     file = parse_toml(text, "array").plain()
     sides = ("R.", "L.") if file.get("mirror") else ("",)
     return {
@@ -123,13 +123,13 @@ def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
     }
 
 
-def _measure(
+def _measure_whiskers(
     spec: ArraySpec, recorded: Chunk, hz: float, bandwidth_hz: float
 ) -> tuple[dict[str, Rest], dict[str, list[Ring]]]:
     rests: dict[str, Rest] = {}
     away: list[NDArray[np.float32]] = []
     for i, name in enumerate(spec.elements):
-        values = _whole(recorded, i)
+        values = _fill_gaps(recorded, i)
         rest = None if values is None else find_rest(values, hz, bandwidth_hz)
         if values is None or rest is None:
             away.append(np.zeros((0, spec.shape[1]), np.float32))
@@ -170,8 +170,8 @@ def _measure_rate(recorded: Chunk) -> Figure:
     return Figure(1 / line.slope, (1 - error) / line.slope, (1 + error) / line.slope)
 
 
-def _whole(recorded: Chunk, element: int) -> NDArray[np.float32] | None:
-    """(n, channel) readings of an element, straight lines where a few are missing; else None."""
+def _fill_gaps(recorded: Chunk, element: int) -> NDArray[np.float32] | None:
+    """Interpolate an element's (n, channel) readings over a few gaps; None: too many missing."""
     valid = recorded.valid[:, element] & np.isfinite(recorded.values[:, element]).all(axis=1)
     seq = recorded.seq[valid] - recorded.seq[0]
     values: NDArray[np.float32] = recorded.values[valid, element]
@@ -188,20 +188,20 @@ def _whole(recorded: Chunk, element: int) -> NDArray[np.float32] | None:
 def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
     """Change values in the text of an array's file; comments and layout stay.
 
-    A line is changed by its look, which TOML allows to mislead. So what has been written is read
-    again, and refused unless it is the file with just these numbers changed.
+    A line is changed by a pattern, which valid TOML may defeat. So the new text is parsed again,
+    and refused unless it differs from the file in just these numbers.
     """
     ending = "\r\n" if "\r\n" in text else "\n"
     text = text.replace("\r\n", "\n")
-    wanted = parse_toml(text, str(path)).plain()
+    expected = parse_toml(text, str(path)).plain()
     for edit in edits:
-        at: Any = wanted
+        at: Any = expected
         for part in edit.path[:-1]:
             at = at[part] if isinstance(part, int) else at.setdefault(part, {})
         at[edit.path[-1]] = edit.value
         text = _write_edit(text, edit)
         try:
-            same = parse_toml(text, str(path)).plain() == wanted
+            same = parse_toml(text, str(path)).plain() == expected
         except ConfigError:
             same = False
         if not same:
@@ -214,14 +214,14 @@ def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
 
 def _write_edit(text: str, edit: Edit) -> str:
     lines, numbers = text.split("\n"), find_lines(text)
-    table, said = edit.path[:-1], f"measured: {edit.why}"
-    new = f"{edit.path[-1]} = {edit.value:g} # {said}"
+    table, note = edit.path[:-1], f"measured: {edit.why}"
+    new = f"{edit.path[-1]} = {edit.value:g} # {note}"
     if edit.path in numbers:
         at = numbers[edit.path] - 1
         if found := LINE.fullmatch(lines[at]):
             key, gap, comment = found.groups()
             kept = MEASURED.sub("", comment or "").rstrip()
-            comment = f"{kept}; {said}" if kept else f"# {said}"
+            comment = f"{kept}; {note}" if kept else f"# {note}"
             lines[at] = f"{key}{edit.value:g}{gap or ' '}{comment}"
     elif table in numbers:
         keys = [n for p, n in numbers.items() if p[:-1] == table and lines[n - 1].strip()[0] != "["]

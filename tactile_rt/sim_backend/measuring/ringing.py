@@ -1,12 +1,12 @@
-"""Whiskers that were bent and let go: how fast they swing, and how soon that is over.
+"""Frequency and damping of the free swings of plucked whiskers.
 
-Plan. A stretch in which a whisker is away from its rest is a pluck if it ends in a free swing:
-that begins where the whisker first passes its rest after having been furthest from it, as nothing
-holds it there. The swing is taken in the direction, among the channels, in which most of it is. Its
-beginning is left out where it is large: large swings are not linear, and other modes are in them.
-One decaying sinusoid with an offset is fitted to the rest by least squares, whose phase and decay
-may bend with the square of its size, as theirs do; what is told is what it tends to. Where that
-leaves more than a tenth of it, it was no free swing, or one of two whiskers.
+Plan. A stretch in which a whisker is away from its rest is a pluck if it ends in a free swing.
+This begins where the whisker first passes its rest after its largest deflection, because nothing
+holds it there. The swing is projected onto the direction of its largest variance among channels.
+Its beginning is left out while it is large: large swings are nonlinear and contain other modes. A
+decaying sinusoid with an offset is fitted to the rest by least squares. Its phase and decay may
+bend with the square of its size, as those of a whisker do; the result is the limit of small
+swings. A fit that leaves more than a tenth of the energy was not a free swing of one whisker.
 """
 
 from collections.abc import Sequence
@@ -19,16 +19,16 @@ from scipy.optimize import least_squares
 Floats = NDArray[np.float64]
 
 HEARD = 0.45  # of the sample rate: a faster swing may be the alias of another one
-AWAY, LARGE = 6.0, 20.0  # of any sample, and of the furthest: in standard deviations of the noise
+AWAY, LARGE = 6.0, 20.0  # least deflection of a sample, and of a pluck's peak: in noise sigmas
 APART_S = 0.25  # calm between two plucks
-LOUDER = 5.0  # a swing that another one drowns is its echo in the mount
-SMALL, CLEAR = 1 / 3, 20.0  # of the largest swing, and in standard deviations of the noise
+LOUDER = 5.0  # a simultaneous swing this much smaller than another is its echo in the mount
+SMALL, CLEAR = 1 / 3, 20.0  # of the largest swing, and in noise sigmas: where the fit may begin
 FEWEST = 12  # samples
 LONGEST = 4000  # samples that are fitted
 PERIODS = 1.0  # at least
-BENDS = 0.3  # standard deviation of what a large swing adds to phase, rad, and log of decay
-RATIOS = (0.003, 0.01, 0.03, 0.1, 0.3)  # damping ratios from which the fit begins
-LEFT = 0.1  # of the energy
+BENDS = 0.3  # prior standard deviation of a large swing's bend of phase, rad, and of log decay
+RATIOS = (0.003, 0.01, 0.03, 0.1, 0.3)  # initial damping ratios of the fit
+LEFT = 0.1  # of the energy, at most
 
 
 class Ring(NamedTuple):
@@ -47,10 +47,10 @@ class Ring(NamedTuple):
 
 
 class Swing(NamedTuple):
-    """A stretch in which a whisker is away from its rest.
+    """A stretch of samples in which a whisker is away from its rest.
 
     Attributes:
-        begin, end: The indices of the first sample, and of one a little after the last.
+        begin, end: The indices of the first sample, and of a sample shortly after the last.
         size: The largest distance from rest, in standard deviations of the noise.
     """
 
@@ -61,7 +61,7 @@ class Swing(NamedTuple):
 
 
 def find_swings(away: Sequence[NDArray[np.float32]], rate_hz: float) -> list[Swing]:
-    """All stretches of all whiskers but those that are the echo of a larger one.
+    """Find the swings of all whiskers, except echoes of larger swings.
 
     Args:
         away: (n, channel) of every whisker, distance from rest in standard deviations of the noise.
@@ -89,7 +89,7 @@ def find_swings(away: Sequence[NDArray[np.float32]], rate_hz: float) -> list[Swi
 
 
 def fit_ring(away: NDArray[np.float32], rate_hz: float) -> Ring | None:
-    """The free swing that a stretch ends with; None: there is none.
+    """Fit the free swing at the end of a stretch; None: it has none.
 
     Args:
         away: (n, channel) distance from rest in standard deviations of the noise.
@@ -105,13 +105,13 @@ def fit_ring(away: NDArray[np.float32], rate_hz: float) -> Ring | None:
     _, _, directions = np.linalg.svd(free, full_matrices=False)
     x = free @ directions[0]
     size = np.abs(x)
-    seen = _last(size > AWAY)
-    x = x[min(_last(size > max(SMALL * size.max(), CLEAR)), seen // 2) :]
+    seen = _find_end(size > AWAY)
+    x = x[min(_find_end(size > max(SMALL * size.max(), CLEAR)), seen // 2) :]
     t = np.arange(len(x)) / rate_hz
 
-    def left(guess: Floats) -> Floats:
+    def compute_residuals(guess: Floats) -> Floats:
         hz, ratio = np.exp(guess[:2])
-        bends = guess[2:]  # of phase and of decay, where the swing is large, as its square
+        bends = guess[2:]  # of phase and of log decay, in proportion to the square of the size
         omega = 2 * np.pi * hz
         large = -np.expm1(-2 * ratio * omega * t)
         decay = np.exp(-ratio * omega * t + bends[1] * large)
@@ -125,7 +125,7 @@ def fit_ring(away: NDArray[np.float32], rate_hz: float) -> Ring | None:
     low = [*np.log([0.3 * guess, 1e-4]), -1, -1]
     high = [*np.log([min(3 * guess, 0.6 * rate_hz), 0.95]), 1, 1]
     begins = [[*np.log([guess, ratio]), 0, 0] for ratio in RATIOS]
-    fits = [least_squares(left, begin, bounds=(low, high)) for begin in begins]
+    fits = [least_squares(compute_residuals, begin, bounds=(low, high)) for begin in begins]
     best = min(fits, key=lambda fit: fit.cost)
     hz, ratio = np.exp(best.x[:2])
     damped = hz * np.sqrt(1 - ratio**2)
@@ -142,6 +142,6 @@ def fit_ring(away: NDArray[np.float32], rate_hz: float) -> Ring | None:
     return Ring(float(hz), float(ratio), float(hz * hz_error), float(ratio * ratio_error))
 
 
-def _last(which: NDArray[np.bool_]) -> int:
-    """The index after the last one; 0: there is none."""
+def _find_end(which: NDArray[np.bool_]) -> int:
+    """Return the index after the last True; 0 if there is none."""
     return int(np.flatnonzero(which)[-1]) + 1 if which.any() else 0

@@ -1,8 +1,8 @@
-"""The mechanics of a chain of links: where it is, its mass matrix, its inertial forces.
+"""The mechanics of a chain of links: its pose, its mass matrix, its inertial forces.
 
-In mm, mg and ms, as `world`. Link b hangs on node b and reaches to node b + 1. Its joint is a hinge
-about the y axis that it has at rest and then one about its own z axis, so its degrees of freedom
-are 2 (b - clamped) and the next one; the first link has none where the base is clamped.
+In mm, mg and ms, like `world`. Link b is from node b to node b + 1. Its joint is a hinge about its
+resting y axis, followed by a hinge about its own z axis, so its degrees of freedom are
+2 (b - clamped) and the next; the first link has none if the base is clamped.
 
 Featherstone, Rigid Body Dynamics Algorithms (2008): composite bodies for the mass matrix, Newton
 and Euler's equations from link to link for the forces.
@@ -15,21 +15,21 @@ import numpy as np
 
 from tactile_rt.sim_backend.rods.compiled import compiled
 
-A = Any  # a contiguous array of float64: what is compiled knows its arguments' types by itself
+A = Any  # a contiguous array of float64: numba infers the types of arguments
 
 
 class Chain(NamedTuple):
-    """What a whisker is made of; and, their rows one after the other, what many are.
+    """The mechanical parameters of a whisker, or of many with concatenated rows.
 
     Attributes:
-        clamped: The number of links without a joint: 1, or 0 where the base gives.
+        clamped: The number of links without a joint: 1, or 0 on a compliant base.
         turn: (link, 2) cosine and sine of the resting angle from the link before, about z.
         length: (link,) lengths of the links, mm.
         inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
             inertia (mg mm^2).
         stiffness: (degree of freedom,) stiffnesses of the joints, uN m / rad.
-        added, damping: (degree of freedom, as many or more columns) mg mm^2 and uN m ms / rad that
-            go with the stiffness, see `rod.make_rod`.
+        added, damping: (degree of freedom, level, as many or more columns) added mass (mg mm^2) and
+            damping (uN m ms / rad) for each length of a step, see `rod.make_rod`.
         friction: Coulomb's coefficient of friction of the surface.
     """
 
@@ -44,7 +44,7 @@ class Chain(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """Where a chain is, in the world.
+    """The pose of a chain in the world.
 
     Attributes:
         nodes: (link + 1, 3) ends of the links, mm.
@@ -59,7 +59,7 @@ class Pose(NamedTuple):
 
 @compiled
 def place(chain: Chain, q: A, pose: Pose) -> None:
-    """Fill in where a chain is whose first node and first frame at rest stand in `pose` already.
+    """Compute a chain's pose from the first node and first resting frame in `pose`.
 
     Args:
         q: (degree of freedom,) rad.
@@ -91,7 +91,7 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
 
 @compiled
 def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
-    """Fill in where a chain on a (4, 3) base is: its point and frame."""
+    """Compute the pose of a chain on a (4, 3) base: point in row 0, frame in the others."""
     for i in range(3):
         pose.nodes[0, i] = root[0, i]
         for k in range(3):
@@ -101,7 +101,7 @@ def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
 
 @compiled
 def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
-    """The lower triangle of the mass matrix.
+    """Compute the lower triangle of the mass matrix.
 
     Args:
         work: (3, 3) scratch.
@@ -155,7 +155,7 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
 def inertial_forces(
     chain: Chain, pose: Pose, v: A, a: A, base: A, pushed: A, work: A, torques: A, wrench: A
 ) -> None:
-    """What an acceleration takes, less what pushes from outside.
+    """Compute the torques of a motion (inverse dynamics), less those of external forces.
 
     Args:
         v, a: (degree of freedom,) rad/ms and rad/ms^2.
@@ -163,8 +163,8 @@ def inertial_forces(
             acceleration.
         pushed: (link, 6) force (mN) and moment about the world's origin (uN m) on each link.
         work: (link, 6) scratch.
-        torques: (degree of freedom,) filled: about each joint's axis.
-        wrench: (6,) filled: force on the base and moment about it that the base has to give.
+        torques: (degree of freedom,) filled: about each joint's axis, uN m.
+        wrench: (6,) filled: force (mN) and moment (uN m) that the base exerts, about its point.
     """
     clamped, inertia = chain.clamped, chain.inertia
     nodes, frames, axes = pose
@@ -185,7 +185,7 @@ def inertial_forces(
         x0, x1, x2 = frames[b, 0, 0], frames[b, 1, 0], frames[b, 2, 0]
         m, at, across = inertia[b, 0], inertia[b, 1], inertia[b, 3]
         along = inertia[b, 2] - across
-        # A unit along the link is accelerated by this: tangentially and towards the axis.
+        # Acceleration per mm along the link: tangential and centripetal.
         u0, u1, u2 = w1 * x2 - w2 * x1, w2 * x0 - w0 * x2, w0 * x1 - w1 * x0
         c0 = t1 * x2 - t2 * x1 + w1 * u2 - w2 * u1
         c1 = t2 * x0 - t0 * x2 + w2 * u0 - w0 * u2
@@ -208,7 +208,7 @@ def inertial_forces(
             across * t2 + along * tx * x2 + w0 * l1 - w1 * l0 + r0 * f1 - r1 * f0 - pushed[b, 5]
         )
         if b + 1 < links:
-            # the next node: the links' lengths are the nodes' distances
+            # The next node; a link's length is the distance of its nodes.
             n = math.sqrt(
                 (nodes[b + 1, 0] - nodes[b, 0]) ** 2
                 + (nodes[b + 1, 1] - nodes[b, 1]) ** 2
@@ -236,10 +236,10 @@ def inertial_forces(
 
 @compiled
 def factor(matrix: A, n: int) -> bool:
-    """Cholesky's factor of the first n rows, in place, from the lower triangle.
+    """Compute the Cholesky factor of the first n rows, in place, from the lower triangle.
 
     Returns:
-        Whether there is one: False of a matrix that is not positive definite.
+        False if the matrix is not positive definite.
     """
     for i in range(n):
         for j in range(i):
@@ -268,7 +268,7 @@ def solve_forth(lower: A, n: int, x: A) -> None:
 
 @compiled
 def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
-    """Solve L y = x for as many columns of x, in place."""
+    """Solve L y = x for `count` columns of x, in place."""
     for i in range(n):
         for k in range(i):
             for c in range(count):
@@ -288,7 +288,7 @@ def solve_back(lower: A, n: int, x: A) -> None:
 
 
 def chain_mass(chain: Chain) -> A:
-    """(degree of freedom, degree of freedom) mass matrix of a chain at rest, whole."""
+    """Compute the full mass matrix of a chain at rest: (degree of freedom, same)."""
     links, n = len(chain.length), 2 * (len(chain.length) - chain.clamped)
     pose = Pose(np.zeros((links + 1, 3)), np.zeros((links, 3, 3)), np.zeros((n, 3)))
     pose.frames[0], matrix = np.eye(3), np.zeros((n, n))

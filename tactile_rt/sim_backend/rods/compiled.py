@@ -1,8 +1,8 @@
-"""Compilation of the inner loops to machine code, which is kept for the next process.
+"""Compilation of the inner loops to machine code, cached on disk for the next process.
 
-Where nothing can be kept (a folder that belongs to another, no home, a full disk), or what is kept
-is damaged, a process compiles for itself: that takes it half a minute, and no more. Work that
-takes so long says so after ten seconds, as a warning of this module's logger.
+If nothing can be cached (a folder of another user, no home, a full disk), or the cache is damaged,
+each process compiles for itself, which takes half a minute. A compilation that lasts more than ten
+seconds is reported as a warning of this module's logger.
 """
 
 import contextlib
@@ -18,10 +18,10 @@ from numba.core import caching
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_caching: Any = caching  # which has no types
+_caching: Any = caching  # has no types
 
-# Numba looks only at the file of a function, not at those of the functions that it calls: what was
-# compiled before one of these files changed is old.
+# Numba checks only a function's own file, not the files of the functions that it calls: this
+# stamp invalidates the cache when any of these files changes.
 STAMP = tuple(
     (file.name, status.st_mtime_ns, status.st_size)
     for file in sorted(Path(__file__).parent.glob("*.py"))
@@ -29,8 +29,8 @@ STAMP = tuple(
 )
 
 
-class _Kept(_caching.FunctionCache):  # type: ignore[misc]
-    """What numba keeps of a function, and lives without."""
+class _DiskCache(_caching.FunctionCache):  # type: ignore[misc]
+    """Numba's disk cache of a function, whose failures are ignored."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -42,7 +42,7 @@ class _Kept(_caching.FunctionCache):  # type: ignore[misc]
         found = None
         try:
             found = super().load_overload(sig, target_context)
-        except Exception:  # damage shows itself in a dozen ways
+        except Exception:  # a damaged cache raises many kinds of error
             with contextlib.suppress(OSError):
                 self.flush()
         if found is None:
@@ -58,7 +58,7 @@ class _Kept(_caching.FunctionCache):  # type: ignore[misc]
 
 _LOG = logging.getLogger(__name__)
 PATIENCE_S = 10.0
-_compiling: set[_Kept] = set()  # the functions that are being compiled now
+_compiling: set[_DiskCache] = set()  # caches of the functions that are being compiled now
 
 
 @cache
@@ -75,7 +75,7 @@ def _warn_of_compilation() -> None:
 
 
 @cache
-def _tell_once() -> None:
+def _warn_uncached_once() -> None:
     _LOG.warning(
         "the simulator is compiled anew, which takes half a minute: there is no folder to keep it "
         "in; NUMBA_CACHE_DIR can name one"
@@ -83,23 +83,23 @@ def _tell_once() -> None:
 
 
 def compiled(function: Function) -> Function:
-    """A function that is compiled when first called, and kept on disk for the next process.
+    """Return a function that is compiled when first called, and cached on disk.
 
-    It lets other threads run, and its sums are in the order in which they are written: the same
-    numbers on every machine.
+    It releases the interpreter lock, and its sums keep the order of the source: the same numbers
+    on every machine.
     """
     made: Any = numba.njit(nogil=True, error_model="numpy")(function)
     try:
-        made._cache = _Kept(function)
+        made._cache = _DiskCache(function)
     except RuntimeError:  # no folder to keep it in
-        _tell_once()
+        _warn_uncached_once()
     return cast(Function, made)
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Return True if other processes find this version of a function compiled."""
+    """Return whether other processes find this version of a function compiled."""
     cache: Any = getattr(function, "_cache", None)
     try:
-        return isinstance(cache, _Kept) and bool(cache._cache_file._load_index())
-    except Exception:  # as when one is loaded
+        return isinstance(cache, _DiskCache) and bool(cache._cache_file._load_index())
+    except Exception:  # a damaged cache, as in `load_overload`
         return False

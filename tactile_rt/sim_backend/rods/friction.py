@@ -1,11 +1,10 @@
-"""Contacts with dry friction: the impulses that let nothing overlap at the end of a step.
+"""Contacts with dry friction: the impulses that prevent overlap at the end of a step.
 
-A contact gives way along its normal only outwards, and its friction opposes the slip with as much
-as the coefficient times the normal impulse. Where the normal impulse is zero the surfaces may part.
-Contacts are solved one after the other until none changes (Gauss and Seidel); in one, friction is a
-viscous drag whose coefficient is found so that the drag is Coulomb's, which leaves a linear problem
-with one unknown each time. Nothing here opens a sliding contact, as the convex cones of many
-engines do.
+Along its normal a contact can only open; its friction opposes the slip with up to the coefficient
+times the normal impulse. If the normal impulse is zero, the surfaces may part. Contacts are solved
+one after another until none changes (Gauss-Seidel). In each, friction is a viscous drag whose
+coefficient is iterated until the drag is Coulomb's, which leaves a linear problem with one unknown
+per iteration. Unlike with the convex cones of many engines, a sliding contact does not open.
 """
 
 import math
@@ -14,25 +13,25 @@ from typing import Any
 from tactile_rt.sim_backend.rods.compiled import compiled
 
 A = Any
-CREEP = 2e-5  # mm/ms: slower slips are held with less than all friction
+CREEP = 2e-5  # mm/ms: below this slip, friction is less than Coulomb's
 MOST_SWEEPS = 20
-# For a contact's drag, in the first sweep and in later ones: there the other contacts have yet to
-# settle, and what more rounds would find is lost.
+# Iterations of a contact's drag in the first sweep, and in later ones: in those the other contacts
+# still change, which would undo more iterations.
 MOST_ROUNDS, LATER_ROUNDS = 10, 2
 TOLERANCE = 1e-4  # of the largest impulse
 
 
 @compiled
 def impulses(count: int, response: A, free: A, friction: float, drag: A, found: A) -> int:
-    """Solve for the impulses of some contacts.
+    """Solve for the impulses of contacts.
 
     Args:
-        count: how many contacts, each with a normal and two tangential directions.
+        count: number of contacts, each with a normal and two tangential directions.
         response: (3 contact, 3 contact) change of relative velocity per impulse.
-        free: (3 contact,) relative velocity without any impulse, along the normal with the gap to
-            be closed added, mm/ms.
-        drag: (contact,) where to begin: friction's impulse per slip; filled with what was found.
-        found: (3 contact,) impulses, from where to begin; filled.
+        free: (3 contact,) relative velocity without any impulse, mm/ms; along the normal plus the
+            gap over the step.
+        drag: (contact,) initial friction impulses per slip; filled with the solution.
+        found: (3 contact,) initial impulses; filled with the solution.
 
     Returns:
         The number of sweeps over the contacts.
@@ -59,7 +58,7 @@ def impulses(count: int, response: A, free: A, friction: float, drag: A, found: 
                 )
                 d = drag[c]
                 for _ in range(LATER_ROUNDS if sweep else MOST_ROUNDS):
-                    # Slip under the drag: (1 + d R) slip = w + r n, r what n does to the slip.
+                    # Slip under the drag: (1 + d R) slip = w + r n, r the slip per unit of n.
                     m11, m12, m22 = 1.0 + d * r11, d * r12, 1.0 + d * r22
                     det = m11 * m22 - m12 * m12
                     x1, x2 = (m22 * w1 - m12 * w2) / det, (m11 * w2 - m12 * w1) / det
@@ -69,9 +68,9 @@ def impulses(count: int, response: A, free: A, friction: float, drag: A, found: 
                     slip1, slip2 = x1 + y1 * n, x2 + y2 * n
                     t, s = -d * slip1, -d * slip2
                     square = slip1 * slip1 + slip2 * slip2
-                    wanted = friction * n / math.sqrt(square + CREEP * CREEP)
-                    settled = abs(wanted - d) * math.sqrt(square) <= 1e-5 * friction * n
-                    d = wanted
+                    coulomb = friction * n / math.sqrt(square + CREEP * CREEP)
+                    settled = abs(coulomb - d) * math.sqrt(square) <= 1e-5 * friction * n
+                    d = coulomb
                     if settled:
                         break
                 drag[c] = d

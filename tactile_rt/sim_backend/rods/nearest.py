@@ -1,5 +1,5 @@
 """The nearest points of a segment and a convex piece: the distance algorithm of Gilbert, Johnson
-and Keerthi (1988), and for what overlaps the face through which it is nearest to come out.
+and Keerthi (1988), and in an overlap the face through which the way out is shortest.
 """
 
 import math
@@ -11,15 +11,15 @@ from tactile_rt.sim_backend.rods.compiled import compiled
 
 A = Any
 MOST_ROUNDS = 40
-OVERLAP_MM = 1e-7  # nearer than that, a direction between the nearest points means nothing
+OVERLAP_MM = 1e-7  # below, the direction between the nearest points is undefined
 WORK = (6, 4)  # shape of the scratch
 
 
 @compiled
-def _weights(simplex: A, count: int, weights: A, w: A) -> float:
-    """Squared distance from the origin to the hull of up to four points, and the nearest's weights.
+def _find_weights(simplex: A, count: int, weights: A, w: A) -> float:
+    """Compute the squared distance from the origin to the hull of up to four points.
 
-    Every face of it is tried: there are fifteen at most, and the nearest inner point wins.
+    Tries all subsets, fifteen at most; `weights` is filled with those of the nearest inner point.
     """
     best = np.inf
     for mask in range(1, 1 << count):
@@ -95,23 +95,23 @@ def _weights(simplex: A, count: int, weights: A, w: A) -> float:
 def nearest(
     a: A, b: A, corners: A, faces: A, beside: A, beside_at: A, known: A, work: A, found: A
 ) -> None:
-    """Distance of a segment from a convex piece, both in the piece's frame.
+    """Compute the distance of a segment from a convex piece, in the piece's frame.
 
     Args:
         a, b: (3,) ends of the segment, mm.
         corners: (corner, 3) mm.
         faces: (face, 4) outward normals and offsets, for a segment that overlaps the piece; none:
             the piece is a point or a line.
-        beside: the numbers of the corners to which an edge leads from each, one corner after the
-            other, and `beside_at` (corner + 1,) where each one's begin; without any, all corners
-            are tried.
-        known: (4,) pairs of a corner and an end between which the nearest points lie, each twice
-            the corner, plus one for b; from -1 on unknown. The last call's, if little has moved
-            since, or -1; filled.
+        beside: numbers of the neighbours of each corner along its edges, concatenated over
+            corners; `beside_at` (corner + 1,) has the start of each corner's. If empty, all
+            corners are tried.
+        known: (4,) pairs of a corner and an end between which the nearest points lie: twice the
+            corner's number, plus one for b; entries from the first -1 on are unknown. Those of the
+            last call, if little has moved since, or -1; filled.
         work: `WORK` scratch.
         found: (6,) filled: distance (mm; negative: depth), place on the segment from 0 (a) to
-            1 (b), the direction from the piece to the segment, and how far the piece reaches in
-            that direction, mm from its frame's origin (infinite where that is not known).
+            1 (b), direction from the piece to the segment, and extent of the piece in that
+            direction, mm from its frame's origin (infinite if unknown).
     """
     weights = work[4]
     if known[0] < 0:
@@ -125,7 +125,7 @@ def nearest(
     p0, p1, p2, square = 0.0, 0.0, 0.0, np.inf
     furthest = np.inf
     for _ in range(MOST_ROUNDS):
-        nearer = _weights(work, count, weights, work[5])
+        nearer = _find_weights(work, count, weights, work[5])
         kept = 0
         p0, p1, p2 = 0.0, 0.0, 0.0
         for c in range(count):
@@ -150,7 +150,7 @@ def nearest(
                 onto = p0 * corners[c, 0] + p1 * corners[c, 1] + p2 * corners[c, 2]
                 if onto > furthest:
                     furthest, far = onto, c
-        else:  # uphill along the edges: on a convex body no other top is in the way
+        else:  # uphill along the edges: a convex body has no other local maximum
             at = known[0] // 2
             while at >= 0:
                 far, at = at, -1
@@ -185,7 +185,7 @@ def nearest(
         found[2], found[3], found[4] = p0 / away, p1 / away, p2 / away
         found[5] = furthest / away
         return
-    # Inside: the place on the segment, of three, that is deepest, and the face nearest to it.
+    # Overlap: of three places on the segment, the deepest, and the face nearest to it.
     found[0] = np.inf
     for half in range(3):
         t = half / 2

@@ -1,4 +1,4 @@
-"""One step of one whisker: mechanics, contacts with dry friction, and the load on its base."""
+"""A time step of one whisker: mechanics, contacts with dry friction, and the load on its base."""
 
 import math
 from typing import Any, NamedTuple
@@ -21,12 +21,12 @@ from tactile_rt.sim_backend.rods.touching import MOST_CONTACTS, Contacts
 
 A = Any
 OUT_SWEEPS = 30
-GIVES_MM = 1e-4  # how far what holds a contact gives way before it slides
+GIVES_MM = 1e-4  # deflection of a sticking contact before it slides
 
 
 @compiled
-def _directions(normal: A, frame: A, rows: A) -> None:
-    """Fill rows (3, 3) with a normal and two tangents, the first along the link if it can be."""
+def _fill_directions(normal: A, frame: A, rows: A) -> None:
+    """Fill rows (3, 3) with a normal and two tangents, the first along the link if possible."""
     for axis in range(2):
         x0, x1, x2 = frame[0, axis], frame[1, axis], frame[2, axis]
         onto = x0 * normal[0] + x1 * normal[1] + x2 * normal[2]
@@ -43,14 +43,14 @@ def _directions(normal: A, frame: A, rows: A) -> None:
 
 
 class Scratch(NamedTuple):
-    """Room for a step's numbers; what later steps, or who calls, may want is said.
+    """Work arrays of a step; only the results that outlast it are documented.
 
     Attributes:
-        mass, lower: The mass matrix, and the factor of the system of equations, of the last step
-            for which they were made.
-        wrench: (6,) force on the base (mN) and moment about it (uN m), of the last step.
-        felt: (2,) the sum of the normal forces (mN), and the contact with the largest, of the last
-            step.
+        mass, lower: The mass matrix and the Cholesky factor of the system, of the last step for
+            which they were computed.
+        wrench: (6,) force of the base (mN) and moment about it (uN m) in the last step.
+        felt: (2,) the sum of the normal forces (mN), and the number of the contact with the
+            largest, in the last step.
     """
 
     mass: A
@@ -71,7 +71,7 @@ class Scratch(NamedTuple):
 
 @compiled
 def scratch(links: int, n: int) -> Scratch:
-    """Room for a whisker of some links and degrees of freedom."""
+    """Allocate `Scratch` for a whisker of `links` links and `n` degrees of freedom."""
     wide = 3 * MOST_CONTACTS
     return Scratch(
         np.zeros((n, n)),
@@ -108,16 +108,16 @@ def step(
     last: A,
     room: Scratch,
 ) -> None:
-    """One step from where the chain stands: q, v and the wrench in `room` are filled.
+    """Advance a chain by one time step: q, v and `room` are updated.
 
     Args:
-        h: ms.
-        fresh: whether to make mass matrix and factor anew; else those of an earlier step of the
-            same length will do.
-        matched: whether with the masses with which the modes have their frequencies at this length
-            of a step, or with the true ones.
+        h: length of the step, ms.
+        fresh: whether to compute mass matrix and factor anew; else those of an earlier step of the
+            same length are used.
+        level: how often the whisker's usual step is halved: selects the added masses and damping.
         q, v: (degree of freedom,) rad and rad/ms.
         surface: (3,) velocity of the object, mm/ms.
+        last: (link, 6) see `stepping.RodState`; updated.
     """
     clamped, stiffness, friction = chain.clamped, chain.stiffness, chain.friction
     nodes, frames, axes = pose
@@ -131,7 +131,7 @@ def step(
         move[i] = 0.0
     inertial_forces(chain, pose, v, move, base, pushed, room.forces, free, wrench)
     if fresh:
-        # The added mass is that of the whisker at rest: bent far, the sum may be less than nothing.
+        # The added mass is that at rest: if bent far, the sum may not be positive definite.
         for share in range(1, -1, -1):
             mass_matrix(chain, pose, room.cube, mass)
             for i in range(n):
@@ -154,7 +154,7 @@ def step(
     if count:
         for c in range(count):
             link = link_of[segments[c]]
-            _directions(normals[c], frames[link], rows[3 * c : 3 * c + 3])
+            _fill_directions(normals[c], frames[link], rows[3 * c : 3 * c + 3])
             reply[:, 3 * c : 3 * c + 3] = 0.0
             for k in range(2 * (link + 1 - clamped)):
                 b = clamped + k // 2
@@ -170,7 +170,7 @@ def step(
                     reply[k, i] = j0 * rows[i, 0] + j1 * rows[i, 1] + j2 * rows[i, 2]
         solve_many_forth(lower, n, 3 * count, reply)
         for c in range(count):
-            # what the base's own motion gives the point, less the object's
+            # velocity of the point that moves with the base, relative to the object
             r0, r1, r2 = (
                 points[c, 0] - nodes[0, 0],
                 points[c, 1] - nodes[0, 1],
@@ -185,7 +185,7 @@ def step(
                     s += reply[k, i] * move[k]
                 free[i] = s
             free[3 * c] += max(gaps[c], 0.0) / h
-            # What holds a contact that sticks has given way so far already, see `friction`.
+            # Deflection that a sticking contact has already, see `GIVES_MM`.
             link = link_of[segments[c]]
             free[3 * c + 1] += last[link, 4] / h
             free[3 * c + 2] += last[link, 5] / h
@@ -196,7 +196,7 @@ def step(
                 for j in range(3 * count):
                     response[i, j] += reply[k, i] * reply[k, j]
         for c in range(count):
-            # begin from the last step's, of the contact on the same link
+            # start from the last step's contact on the same link
             link = link_of[segments[c]]
             drag[c] = last[link, 3]
             for i in range(3):
@@ -249,11 +249,11 @@ def step(
     for c in range(count):
         deep |= gaps[c] < 0.0
     if deep:
-        _out(h, count, base, surface, q, v, pose, near, room)
+        _push_out(h, count, base, surface, q, v, pose, near, room)
 
 
 @compiled
-def _out(
+def _push_out(
     h: float,
     count: int,
     base: A,
@@ -264,7 +264,7 @@ def _out(
     near: Contacts,
     room: Scratch,
 ) -> None:
-    """Move out what overlaps, by the least that does it, without giving it a velocity."""
+    """Resolve overlaps by the smallest displacement, without changing velocities."""
     n = len(q)
     gaps, points, nodes = near.gaps, near.points, pose.nodes
     lower, rows, reply, response = room.lower, room.rows, room.reply, room.response
@@ -273,7 +273,7 @@ def _out(
         turned[k] = 0.0
         for j in range(k, n):
             turned[k] += lower[j, k] * v[j]
-    # free: how far each contact will still be inside after the step, mm
+    # free: the gap of each contact after the step, mm; negative: still overlapping
     for c in range(count):
         i = 3 * c
         r0 = points[c, 0] - nodes[0, 0]

@@ -1,4 +1,4 @@
-"""How a whisker rests under its weight, and how it moves near there while it touches nothing."""
+"""A whisker's rest under its weight, and its linearised free motion near rest."""
 
 from typing import Any
 
@@ -18,9 +18,9 @@ from tactile_rt.sim_backend.rods.one_step import scratch, step
 from tactile_rt.sim_backend.rods.touching import Contacts
 
 A = Any
-SHARES, MOST_TRIES = 4, 20  # of the weight, one after the other, and of Newton's method for each
-SETTLED, NUDGE = 1e-12, 1e-6  # rad
-LITTLE = 0.005  # rad that all joints together are bent by: a whisker answers in proportion
+SHARES, MOST_TRIES = 4, 20  # load steps of the weight, and Newton iterations in each
+SETTLED, NUDGE = 1e-12, 1e-6  # tolerance, and step of finite differences, rad
+LITTLE = 0.005  # rad, sum over all joints: the limit of the linear range
 
 
 @compiled
@@ -28,14 +28,14 @@ def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool
     """Find the angles at which a whisker rests under its weight, by Newton's method.
 
     Args:
-        root: (4, 3) see `advance`.
+        root: (4, 3) see `stepping.advance`.
         gravity: (3,) mm/ms^2.
         q: (degree of freedom,) rad, filled.
         weight: (6,) filled: see `RodState`.
         nodes: (2, link + 1, 3) filled: ends of the links without weight and with it, mm.
 
     Returns:
-        False if none is found: too soft a whisker to carry itself.
+        False if there is no solution: the whisker is too soft to carry itself.
     """
     links, n = len(chain.length), len(q)
     pose = Pose(np.empty((links + 1, 3)), np.empty((links, 3, 3)), np.empty((n, 3)))
@@ -77,16 +77,16 @@ def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool
 
 @compiled
 def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None:
-    """Find the matrix by which a whisker near rest moves through 1 ms.
+    """Compute the matrix that moves a whisker near rest through a sample of 1 ms.
 
     Args:
-        steps: how many make the sample.
+        steps: time steps in a sample.
         gravity: (3,) in the frame of the first link, mm/ms^2.
         rest: (degree of freedom,) see `settle`, rad.
-        answers: (2 degree of freedom + 6 or 8, 2 degree of freedom + 3) filled, rows for columns:
-            angles above rest and their rates after the sample, force and moment on the base
-            (mN and uN m), means, and where the base gives, its two turns, means; for angles above
-            rest, rates, and acceleration of the base, in that frame.
+        answers: (2 degree of freedom + 6 or 8, 2 degree of freedom + 3) filled. Rows (outputs):
+            angles relative to rest and their rates after the sample, mean force and moment of the
+            base (mN and uN m) and, on a compliant base, its two mean turns. Columns (inputs):
+            angles relative to rest, rates, and acceleration of the base, in that frame.
     """
     links, n = len(chain.length), len(rest)
     pose = Pose(np.empty((links + 1, 3)), np.empty((links, 3, 3)), np.empty((n, 3)))
@@ -143,18 +143,18 @@ def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None
 
 @compiled
 def move_on(free: float, state: A, root: A, shaken: A, x: A, felt: A) -> float:
-    """Move a whisker near rest through a sample, if nothing is in its way.
+    """Advance a whisker near rest by a whole sample, if nothing is in its way.
 
     Args:
-        free: how far from the whisker nothing is, over its length.
-        state: see `stepping.RodState`; angles and rates are carried on.
+        free: distance from the whisker that is free of objects, divided by its length.
+        state: see `stepping.RodState`; angles and rates are updated.
         root: (4, 3) see `stepping.advance`.
         shaken: (3,) acceleration of the base, mm/ms^2.
         x: (2 degree of freedom + 3,) scratch.
         felt: (6,) loads and (6,) contacts of the sample, filled: see `stepping.advance`.
 
     Returns:
-        How far its joints turned together, rad; negative: it is bent too far, and did not move.
+        The sum of the joints' turns, rad; negative: the whisker is bent too far and did not move.
     """
     q, v, rest, answers = state.q, state.v, state.rest, state.answers
     load, contact = felt
@@ -169,7 +169,7 @@ def move_on(free: float, state: A, root: A, shaken: A, x: A, felt: A) -> float:
         x[2 * n + k] = 0.0
         for i in range(3):
             x[2 * n + k] += root[1 + i, k] * shaken[i]
-    # the angles first, without changing anything
+    # first only the new angles, without changing the state
     bent, gone = 0.0, 0.0
     for i in range(n):
         s = 0.0

@@ -1,4 +1,4 @@
-"""A whisker as a chain of links: the numbers that `stepping` needs of it."""
+"""A whisker as a chain of links, with the parameters that `stepping` needs."""
 
 import cmath
 import math
@@ -18,22 +18,22 @@ from tactile_rt.sim_backend.arrays.whiskers import (
 from tactile_rt.sim_backend.rods.chains import Chain, chain_mass
 from tactile_rt.sim_backend.rods.touching import Segments
 
-SAG_MM = 7e-4  # how far the chord of a segment may be from the resting curve
-FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should
+SAG_MM = 7e-4  # largest distance of a segment's chord from the resting curve
+FINEST = 8  # largest factor by which the step is divided so that a whisker rings correctly
 SAMPLE_MS = 1.0
-FINE_LINKS, TRUE_MODES = 40, 6  # a chain as good as the whisker itself, in so many modes
-LEVELS = 8  # how often a step can be halved, see `stepping`, and the whole step
-SMOOTH_HZ = 200.0  # faster whiskers take steps in proportion
-HEARD_HZ = 500.0  # resonances above are beyond what samples at 1 kHz can hold
+FINE_LINKS, TRUE_MODES = 40, 6  # a chain as accurate as the whisker itself, in so many modes
+LEVELS = 8  # lengths of a step: the whole, and each half of the one before, see `stepping`
+SMOOTH_HZ = 200.0  # faster whiskers take proportionally shorter steps
+HEARD_HZ = 500.0  # samples at 1 kHz cannot represent resonances above
 
 
 @dataclass(frozen=True)
 class Rod:
-    """One whisker, cut and ready to be stepped.
+    """One whisker, cut into links and ready to be stepped.
 
     Attributes:
         resonance_hz: The first resonance of the whisker on its mount, Hz.
-        wanted_ratio: The damping ratio of the first mode, that of the mount included.
+        wanted_ratio: The target damping ratio of the first mode, including the mount's damping.
         damping_ratio: The damping ratio with which it rings when stepped.
         to_element: The (3, 3) rotation from the frame of the first link to that of the element.
     """
@@ -48,25 +48,25 @@ class Rod:
 
 
 def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
-    """Cut a whisker into equal cells, and choose a step with which it rings as it should.
+    """Cut a whisker into equal cells, and choose a step with which it rings correctly.
 
-    A step that is long against a period makes a mode slower and damps it more. Both are taken back
-    for every mode, see `matched`, as far as a step allows that; where it does not for the first,
-    the step is halved, for whiskers whose ringing samples can hold at all.
+    A step that is long against a period makes a mode slower and damps it more. Both are corrected
+    for every mode, see `matched`, as far as the step allows. If it does not for the first mode,
+    the step is halved, but only for whiskers whose ringing the samples can represent.
 
     Args:
-        links: how many cells; one more link.
+        links: number of cells; the chain has one more link.
     """
     s = link_nodes(whisker, links)
     nodes = whisker.centreline(s)
-    chain, damping, heading = _elastic(whisker, links)
+    chain, damping, heading = _cut_chain(whisker, links)
     mass = chain_mass(chain)
-    slow, shapes = _modes(mass, chain.stiffness)
+    slow, shapes = _find_modes(mass, chain.stiffness)
     ratios = damping @ shapes**2 / (2 * slow)  # of each mode
-    # The chain's modes are to be as fast as those of the whisker itself.
+    # The chain's modes must be as fast as those of the whisker itself.
     omegas = slow.copy()
-    fine, _, _ = _elastic(whisker, FINE_LINKS)
-    known, _ = _modes(chain_mass(fine), fine.stiffness)
+    fine, _, _ = _cut_chain(whisker, FINE_LINKS)
+    known, _ = _find_modes(chain_mass(fine), fine.stiffness)
     omegas[:TRUE_MODES] = known[:TRUE_MODES]
     first = int(omegas.argmin())
     ratios *= omegas / slow * (slow[first] / omegas[first])
@@ -81,11 +81,11 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
         steps *= 2
         found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
     ratio = float(ratios[first])
-    if found[first][1] < 0:  # more than is wanted without any: what backward Euler leaves
+    if found[first][1] < 0:  # over-damped even without damping: the ratio of backward Euler alone
         turn = omegas[first] * SAMPLE_MS / steps
         decay = math.log1p(turn**2) / 2
         ratio = decay / math.hypot(decay, math.atan(turn))
-    # Mode by mode, for every length of a step; the modes are those of the whisker at rest.
+    # Correct each mode of the whisker at rest, for every length of a step.
     onto, heavy, damped = mass @ shapes, [], []
     for level in range(LEVELS):
         h = SAMPLE_MS / steps / 2**level
@@ -94,9 +94,9 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
         drags = np.array([max(beta, 0.0) for _, beta in found]) * slow**2
         heavy.append((onto * (heavier - 1)) @ onto.T)
         damped.append((onto * drags) @ onto.T)
-    # What cannot move cannot be kept clear of anything: the object passes through a clamped link.
+    # A clamped link cannot move out of the way: the object passes through it.
     free = range(chain.clamped, links + 1)
-    pieces = [_segments(whisker, i, s, nodes, heading[i]) for i in free]
+    pieces = [_cut_segments(whisker, i, s, nodes, heading[i]) for i in free]
     return Rod(
         steps_per_sample=steps,
         resonance_hz=resonance_hz,
@@ -111,12 +111,12 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
     )
 
 
-def _elastic(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
+def _cut_chain(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
     """Cut a whisker into cells.
 
     Returns:
-        The chain without added masses and damping, the damping of each joint that is in proportion
-        to stiffness (uN m ms / rad), and the links' headings at rest (rad).
+        The chain without added masses and damping, the stiffness-proportional damping of each
+        joint (uN m ms / rad), and the links' headings at rest (rad).
     """
     s = link_nodes(whisker, links)
     chords = np.diff(whisker.centreline(s), axis=0)
@@ -135,7 +135,7 @@ def _elastic(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
         damping=none,
         friction=whisker.friction,
     )
-    omegas, _ = _modes(chain_mass(chain), chain.stiffness)
+    omegas, _ = _find_modes(chain_mass(chain), chain.stiffness)
     damping = 2 * whisker.damping_ratio / omegas.min() * chain.stiffness
     if whisker.mount_stiffness:
         stiffness = np.concatenate([[whisker.mount_stiffness * 1e6] * 2, chain.stiffness])
@@ -144,7 +144,7 @@ def _elastic(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
     return chain, damping, headings
 
 
-def _modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
+def _find_modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
     """Find the modes of a chain at rest, in and out of plane.
 
     Returns:
@@ -161,29 +161,29 @@ def _modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
 
 
 def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:
-    """How to let backward Euler ring a mode as time itself would.
+    """Compute mass factor and damping that make backward Euler ring a mode exactly.
 
-    The step x' = x + h v', m (v' - v) = -h (k x' + beta k v') multiplies the mode by two numbers;
-    with more mass and less damping than the mode has they are exp(h lambda), lambda its own poles.
+    The step x' = x + h v', m (v' - v) = -h (k x' + beta k v') multiplies the mode by two numbers.
+    With more mass and less damping than the mode has, they are exp(h lambda), lambda its own poles.
 
     Returns:
-        How much heavier, and beta (ms), which is negative where the step damps more than is wanted.
+        The factor of the mass, and beta (ms), negative if the step alone damps more than `ratio`.
     """
     root = cmath.sqrt(ratio * ratio - 1)
     first, second = -omega / (ratio + root), -omega * (ratio + root)  # the poles
     left = cmath.exp(first * h), cmath.exp(second * h)
     gone = ((1 - left[0]) * (1 - left[1])).real
-    if abs(first * h) < 1e-3:  # without losing digits
+    if abs(first * h) < 1e-3:  # a series, to avoid cancellation
         gone = (first * second * h * h * (1 + (first + second) * h / 2)).real
     product = (left[0] * left[1]).real
     beta = h * ((left[0] + left[1]).real - 2 * product) / gone
     return (omega * h) ** 2 * product / gone, beta
 
 
-def _segments(
+def _cut_segments(
     whisker: Whisker, link: int, s: Floats, nodes: Floats, heading: float
 ) -> tuple[Floats, ...]:
-    """What `Segments` has of a link's: ends, bows, radii and arcs."""
+    """Cut a link into segments: ends, bows, radii and arcs, as in `Segments`."""
     longest = math.sqrt(8 * SAG_MM / max(2 * abs(whisker.curvature), 1e-12))
     count = max(1, math.ceil((s[link + 1] - s[link]) / longest))
     at = np.linspace(s[link], s[link + 1], count + 1)

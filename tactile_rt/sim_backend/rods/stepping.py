@@ -1,4 +1,4 @@
-"""One whisker stepped through time beside a moving object, on a base that may turn.
+"""Time stepping of a whisker beside a moving object, on a base that may turn.
 
 A step is implicit in stiffness and damping (backward Euler in the joint angles) and in contact:
 
@@ -6,11 +6,11 @@ A step is implicit in stiffness and damping (backward Euler in the joint angles)
     gap + h (J v' - velocity of the surfaces) >= 0, it or the impulse zero, Coulomb's law
 
 for every place where a link is nearest to a piece of the object, within `NEAR_MM`, touching or not
-(Moreau 1988; Stewart and Trinkle 1996). What overlaps all the same, because a tip flew further
-than that, is moved out without being given a velocity. A step in which a node would move further
-than `LEAP_MM` near the object is done again in parts, and one in which the object moves far begins
-in parts; masses and damping are matched to each length of a step, see `rod.matched`. Near its rest
-and away from everything a whisker moves on by a whole sample at once, see `resting`.
+(Moreau 1988; Stewart and Trinkle 1996). If a tip flew further than that and overlaps, it is moved
+out without changing its velocity. A step in which a node moves further than `LEAP_MM` near the
+object is repeated in parts, and one in which the object moves far is divided from the start;
+masses and damping are matched to each length of a step, see `rod.matched`. Near its rest and away
+from the object, a whisker advances by a whole sample at once, see `resting`.
 """
 
 import math
@@ -34,15 +34,15 @@ from tactile_rt.sim_backend.rods.touching import (
 )
 
 A = Any
-LEAP_MM = 0.1  # further no node moves in one step, or it is divided
+LEAP_MM = 0.1  # a step in which a node moves further is divided
 MOST_PARTS = 8
-HASTE_MM = 0.16  # over the number of links: further no object moves in a step near a whisker
+HASTE_MM = 0.16  # over the number of links: an object's largest motion in a step near a whisker
 MOST_IN_HASTE = 128
-WILD_MM, WILDEST_PARTS = 20.0, 512  # a leap so far is a step that failed: many more parts
+WILD_MM, WILDEST_PARTS = 20.0, 512  # a step with so long a leap has failed: many more parts
 SAMPLE_MS = 1.0
-BENT = 0.01  # of a whisker's length that its nodes move before its mass matrix is made anew
-LOOK_MM = 2.0  # nearer, places are looked at anew where that may spare steps
-STILL = 1e-9  # rad and rad/ms: a whisker at rest that nothing is near need not be stepped
+BENT = 0.01  # of the whisker's length: motion of nodes after which its mass matrix is recomputed
+LOOK_MM = 2.0  # range of the search if it may spare steps
+STILL = 1e-9  # rad and rad/ms: below, a whisker with nothing near is not stepped
 
 
 class RodState(NamedTuple):
@@ -50,11 +50,11 @@ class RodState(NamedTuple):
 
     Attributes:
         q, v: (degree of freedom,) angles and their rates, rad and rad/ms.
-        last: (link, 6) the contact force on each link, normal and tangential (mN), and its drag, to
-            begin from; how far what holds a contact has given way, see `friction`, mm.
+        last: (link, 6) the last contact force on each link, normal and tangential (mN), and its
+            drag, as initial values; the deflection of the sticking contact, see `one_step`, mm.
         rest: (degree of freedom,) angles at rest, bent by its weight, rad.
         weight: (whisker, 6) force (mN) and moment (uN m) that hold it at rest.
-        answers: How it moves on in a sample, near rest, see `resting.linearise`.
+        answers: The linear response near rest over a sample, see `resting.linearise`.
     """
 
     q: A
@@ -66,7 +66,7 @@ class RodState(NamedTuple):
 
 
 class RowBounds(NamedTuple):
-    """Where each whisker's rows begin, and where the last's end: (whisker + 1,) each."""
+    """The starts of each whisker's rows, and the end of the last's: (whisker + 1,) each."""
 
     links: A
     joints: A
@@ -91,27 +91,27 @@ def advance(
     loads: A,
     contacts: A,
 ) -> int:
-    """Step whiskers through some samples of 1 ms.
+    """Step whiskers through samples of 1 ms.
 
     Args:
-        steps: (whisker,) how many steps make a sample.
-        state, seen: see there; carried on. `travelled` and `soonest` are a row for each whisker.
+        steps: (whisker,) number of steps in a sample.
+        state, seen: updated. `travelled` and `soonest` have a row for each whisker.
         roots: (whisker, sample or 1, 4, 3) base point and, in the rows after it, the frame of the
             first link at rest, at the beginning of each sample; 1: it does not turn.
-        bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1: the same of all.
+        bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1: the same for all.
             During a sample a frame turns with its base's angular velocity.
-        quiet: whether the bases do nothing but carry the whiskers' weight.
-        gravity: (3,) mm/ms^2, which `bases` has as an acceleration against it.
-        way: (sample + 1, 3) where the object is at the beginning of each sample and at the end of
-            the last, mm; straight in between.
+        quiet: whether the bases stand still.
+        gravity: (3,) mm/ms^2; `bases` contains it as the opposite acceleration.
+        way: (sample + 1, 3) positions of the object at the beginning of each sample and at the end
+            of the last, mm; it moves straight in between.
         loads: (whisker, sample, 6) zeros, filled: means of force (mN) and moment (uN m) on the
             base, in the world.
         contacts: (whisker, sample, 6) zeros, filled: share of the time in contact, mean normal
-            force (mN), mean of normal force times arc length (uN m), of a base that gives the mean
-            turns about the element's y and z (rad), and how deep it overlaps with the object, mm.
+            force (mN), mean of normal force times arc length (uN m), mean turns of a compliant base
+            about the element's y and z (rad), and the depth of overlap with the object, mm.
 
     Returns:
-        How many steps were computed; negative if the numbers are not finite any more.
+        The number of computed steps; negative if a step still fails in `WILDEST_PARTS` parts.
     """
     done = 0
     for w in range(len(steps)):
@@ -183,16 +183,16 @@ def _advance(
     loads: A,
     contacts: A,
 ) -> int:
-    """`advance` of one whisker."""
+    """Step one whisker, see `advance`."""
     q, v, last, rest, weight, answers = state
     travelled, soonest = seen.travelled, seen.soonest
     links, n = len(chain.length), len(q)
     h = SAMPLE_MS / steps_per_sample
     reach = chain.length.sum()
-    if quiet and not _moves(q, v, rest):  # perhaps nothing comes near it in all this time
+    if quiet and not _is_moving(q, v, rest):  # skip all samples if nothing comes near
         whole = 0.0
         for sample in range(len(way) - 1):
-            whole += _distance(way, sample)
+            whole += _measure_distance(way, sample)
         if soonest.min() - travelled[0] - whole >= NEAR_MM:
             travelled[0] += whole
             for i in range(6):
@@ -211,19 +211,19 @@ def _advance(
     q0, v0, surface, centre = np.empty(n), np.empty(n), np.empty(3), np.empty(3)
     last0 = np.empty((links, 6))
     since = 0.0
-    done, made = 0, 0.0  # for which length of a step the mass matrix is
+    done, made = 0, 0.0  # steps so far; length of the step that the mass matrix was computed for
     here = root[0].copy()
     placed, little = False, np.empty(2 * n + 3)
     at = -1
     while at < (len(way) - 1) * steps_per_sample - 1:
         at += 1
         sample, within = at // steps_per_sample, at % steps_per_sample
-        moves = _distance(way, sample) / steps_per_sample
+        moves = _measure_distance(way, sample) / steps_per_sample
         for i in range(3):
             surface[i] = (way[sample + 1, i] - way[sample, i]) / SAMPLE_MS
         if within == 0:
             made = 0.0
-        if quiet and soonest.min() - travelled[0] >= NEAR_MM + moves and not _moves(q, v, rest):
+        if quiet and soonest.min() - travelled[0] >= NEAR_MM + moves and not _is_moving(q, v, rest):
             travelled[0] += moves
             q[:] = rest
             v[:] = 0.0
@@ -235,8 +235,8 @@ def _advance(
         began = root[sample if len(root) > 1 else 0]
         if within == 0 and len(answers) and (quiet or not (base[1].any() or base[3].any())):
             clear = NEAR_MM + moves * steps_per_sample + 4.0 * LITTLE * reach
-            if NEAR_MM <= soonest.min() - travelled[0] < clear:  # look further, to know for longer
-                _turned(began, base, 0.0, here)
+            if NEAR_MM <= soonest.min() - travelled[0] < clear:  # look wider: bounds last longer
+                _rotate_base(began, base, 0.0, here)
                 place_at(here, chain, q, pose)
                 find_near(pose, segments, thing, way[sample], LOOK_MM, seen, ends, now, near)
             free = soonest.min() - travelled[0] - NEAR_MM - moves * steps_per_sample
@@ -248,11 +248,11 @@ def _advance(
                 placed = False
                 continue
         if not placed:
-            _turned(began, base, h * within, here)
+            _rotate_base(began, base, h * within, here)
             place_at(here, chain, q, pose)
             placed = True
         parts, start = 1, travelled[0]
-        swing = 0.0  # how far the base takes the tip
+        swing = 0.0  # largest motion of the tip by the base's rotation
         for i in range(3):
             swing += base[1, i] ** 2
         swing = math.sqrt(swing) * reach * h
@@ -299,11 +299,11 @@ def _advance(
                 made = h / parts
                 done += 1
                 old[:] = pose.nodes
-                _turned(began, base, h * (within + (part + 1) / parts), here)
+                _rotate_base(began, base, h * (within + (part + 1) / parts), here)
                 place_at(here, chain, q, pose)
-                moved = _furthest(old, pose.nodes)
+                moved = _find_largest_move(old, pose.nodes)
                 since += moved
-                if not moved <= furthest:  # also where it is no number
+                if not moved <= furthest:  # also if it is not a number
                     furthest = moved
                 travelled[0] += moves / parts + 1.1 * moved
                 for i in range(6):
@@ -316,15 +316,15 @@ def _advance(
                     touching += 1.0
                     force += room.felt[0]
                     lever += room.felt[0] * (arcs[0] * (1 - t) + arcs[1] * t)
-            wild = not furthest < WILD_MM  # also where it is no number
+            wild = not furthest < WILD_MM  # also if it is not a number
             if wild and parts >= WILDEST_PARTS:
                 return -done - 1
             if not wild and (furthest <= LEAP_MM or parts >= MOST_PARTS):
                 break
-            # what swings through air leaps as far as it likes
+            # away from the object a leap of any length is fine
             if not wild and soonest.min() - travelled[0] >= NEAR_MM:
                 break
-            # again, in parts
+            # repeat the step in parts
             if wild:
                 parts *= 8
                 travelled[0] = start
@@ -334,12 +334,12 @@ def _advance(
                 while parts < MOST_PARTS and furthest > LEAP_MM:
                     parts *= 2
                     furthest /= 2
-                travelled[0] += travelled[0] - start  # and all the way back
+                travelled[0] += travelled[0] - start  # the way back counts, too
             q[:] = q0
             v[:] = v0
             if not wild:
                 last[:] = last0
-            _turned(began, base, h * within, here)
+            _rotate_base(began, base, h * within, here)
             place_at(here, chain, q, pose)
         share = 1.0 / (parts * steps_per_sample)
         for i in range(6):
@@ -355,7 +355,7 @@ def _advance(
 
 
 @compiled
-def _moves(q: A, v: A, rest: A) -> bool:
+def _is_moving(q: A, v: A, rest: A) -> bool:
     for i in range(len(q)):
         if not (abs(q[i] - rest[i]) <= STILL and abs(v[i]) <= STILL):
             return True
@@ -363,7 +363,7 @@ def _moves(q: A, v: A, rest: A) -> bool:
 
 
 @compiled
-def _distance(way: A, sample: int) -> float:
+def _measure_distance(way: A, sample: int) -> float:
     square = 0.0
     for i in range(3):
         square += (way[sample + 1, i] - way[sample, i]) ** 2
@@ -371,8 +371,8 @@ def _distance(way: A, sample: int) -> float:
 
 
 @compiled
-def _furthest(old: A, new: A) -> float:
-    """How far the node went that went furthest; no number where one is none."""
+def _find_largest_move(old: A, new: A) -> float:
+    """Return the largest motion of a node; not a number if any is."""
     furthest = 0.0
     for b in range(len(old)):
         square = 0.0
@@ -384,8 +384,8 @@ def _furthest(old: A, new: A) -> float:
 
 
 @compiled
-def _turned(root: A, base: A, t: float, here: A) -> None:
-    """Fill in a base's frame so long after a sample began (Rodrigues' rotation)."""
+def _rotate_base(root: A, base: A, t: float, here: A) -> None:
+    """Compute a base's frame at a time after the sample's start (Rodrigues' rotation)."""
     x, y, z = base[1, 0] * t, base[1, 1] * t, base[1, 2] * t
     angle = math.sqrt(x * x + y * y + z * z)
     here[:] = root

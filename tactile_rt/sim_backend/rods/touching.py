@@ -1,4 +1,4 @@
-"""Where a whisker is nearest to the pieces of an object: the places that a step has to mind."""
+"""The places where a whisker is nearest to an object's pieces: the contacts of a step."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,20 +11,20 @@ from tactile_rt.sim_backend.rods.nearest import WORK, nearest
 
 A = Any
 NEAR_MM = 0.1  # places that are nearer are constraints of a step
-STALE_MM, CLOSE_MM = 0.05, 1.0  # where it is near, a plane found so much way ago is found anew
+STALE_MM, CLOSE_MM = 0.05, 1.0  # within the second, a plane is updated after so much travel
 MOST_CONTACTS = 8  # of one whisker at one time: the nearest ones
 
 
 class Segments(NamedTuple):
-    """The parts of a whisker between which and an object contacts are sought.
+    """The segments of a whisker that are searched for contacts with an object.
 
-    The nearest place is sought along the chord; how far the arc is from there is taken to be a
-    parabola.
+    The nearest place is searched along the chord; the arc's distance from the chord is
+    approximated by a parabola.
 
     Attributes:
-        link: (segment,) numbers of the links on which they are.
+        link: (segment,) numbers of the segments' links.
         ends: (segment, 2, 3) both ends, in the link's frame, mm.
-        bows: (segment, 3) ways from the middle of the chord to the resting curve, in the link's
+        bows: (segment, 3) vectors from the middle of the chord to the resting curve, in the link's
             frame, mm.
         radii, arcs: (segment, 2) radii and arc lengths from the base at the ends, mm.
     """
@@ -37,7 +37,7 @@ class Segments(NamedTuple):
 
 
 class Object(NamedTuple):
-    """The convex pieces of an object, one after the other, about the object's place.
+    """The convex pieces of an object, concatenated, relative to the object's position.
 
     Attributes:
         corners: (corner, 3) corners of the pieces, mm.
@@ -45,9 +45,9 @@ class Object(NamedTuple):
         faces: (face, 4) outward normals and offsets.
         face_at: (piece + 1,) numbers at which the faces of each piece begin.
         rounding: (piece,) the radius by which each is grown, mm.
-        beside: The corners to which an edge leads from each corner, numbered in its piece, see
-            `nearest`; of pieces with few corners none.
-        beside_at: (corner + 1,) numbers at which those of each corner begin.
+        beside: The neighbours of each corner along its edges, numbered in its piece, see
+            `nearest`; none for pieces with few corners.
+        beside_at: (corner + 1,) numbers at which the neighbours of each corner begin.
     """
 
     corners: A
@@ -60,15 +60,15 @@ class Object(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What is known from the last times about how near a whisker is to an object; carried on.
+    """Cached bounds of the gaps between a whisker and an object; updated by every search.
 
     Attributes:
-        travelled: (1,) what the object and the whisker have travelled since the beginning, mm.
-        reach: (segment, piece) lower bound of the gap, plus what was travelled when it was found.
-        soonest: (piece + 1,) the least of them, and at last something infinite.
-        known: (segment, piece, 4) pairs of points to begin from, see `nearest`.
-        planes: (segment, piece, 5) outward normal and offset of a plane through which the piece
-            does not reach, and what was travelled when it was found.
+        travelled: (1,) the distance that object and whisker have travelled since the start, mm.
+        reach: (segment, piece) lower bound of the gap, plus `travelled` when it was computed.
+        soonest: (piece + 1,) the least of them over segments, and infinity at the end.
+        known: (segment, piece, 4) initial pairs of points for the search, see `nearest`.
+        planes: (segment, piece, 5) outward normal and offset of a plane that the piece does not
+            cross, and `travelled` when it was computed.
     """
 
     travelled: A
@@ -79,7 +79,7 @@ class Seen(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Places where a whisker is near an object, as many as there may be.
+    """Places where a whisker is near an object, up to `MOST_CONTACTS`.
 
     Attributes:
         gaps: (contact,) gaps between the surfaces, mm.
@@ -96,7 +96,7 @@ class Contacts(NamedTuple):
 
 
 def unseen(whiskers: int, segments: int, pieces: int) -> Seen:
-    """What is known before anything is seen; the whiskers' segments one after the other."""
+    """Return bounds before the first search, with the whiskers' segments concatenated."""
     return Seen(
         np.zeros((whiskers, 1)),
         np.full((segments, pieces), -np.inf),
@@ -108,7 +108,7 @@ def unseen(whiskers: int, segments: int, pieces: int) -> Seen:
 
 @compiled
 def forget(seen: Seen) -> None:
-    """Begin anew."""
+    """Reset all bounds, as before the first search."""
     seen.reach[:] = -np.inf
     seen.soonest[:-1] = -np.inf
     seen.known[:] = -1
@@ -129,18 +129,18 @@ def find_near(
     now: A,
     near: Contacts,
 ) -> int:
-    """Find where a whisker is nearest to pieces that are near; returns at how many places.
+    """Find the places where a whisker is nearest to pieces, and return their number.
 
-    What is wanted of each piece is where the gap is least along each link. A plane through which
-    a piece does not reach bounds the gap of a segment from below, and as the pieces do not turn,
-    the plane of the last time still does: only the segments whose bound is the least of their
-    neighbours' are looked at anew.
+    For each piece these are the minima of the gap along each link. A plane that a piece does not
+    cross bounds the gap of a segment from below. As pieces do not turn, the last search's plane
+    still does: only segments whose bound is less than their neighbours' are searched again.
 
     Args:
-        centre: (3,) where the object is, mm.
-        within: how near segments are looked at anew: `NEAR_MM`, or more to know for longer.
+        centre: (3,) position of the object, mm.
+        within: gap below which segments are searched: `NEAR_MM`, or more for longer-lived bounds.
         ends: (segment, 2, 3) scratch.
-        now: (segment, 6) scratch: gap, place, direction, and whether it is more than a bound.
+        now: (segment, 6) scratch: gap, place, direction, and whether the gap is more than a bound.
+        near: filled.
     """
     travelled = seen.travelled[0]
     reach, planes = seen.reach, seen.planes
@@ -149,7 +149,7 @@ def find_near(
     count, number = 0, len(segments.link)
     found, scratch = np.empty(6), np.empty(WORK)
     for s in range(number):
-        ends[s, 0, 0] = np.inf  # not known
+        ends[s, 0, 0] = np.inf  # not yet computed
     for p in range(len(rounding)):
         if seen.soonest[p] - travelled >= within:
             continue
@@ -160,7 +160,7 @@ def find_near(
                 continue
             if ends[s, 0, 0] == np.inf:
                 link = segments.link[s]
-                _place(segments.ends[s], pose.nodes[link], pose.frames[link], centre, ends[s])
+                _place_ends(segments.ends[s], pose.nodes[link], pose.frames[link], centre, ends[s])
             bow = 0.0
             for i in range(3):
                 bow += segments.bows[s, i] ** 2
@@ -180,7 +180,7 @@ def find_near(
         while again:
             again = False
             for s in range(first, last + 1):
-                if now[s, 0] == np.inf or now[s, 5] or not _least(s, now, segments.link):
+                if now[s, 0] == np.inf or now[s, 5] or not _is_nearest(s, now, segments.link):
                     continue
                 nearest(
                     ends[s, 0],
@@ -211,9 +211,9 @@ def find_near(
             seen.soonest[p] = min(seen.soonest[p], reach[s, p])
         for s in range(first, last + 1):
             gap = now[s, 0]
-            if gap == np.inf or not _least(s, now, segments.link):
+            if gap == np.inf or not _is_nearest(s, now, segments.link):
                 continue
-            # Neighbours on two links share their ends, and a gap there.
+            # Segments on adjacent links share an end: count a minimum there once.
             if s > 0 and now[s, 1] == 0.0 and now[s - 1, 0] <= gap and now[s - 1, 5]:
                 if now[s - 1, 1] == 1.0:
                     continue
@@ -238,8 +238,8 @@ def find_near(
 
 
 @compiled
-def _least(s: int, now: A, link_of: A) -> bool:
-    """Whether no neighbour on the same link is nearer, for what is known of them."""
+def _is_nearest(s: int, now: A, link_of: A) -> bool:
+    """Return whether no neighbour on the same link is nearer, by present bounds."""
     gap, link = now[s, 0], link_of[s]
     if s > 0 and link_of[s - 1] == link and now[s - 1, 0] <= gap:
         return False
@@ -247,8 +247,8 @@ def _least(s: int, now: A, link_of: A) -> bool:
 
 
 @compiled
-def _place(in_link: A, node: A, frame: A, centre: A, ends: A) -> None:
-    """Fill in the (2, 3) ends of a segment, about the object's place."""
+def _place_ends(in_link: A, node: A, frame: A, centre: A, ends: A) -> None:
+    """Compute the (2, 3) ends of a segment relative to the object's position."""
     for end in range(2):
         for i in range(3):
             ends[end, i] = node[i] - centre[i]

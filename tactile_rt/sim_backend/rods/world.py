@@ -1,4 +1,4 @@
-"""An array and an object, stepped whisker by whisker."""
+"""The world of an array and an object, stepped whisker by whisker."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,9 +22,9 @@ from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 
 WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
-FEW_CORNERS = 64  # of so few it costs less to try them all
+FEW_CORNERS = 64  # up to so many, trying them all is faster
 
-_cut = lru_cache(maxsize=512)(make_rod)  # 10 ms each, and the same whiskers meet many objects
+_make_rod = lru_cache(maxsize=512)(make_rod)  # 10 ms each; the same whiskers meet many objects
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class Piece:
     """A convex piece of an object: the hull of its corners, grown by a radius.
 
     Attributes:
-        corners: The (corner, 3) corners, mm, about the object's place.
-        faces: The (face, 4) outward normals and offsets of the hull; none of a point or a line.
+        corners: The (corner, 3) corners, mm, relative to the object's position.
+        faces: The (face, 4) outward normals and offsets of the hull; none for a point or a line.
         rounding: The radius by which the hull is grown, mm.
-        edges: The (2 * edge, 2) corners that an edge joins, both ways, in order; none: of few
-            corners all are tried.
+        edges: The (2 * edge, 2) corners that an edge joins, both ways, sorted; none if there are
+            only few corners, which are all tried.
     """
 
     corners: Floats
@@ -46,7 +46,7 @@ class Piece:
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> "Piece":
-        """The piece that a convex mesh is."""
+        """Make a piece of a convex mesh."""
         normals = np.asarray(mesh.face_normals, dtype=np.float64)
         offsets = np.einsum("fi,fi->f", normals, mesh.triangles[:, 0])
         faces = np.concatenate([normals, offsets[:, None]], axis=1)
@@ -54,18 +54,18 @@ class Piece:
         if len(corners) <= FEW_CORNERS:
             return cls(corners, faces)
         triangles = np.asarray(mesh.faces)
-        if len(triangles) != 2 * len(corners) - 4:  # corners that are none, or are there twice
+        if len(triangles) != 2 * len(corners) - 4:  # unused or duplicate corners
             hull = ConvexHull(corners)
             number = np.zeros(len(corners), np.int64)
             number[hull.vertices] = np.arange(len(hull.vertices))
             corners, triangles = corners[hull.vertices], number[hull.simplices]
         edges, n = np.concatenate([triangles[:, [i, i - 1]] for i in range(3)]), len(corners)
-        both = np.sort(np.concatenate([edges @ (n, 1), edges @ (1, n)]))[::2]  # of two triangles
+        both = np.sort(np.concatenate([edges @ (n, 1), edges @ (1, n)]))[::2]  # in two triangles
         return cls(corners, faces, 0.0, np.stack(np.divmod(both, n), axis=1))
 
 
 class RodWorld:
-    """Whiskers on bases that turn or stand still, and an object that moves among them, not turning.
+    """Whiskers on bases that turn or stand still, and an object that only translates.
 
     Args:
         roots: (whisker, 4, 3) base point (mm) and, in the rows after it, the element's frame in the
@@ -78,11 +78,11 @@ class RodWorld:
 
     Attributes:
         angles: The (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
-        turns: The (sample, whisker, 2) turns of bases that give in the samples of the last
-            `advance`, means, about the element's y and z, rad.
-        sag: How far gravity moves the (link + 1, 3) nodes of each whisker, mm.
-        overlap: The (sample, whisker) depth to which each overlaps with the object in those
-            samples, mm; next to nothing but where a whisker is wedged.
+        turns: The (sample, whisker, 2) mean turns of compliant bases in the samples of the last
+            `advance`, about the element's y and z, rad.
+        sag: The (link + 1, 3) displacements of each whisker's nodes by gravity, mm.
+        overlap: The (sample, whisker) depth of overlap with the object in those samples, mm;
+            negligible unless a whisker is wedged.
     """
 
     def __init__(
@@ -105,9 +105,9 @@ class RodWorld:
         self._to_links = np.array([rod.to_element.T for rod in rods])
         chains, segments = [rod.chain for rod in rods], [rod.segments for rod in rods]
         rows = RowBounds(
-            _begins([c.length for c in chains]),
-            _begins([c.stiffness for c in chains]),
-            _begins([s.link for s in segments]),
+            _find_starts([c.length for c in chains]),
+            _find_starts([c.stiffness for c in chains]),
+            _find_starts([s.link for s in segments]),
             np.zeros(len(rods) + 1, np.int64),
         )
         cells = links
@@ -123,22 +123,22 @@ class RodWorld:
                     raise ConfigError(f"whisker {name} is too soft to carry its own weight")
                 answers.append(_linearise(rod, root[1:].T @ gravity, angles))
             else:
-                answers.append(_answers(_shape_of(whiskers[i]), cells, steps_per_sample))
+                answers.append(_linearise_bare(_strip_pose(whiskers[i]), cells, steps_per_sample))
             self.sag.append(nodes[1] - nodes[0])
-        rows = rows._replace(answers=_begins(answers))
+        rows = rows._replace(answers=_find_starts(answers))
         degrees = [np.bincount(p.edges[:, 0], minlength=len(p.corners)) for p in pieces]
         self.angles = rest.copy()
         self._advance = partial(
             advance,
             np.array([r.steps_per_sample for r in rods]),
             rows,
-            Chain(*(_stacked(each) for each in zip(*chains, strict=True))),
-            Segments(*(_stacked(each) for each in zip(*segments, strict=True))),
+            Chain(*(_stack(each) for each in zip(*chains, strict=True))),
+            Segments(*(_stack(each) for each in zip(*segments, strict=True))),
             Object(
                 np.concatenate([np.zeros((0, 3)), *(p.corners for p in pieces)]),
-                _begins([p.corners for p in pieces]),
+                _find_starts([p.corners for p in pieces]),
                 np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
-                _begins([p.faces for p in pieces]),
+                _find_starts([p.faces for p in pieces]),
                 np.array([p.rounding for p in pieces]),
                 np.concatenate([NO_EDGES, *(p.edges for p in pieces)])[:, 1].copy(),
                 np.cumsum(np.concatenate([[0], *degrees])),
@@ -149,14 +149,14 @@ class RodWorld:
                 np.zeros((links, 6)),
                 rest,
                 self._weights,
-                _stacked(answers),
+                _stack(answers),
             ),
             unseen(len(rods), parts, len(pieces)),
         )
 
     def rest_loads(self) -> Floats:
-        """Compute the (whisker, 6) base loads of whiskers that nothing but gravity bends."""
-        return _in_elements(-self._weights, self._frames)
+        """Compute the (whisker, 6) base loads of whiskers at rest under gravity, N and N m."""
+        return _rotate_loads(-self._weights, self._frames)
 
     def advance(
         self,
@@ -165,16 +165,16 @@ class RodWorld:
         shaken: Floats | None = None,
         turning: Floats | None = None,
     ) -> tuple[Floats, Floats]:
-        """See `sweep_simulation.World`; loads and contacts are means over each sample.
+        """Simulate samples, see `sweep_simulation.World`; loads and contacts are sample means.
 
         Args:
-            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; the object's way is
-                then relative to the head. None: it is not accelerated.
-            turning: (sample + 3, whisker, 3, 3) frames of the elements in the world where bases
-                turn, at the beginning of each sample, from the one before the first to the one
-                after the last, and at the end of that; each turns by less than 90 degrees in a
-                sample, and at an even rate. Loads are in the frame at the middle of their sample.
-                None: they are where they were when this was made.
+            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; `way` is then
+                relative to the head. None: it is not accelerated.
+            turning: (sample + 3, whisker, 3, 3) frames of the elements in the world if bases turn:
+                at the beginning of each sample, from the sample before the first to the sample
+                after the last, and at the end of that. Each turns at a constant rate in a sample,
+                by less than 90 degrees. Loads are in the frame at the middle of their sample.
+                None: the frames stay as at construction.
         """
         samples = len(way) - 1
         fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0.0)
@@ -188,7 +188,7 @@ class RodWorld:
         moves = shaken is not None or turning is not None
         bases = np.zeros((1, samples if moves else 1, 4, 3))
         if turning is not None:
-            rates = _rates(turning)
+            rates = _compute_rates(turning)
             bases = np.zeros((len(self.rods), samples, 4, 3))
             bases[:, :, 1] = rates[:, 1:-1]
             bases[:, :, 3] = (rates[:, 2:] - rates[:, :-2]) / 2
@@ -208,15 +208,15 @@ class RodWorld:
         if done < 0:
             raise SourceError(JAMMED)
         # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
-        felt = _in_elements(loads, middle)
+        felt = _rotate_loads(loads, middle)
         self.turns = contacts[..., 3:5].swapaxes(0, 1)
         self.overlap = contacts[..., 5].swapaxes(0, 1)
         return felt.swapaxes(0, 1), contacts[..., :3].swapaxes(0, 1) * (1.0, 1e-3, 1e-6)
 
 
 def _cut_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
-    """`make_rod`, once for all whiskers of one shape and material."""
-    rod = _cut(_shape_of(whisker), links, steps_per_sample)
+    """Call `make_rod` once for all whiskers of one shape and material."""
+    rod = _make_rod(_strip_pose(whisker), links, steps_per_sample)
     return replace(rod, chain=rod.chain._replace(friction=whisker.friction))
 
 
@@ -228,20 +228,20 @@ def _linearise(rod: Rod, gravity: Floats, rest: Floats) -> Floats:
 
 
 @lru_cache(maxsize=512)
-def _answers(shape: Whisker, links: int, steps_per_sample: int) -> Floats:
-    """`resting.linearise` of a whisker without weight."""
-    rod = _cut(shape, links, steps_per_sample)
+def _linearise_bare(shape: Whisker, links: int, steps_per_sample: int) -> Floats:
+    """Call `resting.linearise` for a whisker without weight."""
+    rod = _make_rod(shape, links, steps_per_sample)
     return _linearise(rod, WEIGHTLESS, np.zeros(len(rod.chain.stiffness)))
 
 
-def _shape_of(whisker: Whisker) -> Whisker:
-    """The whisker of this shape and material, wherever it stands and whatever it touches."""
+def _strip_pose(whisker: Whisker) -> Whisker:
+    """Return a whisker of this shape and material alone, as a key for the cache."""
     here = (0.0, 0.0, 0.0)
     return replace(whisker, name="any", row=0, column=0, base=here, angles=here, friction=0.0)
 
 
-def _in_elements(loads: Floats, frames: Floats) -> Floats:
-    """Turn loads of the world, mN and uN m, into frames, N and N m."""
+def _rotate_loads(loads: Floats, frames: Floats) -> Floats:
+    """Rotate loads from the world, mN and uN m, into frames, N and N m."""
     felt = np.zeros_like(loads)
     for k in range(3):
         felt[..., :3] += loads[..., k, None] * frames[..., k, :] * 1e-3
@@ -249,15 +249,15 @@ def _in_elements(loads: Floats, frames: Floats) -> Floats:
     return felt
 
 
-def _rates(frames: Floats) -> Floats:
-    """(whisker, sample, 3) angular velocities, rad/ms, from frames (sample + 1, whisker, 3, 3)."""
+def _compute_rates(frames: Floats) -> Floats:
+    """Compute (whisker, sample, 3) rates, rad/ms, of frames (sample + 1, whisker, 3, 3)."""
     step = (frames[1:] @ frames[:-1].swapaxes(-1, -2)).swapaxes(0, 1)
     turns = Rotation.from_matrix(step.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(turns.reshape(step.shape[:-1]) / SAMPLE_MS)
 
 
-def _stacked(each: Sequence[Any]) -> NDArray[Any]:
-    """Rows one below the other, those of narrower matrices filled up with zeros; numbers as one."""
+def _stack(each: Sequence[Any]) -> NDArray[Any]:
+    """Concatenate rows, padding narrower matrices with zeros; put scalars into one array."""
     if np.ndim(each[0]) == 0:
         return np.array(each)
     wide = max(rows.shape[-1] for rows in each)
@@ -266,6 +266,6 @@ def _stacked(each: Sequence[Any]) -> NDArray[Any]:
     return np.concatenate(each)
 
 
-def _begins(each: Sequence[Any]) -> NDArray[np.int64]:
-    """Where each one's rows begin when they stand one after the other, and where the last end."""
+def _find_starts(each: Sequence[Any]) -> NDArray[np.int64]:
+    """Return the start of each array's rows when concatenated, and the end of the last."""
     return np.cumsum([0, *(len(rows) for rows in each)])

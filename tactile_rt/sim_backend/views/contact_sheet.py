@@ -1,4 +1,4 @@
-"""Contact sheets: many objects in one picture, to see that each is what it should be."""
+"""Contact sheets: many objects in one picture, to check each by eye."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,9 +22,9 @@ def write_contact_sheet(
     """Write a picture (.png) of named objects.
 
     Args:
-        things: the pieces of each; None: one that cannot be used.
-        whiskers: (point, 3) from base to tip, mm, in the world, as the pieces then are: drawn with
-            every object, which moves along -y.
+        things: the pieces of each object; None: it cannot be used.
+        whiskers: (point, 3) from base to tip, mm, in the world, drawn with every object, which
+            moves along -y; the pieces are then in the world, too.
     """
     across, wide = (min(3, len(things)), 4.0) if whiskers else (ACROSS, 1.6)
     down = -(-len(things) // across)
@@ -45,7 +45,7 @@ def write_contact_sheet(
         for line in whiskers:
             axes.plot(*line.T, color="black", marker="o", markersize=4, markevery=[0])
         if whiskers:
-            axes.computed_zorder = False  # they show through what hides them
+            axes.computed_zorder = False  # whiskers show through objects that hide them
             axes.view_init(elev=24, azim=-154)
             axes.quiver(*solid.bounds[1], 0, -solid.extents[1] / 2, 0, color="tab:red")
             axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")

@@ -1,6 +1,6 @@
 """Footage as pictures and videos: scene, map and traces in one picture for each moment.
 
-The scene is drawn offscreen on a copy of the simulation: nothing here touches the physics.
+The scene is drawn offscreen on a copy of the simulation: nothing here affects the physics.
 """
 
 import copy
@@ -28,25 +28,25 @@ from tactile_rt.sim_backend.world import OBJECT_BIT
 
 OBJECT, HEAD = (0.62, 0.74, 0.82, 1.0), (0.86, 0.81, 0.76, 1.0)
 FINE = 2  # drawn finer by this factor, then averaged
-GHOST = 0.5  # how much of a whisker shows through what hides it
-# In the extent of the picture: what whiskers (0.02-0.1 mm thick) and their bases are drawn as
+GHOST = 0.5  # opacity of whiskers behind objects
+# Radii of whiskers (0.02-0.1 mm thick), bases and arrows, relative to the picture's extent
 THIN, BASE, SHAFT = 0.0018, 0.006, 0.005
-ROOM = 10  # half the side of what is around everything, in the camera's distance and more
+ROOM = 10  # half the side of the surrounding room, relative to extent plus camera distance
 MOST_GEOMS = 20_000
 DOT, ARROW = mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ARROW
 IMAGES = (".png", ".jpg")
 VIDEOS = (".mp4",)
-QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 the usual
+QUALITY = "20"  # H.264 constant rate factor: 18 is visually lossless, 23 the default
 
 Floats = NDArray[Any]
 Pixels = NDArray[np.uint8]
 
 
 class Dressed:
-    """A copy of a simulation's model, and a state of it, made fit to be seen.
+    """A copy of a simulation's model and state, prepared for drawing.
 
     Attributes:
-        sites: The site at each element's base, by number, in the order of the elements.
+        sites: The number of the site at each element's base, in the order of the elements.
     """
 
     def __init__(self, model: mujoco.MjModel, spec: ArraySpec) -> None:
@@ -64,7 +64,7 @@ class Dressed:
         whiskers = [geom for geoms in self.links for geom in geoms]
         self._others = np.setdiff1d(np.arange(model.ngeom), whiskers)
         moved = (model.geom_contype[self._others] & OBJECT_BIT) > 0
-        self._moved = self._others[moved]
+        self._objects = self._others[moved]
         self._colours = np.where(moved[:, None], OBJECT, HEAD)
         self._radii = model.geom_size[:, 0].copy()
         self._whiskers = np.array(whiskers)
@@ -74,50 +74,50 @@ class Dressed:
         visual.headlight.diffuse[:] = 0.5
         visual.headlight.specular[:] = 0.0
         visual.quality.numslices, visual.quality.numstacks = 12, 6
-        visual.quality.offsamples = 0  # smooth edges come from drawing finer, at half the cost
+        visual.quality.offsamples = 0  # drawing finer gives smooth edges at half the cost
 
     def points(self) -> NDArray[np.float64]:
-        """(n, 3) both ends of all links in the world, mm, as posed."""
+        """Compute the (n, 3) ends of all links in the world, mm, as posed."""
         half = self.model.geom_size[self._whiskers, 1, None]
         axes = self.data.geom_xmat[self._whiskers].reshape(-1, 3, 3)[:, :, 2]
         middle = self.data.geom_xpos[self._whiskers]
         return np.concatenate([middle - half * axes, middle + half * axes])
 
     def object_points(self) -> NDArray[np.float64]:
-        """(n, 3) corners of boxes round what is swept past, in the world, mm, as posed."""
-        boxes = self.model.geom_aabb[self._moved].reshape(-1, 2, 3)
+        """Compute (n, 3) corners of the object's bounding boxes in the world, mm."""
+        boxes = self.model.geom_aabb[self._objects].reshape(-1, 2, 3)
         corners = np.array(list(product((-1.0, 1.0), repeat=3)))
         local = boxes[:, 0, None] + corners * boxes[:, 1, None]
-        frames = self.data.geom_xmat[self._moved].reshape(-1, 3, 3)
-        places = np.einsum("nij,nkj->nki", frames, local) + self.data.geom_xpos[self._moved, None]
+        frames = self.data.geom_xmat[self._objects].reshape(-1, 3, 3)
+        places = np.einsum("nij,nkj->nki", frames, local) + self.data.geom_xpos[self._objects, None]
         return np.asarray(places.reshape(-1, 3))
 
     def thicken(self, extent_mm: float) -> None:
-        """Draw whiskers thick enough for a picture of this height; thick ones as they are."""
+        """Draw thin whiskers thick enough to be seen in a picture of this height."""
         radii = self._radii[self._whiskers]
         self.model.geom_size[self._whiskers, 0] = np.hypot(radii, THIN * extent_mm)
 
     def cover(self, opacity: float) -> None:
-        """Show everything that is not a whisker so far: 0 not at all, 1 fully."""
+        """Set the opacity of everything except whiskers, 0 to 1."""
         self.model.geom_rgba[self._others, 3] = opacity
 
     def pose(self, footage: Footage, moment: int, scale: ForceScale) -> None:
-        """Place everything as it was, each whisker in the colour of its force."""
+        """Restore a moment, with each whisker in the colour of its force."""
         footage.restore(moment, self.data)
         for geoms, size in zip(self.links, scale.per_si * footage.sizes[moment], strict=True):
             self.model.geom_rgba[geoms] = scale.colour(size)
 
 
-def _add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
-    """Add to a scene a white room around everything: MuJoCo's own background is black."""
+def _add_white_room(scene: mujoco.MjvScene, camera: Camera) -> None:
+    """Add a white room around a scene, because MuJoCo's background is black."""
     white, far = np.ones(4, dtype=np.float32), ROOM * (camera.extent_mm + camera.distance_mm)
     for axis in np.eye(3):
         for side in (-far, far):
             place, size = camera.lookat + side * axis, np.where(axis > 0, 1e-3 * far, 1.1 * far)
-            _add(scene, mujoco.mjtGeom.mjGEOM_BOX, size, place, white).emission = 1.0
+            _add_geom(scene, mujoco.mjtGeom.mjGEOM_BOX, size, place, white).emission = 1.0
 
 
-def _add(
+def _add_geom(
     scene: mujoco.MjvScene, kind: mujoco.mjtGeom, size: Floats, place: Floats, rgba: Floats
 ) -> mujoco.MjvGeom:
     geom = scene.geoms[scene.ngeom]
@@ -127,7 +127,7 @@ def _add(
 
 
 class Stage:
-    """Pictures of the states in footage, drawn offscreen; to be closed.
+    """An offscreen renderer of the states in footage; call `close` when done.
 
     Args:
         width, height: of the pictures, pixels.
@@ -147,14 +147,14 @@ class Stage:
         self._scene = mujoco.MjvScene(model, MOST_GEOMS)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = 0
-        self._gl, self._painter = _painter(model, *self._size)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._painter)
+        self._gl, self._context = _open_gl(model, *self._size)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
 
     def picture(self, moment: int) -> NDArray[np.uint8]:
-        """(height, width, 3) RGB picture of a moment."""
+        """Draw a moment as a (height, width, 3) RGB picture."""
         self.dressed.pose(self.footage, moment, self.scale)
         whole, bare = (self._draw(moment, opacity) for opacity in (1.0, 0.0))
-        # What hides whiskers is drawn as glass: as one body, not as the pieces it is made of.
+        # An object that hides whiskers looks like glass, as a whole instead of piece by piece.
         return np.asarray(Image.blend(whole, bare, GHOST).reduce(FINE))
 
     def _draw(self, moment: int, opacity: float) -> Image.Image:
@@ -163,16 +163,16 @@ class Stage:
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, self._view, everything, scene)
         self._add_forces(moment)
-        _add_paper(scene, self.camera)
+        _add_white_room(scene, self.camera)
         pixels = np.empty((self._size[1], self._size[0], 3), dtype=np.uint8)
         area = mujoco.MjrRect(0, 0, *self._size)
         self._gl.make_current()
-        mujoco.mjr_render(area, scene, self._painter)
-        mujoco.mjr_readPixels(pixels, None, area, self._painter)
+        mujoco.mjr_render(area, scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, area, self._context)
         return Image.fromarray(pixels[::-1])
 
     def _add_forces(self, moment: int) -> None:
-        """Draw a dot for each element, and an arrow where its force points."""
+        """Add a dot for each element, and an arrow in the direction of its force."""
         data, scale, extent_mm = self.dressed.data, self.scale, self.camera.extent_mm
         sizes = (scale.per_si * self.footage.sizes[moment]).tolist()
         loads = self.footage.loads[moment]
@@ -180,9 +180,9 @@ class Stage:
             base = data.site_xpos[site]
             force = data.site_xmat[site].reshape(3, 3) @ load[:3]
             rgba = np.array(scale.colour(size), dtype=np.float32)
-            _add(self._scene, DOT, np.full(3, BASE * extent_mm), base, rgba)
+            _add_geom(self._scene, DOT, np.full(3, BASE * extent_mm), base, rgba)
             if scale.draws(size):
-                arrow = _add(self._scene, ARROW, np.ones(3), base, rgba)
+                arrow = _add_geom(self._scene, ARROW, np.ones(3), base, rgba)
                 end = base + force / max(np.linalg.norm(force), 1e-12) * scale.length(size)
                 mujoco.mjv_connector(arrow, ARROW, SHAFT * extent_mm, base, end)
                 arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
@@ -191,19 +191,19 @@ class Stage:
         """Free what the pictures were drawn with."""
         if self._gl is not None:
             self._gl.make_current()
-            self._painter.free()
+            self._context.free()
             self._gl.free()
             self._gl = None
 
 
-def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """An OpenGL context, and MuJoCo's in it: that of MUJOCO_GL if set, else the first that works.
+def _open_gl(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
+    """Open an OpenGL context with MuJoCo's: from MUJOCO_GL, else the first that works.
 
-    Not mujoco.Renderer, whose choice is made when mujoco is first imported: too early for us.
+    mujoco.Renderer is not used, because it chooses when mujoco is first imported: too early.
     """
-    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if asked in ("egl", "osmesa", "glfw", "cgl"):
-        kinds = [asked]
+    choice = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if choice in ("egl", "osmesa", "glfw", "cgl"):
+        kinds = [choice]
     elif sys.platform == "linux":
         screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
         kinds = ["egl", "glfw"] if screen else ["egl"]
@@ -213,7 +213,7 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoc
     for kind in kinds:
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of GLFW: its failure shows when it is used
+                warnings.simplefilter("ignore")  # from GLFW, which fails later, when it is used
                 context = importlib.import_module(f"mujoco.{kind}").GLContext(width, height)
                 context.make_current()
             return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -226,7 +226,7 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoc
 
 
 def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:
-    """The camera of a named view, on the whiskers at rest and on what presses them most."""
+    """Fit a named view to the resting whiskers and the object at its strongest touch."""
     dressed = Dressed(footage.model, footage.spec)
     footage.restore(0, dressed.data)
     left = all(x < 0 for x, _, _ in footage.spec.positions)
@@ -237,10 +237,10 @@ def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:
 
 
 class Film:
-    """Complete pictures of footage; to be closed.
+    """Complete pictures of footage; call `close` when done.
 
     Args:
-        pixels: width of the pictures; their height is 9/16 of it.
+        pixels: width of the pictures; their height is 9/16 of the width.
 
     Raises:
         ConfigError: no such view, or this machine has no OpenGL to draw with.
@@ -263,7 +263,7 @@ class Film:
         self.size = self._sheet.size
 
     def picture(self, moment: int) -> Pixels:
-        """(height, width, 3) RGB picture of a moment of the footage."""
+        """Draw a moment of the footage as a (height, width, 3) RGB picture."""
         return self._sheet.picture(moment, self._stage.picture(moment))
 
     def __iter__(self) -> Iterator[Pixels]:
@@ -297,10 +297,10 @@ def write_video(path: Path, pictures: Iterable[Pixels], fps: int) -> None:
 
 
 def _write_mp4(out: BinaryIO, pictures: Iterable[Pixels], fps: int) -> None:
-    # by its name, as what comes first is moved there at the end
+    # opened by name, because faststart moves the index to the front at the end
     with av.open(str(out.name), "w", "mp4", options={"movflags": "+faststart"}) as file:
         stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY})
-        stream.pix_fmt = "yuv420p"  # what every player plays
+        stream.pix_fmt = "yuv420p"  # supported by every player
         for k, pixels in enumerate(pictures):
             if k == 0:
                 stream.height, stream.width = pixels.shape[:2]

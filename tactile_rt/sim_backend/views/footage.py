@@ -1,4 +1,4 @@
-"""A simulation as it went: loads, readings and states at even intervals, to draw pictures from."""
+"""Recorded simulations: loads, readings and states at even intervals, for pictures."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ VIEWS: dict[str, tuple[float, float]] = {
     "oblique": (26.0, -27.0),
 }
 MARGIN = 1.2  # around the framed points: room for arrows
-# What places everything: joint angles, and the poses of the bodies that are moved.
+# The state that determines all positions: joint angles and the poses of mocap bodies.
 _STATE = int(
     mujoco.mjtState.mjSTATE_QPOS
     | mujoco.mjtState.mjSTATE_MOCAP_POS
@@ -33,13 +33,13 @@ _STATE = int(
 
 @dataclass(frozen=True)
 class Camera:
-    """A point of view, in perspective.
+    """A perspective camera.
 
     Attributes:
         azimuth, elevation: The direction of view, degrees.
         lookat: The point (x, y, z) in the middle of the picture, world, mm.
-        extent_mm: The height of what the picture shows at that point, mm.
-        fovy_deg: The vertical field of view in perspective, degrees; small is far away.
+        extent_mm: The height of the field of view at that point, mm.
+        fovy_deg: The vertical angle of view, degrees; a small angle means a distant camera.
     """
 
     azimuth: float
@@ -50,28 +50,28 @@ class Camera:
 
     @property
     def distance_mm(self) -> float:
-        """From the eye to the point looked at, mm."""
+        """The distance from the camera to `lookat`, mm."""
         return float(self.extent_mm / 2 / np.tan(np.radians(self.fovy_deg) / 2))
 
     @property
     def forward(self) -> NDArray[np.float64]:
-        """(3,) direction of view in the world."""
+        """The (3,) direction of view in the world."""
         a, e = np.radians((self.azimuth, self.elevation))
         return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
     @property
     def right(self) -> NDArray[np.float64]:
-        """(3,) direction in the world that points right in the picture."""
+        """The (3,) direction in the world that points right in the picture."""
         a = np.radians(self.azimuth)
         return np.array([np.sin(a), -np.cos(a), 0.0])
 
     @property
     def up(self) -> NDArray[np.float64]:
-        """(3,) direction in the world that points up in the picture."""
+        """The (3,) direction in the world that points up in the picture."""
         return np.cross(self.right, self.forward)
 
     def aim(self, model: mujoco.MjModel, camera: mujoco.MjvCamera) -> None:
-        """Set MuJoCo's free camera, and the model's view settings that go with it."""
+        """Apply this camera to MuJoCo's free camera and to the model's view settings."""
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] = self.lookat
         camera.distance = self.distance_mm
@@ -85,11 +85,11 @@ class Camera:
 def framing(
     view: str, points: NDArray[np.float64], aspect: float = 1.5, left: bool = False
 ) -> Camera:
-    """The camera of a named view, set so that all points are in the picture.
+    """Fit the camera of a named view to points.
 
     Args:
-        points: (n, 3) world, mm: the whiskers at rest, and what they touch.
-        left: whether these are whiskers of the animal's left side: the view's mirror image.
+        points: (n, 3) world, mm: the whiskers at rest, and the object.
+        left: whether the whiskers are on the animal's left side, which mirrors the view.
     """
     if view not in VIEWS:
         raise ConfigError(f"no camera {view!r}: there are {', '.join(VIEWS)}")
@@ -101,20 +101,20 @@ def framing(
     middle = (seen.min(axis=0) + seen.max(axis=0)) / 2
     x, y, z = (frame.T @ middle).tolist()
     right, up, forward = (seen - middle).T
-    near = 2 * np.tan(np.radians(axes.fovy_deg) / 2) * np.maximum(-forward, 0)  # looks larger
+    near = 2 * np.tan(np.radians(axes.fovy_deg) / 2) * np.maximum(-forward, 0)  # perspective
     extent = float((2 * np.maximum(abs(right) / aspect, abs(up)) + near).max())
     return Camera(azimuth, elevation, (x, y, z), MARGIN * max(extent, 1e-3))
 
 
 @dataclass(frozen=True)
 class Footage:
-    """A simulation as it went, moment by moment.
+    """A recorded simulation, moment by moment.
 
     Attributes:
         loads: The (moment, element, 6) base loads, N and N m, each the mean over the period before.
-        states: The (moment, n) places of everything at the end of each period.
-        sizes: The (moment, element) size of the force on each base, or of what the array's sensor
-            reads first, less that of the first moment, SI.
+        states: The (moment, n) MuJoCo states at the end of each period.
+        sizes: The (moment, element) norm of the force on each base or, with a sensor, of its
+            readings with the first channel's unit less those of the first moment, SI.
     """
 
     model: mujoco.MjModel
@@ -129,21 +129,21 @@ class Footage:
 
     @property
     def times_ms(self) -> NDArray[np.float64]:
-        """(moment,) end of each period, ms since the start."""
+        """The (moment,) ends of the periods, ms since the start."""
         return self.period_ms * np.arange(1, len(self) + 1, dtype=np.float64)
 
     @property
     def strongest(self) -> int:
-        """The moment in which the sizes add up to most; the middle one if there are none."""
+        """The moment with the largest sum of sizes; the middle if all are 0."""
         total = self.sizes.sum(axis=1)
         return int(total.argmax()) if total.any() else len(self) // 2
 
     def at(self, ms: float) -> int:
-        """The moment nearest to a time, ms since the start."""
+        """Return the moment nearest to a time, ms since the start."""
         return int(np.clip(round(ms / self.period_ms) - 1, 0, len(self) - 1))
 
     def restore(self, moment: int, data: mujoco.MjData) -> None:
-        """Place everything in `data`, of this model or a copy of it, as it was."""
+        """Restore a moment's state in `data` of this model or a copy."""
         mujoco.mj_setState(self.model, data, self.states[moment], _STATE)
         mujoco.mj_kinematics(self.model, data)
 
@@ -155,12 +155,12 @@ def record(
     progress: Callable[[float], None] = lambda done: None,
     sensor: SensorSpec | None = None,
 ) -> Footage:
-    """Run a simulation to its end.
+    """Run a simulation to its end, and record it.
 
     Args:
-        simulation: made with `whole=True`, so that it has all whiskers of the array; fresh or
-            advanced, it goes on from where it is.
-        sensor: what reads the array, of which `spec` is; None: nothing, and it is of base loads.
+        simulation: made with `whole=True`, so that it has all whiskers of the array; it continues
+            from its present state.
+        sensor: the array's sensor, which `spec` describes; None: `spec` describes base loads.
     """
     moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)

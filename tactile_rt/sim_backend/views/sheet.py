@@ -1,4 +1,4 @@
-"""The whole picture: the scene, the array as a map of forces beside it, their traces below."""
+"""The layout of a picture: the scene, a map of the array's forces beside it, traces below."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -26,16 +26,16 @@ WIDE, TALL = 12.8, 7.2  # inches: 16 : 9
 SCENE: Place = (0.0, 0.265, 0.62, 0.62)
 MAP: Place = (0.635, 0.4, 0.35, 0.425)
 INK, QUIET, EMPTY = "#222222", "#6b6b6b", "#f2f2f2"
-REACH = 0.36  # of a cell: half the longest arrow in it
-HARDLY = 0.15  # of a force, in the plane of the map: less has no direction worth drawing
+REACH = 0.36  # half the longest arrow, relative to a cell
+HARDLY = 0.15  # share of a force in the plane of the map below which no arrow is drawn
 NAMED = 6  # strongest traces that get a colour and a name
 RGBA = tuple[float, float, float, float]
 
 _COLOURS = colormaps["plasma_r"]
 _UNTOUCHED: RGBA = (0.62, 0.62, 0.62, 1.0)
-_FELT = 0.01  # of the top: less is drawn as untouched
-_LONGEST = 1.5  # arrows grow no longer than this, so that a snap does not cross the picture
-_HEARD_OF = 98.0  # percentile of the moments' strongest forces that gets the top colour
+_LEAST = 0.01  # of the top: less is drawn as untouched
+_LONGEST = 1.5  # largest length of an arrow, so that the arrow of a snap stays in the picture
+_TOP_PERCENTILE = 98.0  # of the moments' strongest forces, which sets the top colour
 
 
 def round_number(value: float) -> float:
@@ -48,7 +48,7 @@ def round_number(value: float) -> float:
 
 @dataclass(frozen=True)
 class ForceScale:
-    """Colours and arrow lengths of forces, or of what else is read.
+    """Colours and arrow lengths of forces, or of other readings.
 
     Attributes:
         top: The size that gets the strongest colour, in `unit`.
@@ -63,32 +63,32 @@ class ForceScale:
 
     @classmethod
     def fitting(cls, sizes: NDArray[np.float64], extent_mm: float, unit: str = "N") -> Self:
-        """Fit a scale to sizes (moment, element), SI, in a picture of so much height."""
+        """Fit a scale to sizes (moment, element), SI, in a picture of given height."""
         strongest = sizes.max(axis=1)
         touched = strongest[strongest > 0.02 * strongest.max()]
-        top = float(np.percentile(touched, _HEARD_OF)) / 1.2 if len(touched) else 1e-3
+        top = float(np.percentile(touched, _TOP_PERCENTILE)) / 1.2 if len(touched) else 1e-3
         power = int(np.clip(np.ceil(-np.log10(10 * top) / 3), 0, 4))
         unit, per_si = ("", "m", "u", "n", "p")[power] + unit, 1e3**power
         return cls(round_number(per_si * top), round_number(0.15 * extent_mm), unit, per_si)
 
     def draws(self, size: float) -> bool:
-        """True if a force is large enough to be drawn."""
-        return size >= _FELT * self.top
+        """Return whether a force is large enough to be drawn."""
+        return size >= _LEAST * self.top
 
     def colour(self, size: float) -> RGBA:
-        """RGBA of a force; grey for none."""
+        """Return the RGBA colour of a force; grey if it is too small to draw."""
         if not self.draws(size):
             return _UNTOUCHED
         r, g, b, a = _COLOURS(0.12 + 0.83 * min(size / self.top, 1.0))
         return r, g, b, a
 
     def length(self, size: float) -> float:
-        """Length of a force's arrow, mm."""
+        """Return the length of a force's arrow, mm."""
         return self.arrow_mm * min(size / self.top, _LONGEST)
 
 
 class Sheet:
-    """Pictures of footage, one for each moment. What stays is drawn once.
+    """Pictures of footage, one for each moment; static parts are drawn once.
 
     Attributes:
         size: The (width, height) of the pictures in pixels, both even.
@@ -105,7 +105,7 @@ class Sheet:
         pixels: int,
     ) -> None:
         self._footage = footage
-        self.size = _scaled_size(pixels)
+        self.size = _round_size(pixels)
         self.scene_size = scene_size(pixels)
         dpi = self.size[0] / WIDE
         figure = Figure(figsize=(WIDE, self.size[1] / dpi), dpi=dpi)
@@ -116,7 +116,7 @@ class Sheet:
         width, height = self.scene_size
         scene = figure.add_axes(SCENE)
         scene.axis("off")
-        # As many cells as pixels, so that none is resampled.
+        # As many cells as pixels, so that nothing is resampled.
         blank = np.full((height, width, 3), 255, dtype=np.uint8)
         self._scene = scene.imshow(blank, aspect="auto", interpolation="nearest")
         self._legend = _draw_ruler(figure, camera, scale)
@@ -128,7 +128,7 @@ class Sheet:
         figure.text(middle, 0.862, f"{what} at each base", ha="center", fontsize=12, color=INK)
         how = "colour: size, arrow: direction of the force in y and z"
         figure.text(middle, 0.833, how, ha="center", fontsize=9.5, color=QUIET)
-        self._map = ForceMap(figure, MAP, spec, scale, _mirrored(footage, camera))
+        self._map = ForceMap(figure, MAP, spec, scale, _must_mirror(footage, camera))
         draw_scale(figure, (middle - 0.1, 0.345, 0.2, 0.016), scale)
 
         traces = figure.add_axes((0.06, 0.085, 0.925, 0.165))
@@ -144,10 +144,10 @@ class Sheet:
         self._figure = figure
 
     def picture(self, moment: int, scene: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture of one moment: (height, width, 3) RGB.
+        """Draw the (height, width, 3) RGB picture of a moment.
 
         Args:
-            scene: its (height, width, 3) picture of `scene_size`.
+            scene: the moment's (height, width, 3) scene, of `scene_size`.
         """
         time = float(self._footage.times_ms[moment])
         self._scene.set_data(scene)
@@ -160,20 +160,20 @@ class Sheet:
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
 
-def _scaled_size(pixels: int) -> tuple[int, int]:
-    """(width, height) of a sheet about so many pixels wide: even, as video formats want them."""
+def _round_size(pixels: int) -> tuple[int, int]:
+    """Round a sheet's (width, height), pixels, to even numbers, as video formats need."""
     width = 2 * round(pixels / 2)
     return width, 2 * round(width * TALL / WIDE / 2)
 
 
 def scene_size(pixels: int) -> tuple[int, int]:
-    """(width, height) of the scene in a sheet so many pixels wide."""
-    width, height = _scaled_size(pixels)
+    """Compute the scene's (width, height) in a sheet of a width, pixels."""
+    width, height = _round_size(pixels)
     return round(SCENE[2] * width), round(SCENE[3] * height)
 
 
 def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artist]:
-    """A force arrow as long as it is at the point looked at, and what it stands for."""
+    """Draw a reference arrow, as long as at the camera's focus, and its label."""
     right, y = SCENE[0] + SCENE[2] - 0.022, SCENE[1] + 0.03  # bases are often on the left
     long = scale.arrow_mm / camera.extent_mm * SCENE[3] * TALL / WIDE
     head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
@@ -182,31 +182,31 @@ def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artis
     figure.add_artist(arrow)
     clear = {"facecolor": "white", "edgecolor": "none", "pad": 1.5, "alpha": 0.7}
     words = f"{scale.arrow_mm:g} mm · arrow of {scale.top:g} {scale.unit}"
-    said = figure.text(right, y + 0.022, words, fontsize=10, color=INK, bbox=clear, ha="right")
-    return [arrow, said]
+    label = figure.text(right, y + 0.022, words, fontsize=10, color=INK, bbox=clear, ha="right")
+    return [arrow, label]
 
 
-def _mirrored(footage: Footage, camera: Camera) -> bool:
-    """Whether the map is to be mirrored so that its nose is where the picture's is."""
+def _must_mirror(footage: Footage, camera: Camera) -> bool:
+    """Return whether to mirror the map so that its nose is on the picture's side."""
     data = mujoco.MjData(footage.model)
     footage.restore(0, data)
     whisker = footage.model.site_bodyid[footage.model.site(footage.spec.elements[0]).id]
     head = data.xmat[footage.model.body_parentid[whisker]].reshape(3, 3)
     lateral, rostral = camera.right @ head[:, 0], camera.right @ head[:, 1]
     signs = rostral_sign(footage.spec)
-    if len(set(signs.tolist())) > 1:  # a face: its right side on the left when seen from ahead
+    if len(set(signs.tolist())) > 1:  # a face: from the front, its right side is on the left
         return bool(lateral > 0.5)
     return bool(signs[0] * rostral < -0.5)
 
 
 class ForceMap:
-    """The array on its grid: each cell in the colour of its size, with the force's direction.
+    """The array's grid, with each cell in the colour of its force, and its direction.
 
-    The arrow in a cell is the part of the force along y and z of the mount frame, rostral and
-    dorsal on an animal; it is long where all of the force is in that plane.
+    The arrow in a cell is the component of the force along y and z of the mount frame, rostral and
+    dorsal on an animal; it is longest if all of the force is in that plane.
 
     Args:
-        place: in it: left, bottom, width, height, fractions.
+        place: in the figure: left, bottom, width, height, fractions.
         mirrored: whether column 0 is on the right, as in a picture with +y on the left.
     """
 
@@ -253,7 +253,7 @@ class ForceMap:
         """Set loads (element, 6), SI, in the element frames, and sizes (element,).
 
         Returns:
-            What differs from the map of an untouched array, in the order to draw it.
+            The artists that differ from the map of an untouched array, in drawing order.
         """
         forces = np.einsum("eij,ej->ei", self._turns, loads[:, :3])
         changed: list[Artist] = []
@@ -276,7 +276,7 @@ class ForceMap:
 
 
 def rostral_sign(spec: ArraySpec) -> NDArray[np.float64]:
-    """(element,) 1 where columns go rostral, -1 where they go caudal, as on the left of a face."""
+    """Return (element,) signs: 1 if columns go rostral, -1 if caudal (left of a face)."""
     place = np.array(spec.positions)
     columns = np.array([column for _, column in spec.grid], dtype=np.float64)
     signs = np.ones(len(columns))
@@ -288,7 +288,7 @@ def rostral_sign(spec: ArraySpec) -> NDArray[np.float64]:
 
 
 def draw_scale(figure: Figure, place: Place, scale: ForceScale) -> None:
-    """A horizontal colour bar of the forces in these figure fractions."""
+    """Draw a horizontal colour bar of the forces at a place in figure fractions."""
     steps = np.linspace(0.02 * scale.top, scale.top, 64)
     colours = ListedColormap([scale.colour(f) for f in steps])
     bar = figure.colorbar(
@@ -306,7 +306,7 @@ def draw_scale(figure: Figure, place: Place, scale: ForceScale) -> None:
 def draw_traces(
     axes: Axes, times_ms: NDArray[np.float64], forces: NDArray[np.float64], names: tuple[str, ...]
 ) -> None:
-    """Forces (sample, element) in mN over time; the strongest in colour and by name."""
+    """Draw forces (sample, element), mN, over time; the strongest in colour and by name."""
     peaks = forces.max(axis=0)
     top = max(float(peaks.max()), 1e-6)
     for rank, i in enumerate(np.argsort(-peaks)):

@@ -226,7 +226,7 @@ def test_position_velocity_and_acceleration_of_the_head_agree() -> None:
     one = head()
     ways, pulls = [], []
     for command in ((0, 60, 10), (-30, 20, 0), (0, 0, -60)):
-        way, pull = one._go(100, np.array(command, dtype=float))
+        way, pull = one._move(100, np.array(command, dtype=float))
         ways.append(way[:-1])
         pulls.append(pull)
     way, pull = np.concatenate(ways), np.concatenate(pulls)
@@ -240,4 +240,4 @@ def test_touches_are_counted_anew_after_a_pause() -> None:
     touching = np.zeros((40, 2), dtype=bool)
     touching[5:9, 0] = touching[12:20, 0] = touching[35:, 0] = True  # 3 ms free, 15 ms free
     touching[0, 1] = touching[39, 1] = True
-    assert one._begun(touching[:13]) + one._begun(touching[13:]) == 4
+    assert one._count_touches(touching[:13]) + one._count_touches(touching[13:]) == 4

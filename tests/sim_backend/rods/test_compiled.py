@@ -103,7 +103,7 @@ def test_without_a_folder_it_is_said_once(doubled, monkeypatch, caplog):
         raise RuntimeError("cannot cache function: no locator available")
 
     monkeypatch.setattr(FunctionCache, "__init__", no_place)
-    module._tell_once.cache_clear()
+    module._warn_uncached_once.cache_clear()
     with caplog.at_level(logging.WARNING):
         assert doubled()(2.0) == doubled()(2.0) == 4.0
     assert [r.message for r in caplog.records if "NUMBA_CACHE_DIR" in r.message] == [
