@@ -184,7 +184,7 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
         return read_animals(path)
     if name in ROBOTS:
         return read_animals(Path(f"{name}.toml"), robot_text(name))
-    if name in ANIMALS:  # without a search for installed packages
+    if name in ANIMALS:  # these need no search of installed packages
         return (species_array(name),)
     file = packages.added(packages.ARRAYS, name)
     return (species_array(name),) if file is None else read_animals(Path(file))

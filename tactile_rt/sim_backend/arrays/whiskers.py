@@ -196,7 +196,7 @@ class Whisker:
         return base + (tip - base) * np.asarray(s) / self.length
 
     def bending_stiffness(self, s: Floats) -> Floats:
-        """Return E I (N mm^2) at arc length s (mm), with I = pi r^4 / 4."""
+        """Return E I (N mm^2) at arc length s (mm), I = pi r^4/4."""
         return self.young_modulus * 1e-6 * np.pi * self.radius(s) ** 4 / 4
 
     def centreline(self, s: Floats) -> Floats:
@@ -229,7 +229,7 @@ def link_nodes(whisker: Whisker, links: int) -> Floats:
 
 
 def joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
-    """Return the stiffness (uN m / rad) of the joint in the middle of a cell.
+    """Return the stiffness (uN m / rad) of the joint in mid-cell.
 
     The joint bends a tip under a force as much as the beam's own piece does, by the integral of
     (L - s)^2 / E I: towards a thin tip, that is more than E I in mid-cell would give.

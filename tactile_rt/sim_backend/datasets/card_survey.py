@@ -36,7 +36,7 @@ PUBLISHED = (
     ("train", "truck", "car", "plane"),
 )
 
-# Values (sweep, feature), names (sweep,) and a penalty -> a machine that names other values.
+# Values (sweep, feature), names (sweep,) and a penalty -> a machine that classifies other values.
 Fit = Callable[
     [NDArray[np.float32], NDArray[Any], float], Callable[[NDArray[np.float32]], NDArray[Any]]
 ]

@@ -117,7 +117,7 @@ class MeshObjects:
 
     @cached_property
     def _names(self) -> dict[str, str]:
-        """Name of every object in its folder, by a name that is valid for a file."""
+        """Name of every object in its folder, by a valid file name."""
         names = {name.replace("/", "-"): name for name in self._set.names}
         if len(names) < len(self._set.names):
             raise ConfigError(f"{self.choice.source}: two objects differ by / and - alone")

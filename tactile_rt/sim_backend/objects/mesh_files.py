@@ -41,7 +41,7 @@ GLB_JSON: Final = struct.Struct("<4sIIII")  # headers of the file and of its fir
 DRACO: Final = b"DRACO"
 NO_GLTF: Final = (ValueError, KeyError, TypeError, AttributeError, IndexError)
 POINT = 1e-9  # of the largest extent or coordinate: a smaller extent counts as zero
-STRAY, AWAY = 5e-3, 3.0  # a share of the area, and the times that it may not lengthen a mesh
+STRAY, AWAY = 5e-3, 3.0  # share of area at either end, stray if it makes a mesh this much longer
 TO_Z_UP: Final = {  # from the axis that points up
     "x": np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
@@ -188,7 +188,7 @@ UNREAD_SUFFIXES = (".step", ".stp", ".iges", ".igs", ".fbx", ".3ds", ".wrl", ".u
 
 
 def check_mesh_file(path: Path) -> None:
-    """Refuse a file that is missing, empty or of an unknown format."""
+    """Refuse a missing or empty file, a Git LFS pointer or an unknown format."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise ConfigError(

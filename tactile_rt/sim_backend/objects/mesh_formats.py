@@ -123,7 +123,7 @@ def read_obj(path: Path, content: bytes) -> Meshes:
     else:  # weights, or colours
         vertices = np.array([row.split()[:3] for row in places], float)
     corners = _parse_numbers(re.sub(rb"/\S*", b"", b" ".join(faces)), np.int64)
-    before = np.cumsum(kinds == b"v")[kinds == b"f"]  # relative ones count back from it
+    before = np.cumsum(kinds == b"v")[kinds == b"f"]  # relative numbers count back from it
     back = corners + np.repeat(before, sizes)[: len(corners)] + 1
     relative = corners < 0
     mesh = _make_mesh(vertices, np.where(relative, np.maximum(back, 0), corners) - 1, sizes, 1)

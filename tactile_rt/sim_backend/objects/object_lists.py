@@ -216,7 +216,7 @@ def _download(file: ListedFile) -> bytes:
 
 
 def _read_clone(file: ListedFile, clones: Path) -> bytes:
-    """Read a file from a clone at its commit, else as it lies in the folder."""
+    """Read a file from a clone at its commit, else from the folder itself."""
     owner, name = file.repository.split("/")
     places = [clones / name, clones / owner / name, clones / f"{owner}+{name}", clones]
     for place in places:

@@ -26,7 +26,7 @@ class TactileObject:
     name: str  # "mug-17", or the file's stem
     category: str  # "mug", or the file's stem for a mesh file
     pieces: tuple[trimesh.Trimesh, ...]  # convex, watertight, wound outward; union = the object
-    surface_error: float = 0.0  # largest distance between the pieces' surface and the mesh's
+    surface_error: float = 0.0  # largest distance of the pieces from the mesh, in largest extents
     made_by: str = "drawn"  # origin of the pieces: drawn as such, or as in `meshes`
 
 

@@ -54,7 +54,7 @@ def ladder(rng: Generator) -> list[Trimesh]:
     top, depth, back = bottom * u(0.6, 0.8), u(0.07, 0.11), u(0.16, 0.26)
 
     def front(side: float, z: float) -> tuple[float, float, float]:
-        """Return a point of the front rails at height z; `side` is -1 to 1 across."""
+        """Return a point of the front rails at height z, side -1 to 1."""
         return (-0.04 - reach * (1 - z), side * (bottom + (top - bottom) * z) / 2, z)
 
     def rear(side: float, z: float) -> tuple[float, float, float]:

@@ -101,7 +101,7 @@ def chair(rng: Generator) -> list[Trimesh]:
     back, post = -deep / 2 + 0.03, u(0.03, 0.08)
 
     def at(side: float, z: float) -> tuple[float, float, float]:
-        """Return a point of the leaning back at height z; `side` is -1 to 1 across."""
+        """Return a point of the leaning back at height z, side -1 to 1."""
         x = back - lean * (z - seat) / (top - seat)
         return (x, side * (wide - post) / 2 * 0.95, z)
 
@@ -188,7 +188,7 @@ def ladder(rng: Generator) -> list[Trimesh]:
 
 
 def lamp(rng: Generator) -> list[Trimesh]:
-    """Build a stand with a shade, a ball, a hood on an arm or a lantern."""
+    """Build a lamp: shade or ball on a pole, street lamp, desk lamp or lantern."""
     u = rng.uniform
     pole, base = u(0.012, 0.05), u(0.08, 0.28)
     foot = u(0.02, 0.1)

@@ -10,7 +10,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, lathe,
 
 
 def birdcage(rng: Generator) -> list[Trimesh]:
-    """Build few or many wires round a floor, under a dome, a cone or a lid."""
+    """Build wires round a floor, few or many, under a dome, cone or lid."""
     u = rng.uniform
     wires, r, wire = int(rng.integers(5, 15)), u(0.2, 0.48), u(0.012, 0.032)
     eave, top, lean = u(0.4, 0.85), u(0.85, 1.0), u(-0.25, 0.25)
