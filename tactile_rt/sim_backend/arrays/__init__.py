@@ -1,1 +1,1 @@
-"""Whiskers, how they are mounted on a head, and the files that describe both."""
+"""Whiskers, their mounting on a head, and the files that describe both."""

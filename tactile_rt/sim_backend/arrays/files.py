@@ -1,15 +1,15 @@
-"""Arrays by name: a species', a robot's, another package's, or a file's, in CSV or in TOML.
+"""Arrays by name, of a species, a robot or another package, or from a CSV or TOML file.
 
 Both kinds of file have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`;
-see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
+see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both formats. In TOML::
 
     name = "robot"             # the file's name if left out
     mirror = true              # adds the left side
     gravity_m_s2 = [0.0, 0.0, -9.80665]    # in the world; if left out: whiskers have no weight
-    [mount]                    # if left out: unturned, the mean base point at the world's origin
+    [mount]                    # if left out: not rotated, the mean base point at the world's origin
     position_mm = [0.0, 0.0, 0.0]
     roll_pitch_yaw_rad = [0.0, 0.0, 0.0]
-    [sensor]                   # what reads the whiskers; if left out: their base loads, 1 kHz
+    [sensor]                   # if left out: the base loads at 1 kHz
     rate_hz = 100              # see `sensor_spec.SensorSpec`
     [[sensor.channel]]         # see `sensor_spec.ChannelSpec`
     name = "mz"
@@ -53,7 +53,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
 )
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, TURN, Whisker
 
-# By name: the options of the serial URL that reads the array.
+# Options of the serial URL that reads each robot's array.
 ROBOTS = MappingProxyType(
     {
         "hx711_whisker": "codec=hx711_whisker",
@@ -68,18 +68,18 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 def robot_text(name: str) -> str:
-    """The description of one of `ROBOTS`: what is in its .toml file."""
+    """Return the text of the .toml file of one of `ROBOTS`."""
     file = resources.files(__package__).joinpath("data", f"{name}.toml")
     return file.read_text(encoding="utf-8")
 
 
 def mouse_whiskers() -> tuple[Whisker, ...]:
-    """The 30 right-side mystacial whiskers of the mouse (Bresee et al. 2023)."""
+    """Return the 30 right-side mystacial whiskers of the mouse (Bresee et al. 2023)."""
     return _read_species("mouse.csv")
 
 
 def rat_whiskers() -> tuple[Whisker, ...]:
-    """The 30 right-side mystacial whiskers of the rat (Belli et al. 2017, 2018)."""
+    """Return the 30 right-side mystacial whiskers of the rat (Belli et al. 2017, 2018)."""
     return _read_species("rat.csv")
 
 
@@ -100,13 +100,13 @@ ANIMALS = (*SPECIES, *(f"{animal}-{side}" for animal in SPECIES for side in SIDE
 
 @cache
 def species_array(name: str) -> WhiskerArray:
-    """The array of an animal: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ...
+    """Return the array of an animal: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ...
 
-    ``mouse`` is ``mouse-right``. An animal's left side alone is mounted as its right side's mirror
-    image, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads; both
+    ``mouse`` is ``mouse-right``. A left side alone is mounted as the mirror image of the right
+    side, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads; both
     sides stand on one head, mounted as for the right side alone. The rat's pose in the published
-    sweeps is not known: its head is turned as the mouse's and placed so that the mean of its base
-    points is where the mouse's is.
+    sweeps is unknown: its head is turned like the mouse's and placed so that the means of their
+    base points coincide.
     """
     animal, _, side = name.partition("-")
     if name not in ANIMALS:
@@ -165,7 +165,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def load_array(name: str) -> WhiskerArray:
-    """The one array of a name.
+    """Load a single array by name or from a file.
 
     Args:
         name: of an animal and side, see `species_array`, of a robot, see `ROBOTS`, or of another
@@ -178,13 +178,13 @@ def load_array(name: str) -> WhiskerArray:
 
 
 def load_animals(name: str) -> tuple[WhiskerArray, ...]:
-    """The arrays that share one world: one by its name, or all that a .toml file places in it."""
+    """Load the arrays that share one world: a named one, or all of a file."""
     path = Path(name)
     if path.suffix.lower() in ARRAY_FILES:
         return read_animals(path)
     if name in ROBOTS:
         return read_animals(Path(f"{name}.toml"), robot_text(name))
-    if name in ANIMALS:  # without a look at what is installed
+    if name in ANIMALS:  # these need no search of installed packages
         return (species_array(name),)
     file = packages.added(packages.ARRAYS, name)
     return (species_array(name),) if file is None else read_animals(Path(file))
@@ -194,23 +194,23 @@ def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...
     """Read the array, or the several animals, of a .csv or .toml file.
 
     Args:
-        text: what is about to be written to it, of a .toml file; None: what is in it.
+        text: content to use in place of that of a .toml file; None: read the file.
     """
     if path.suffix.lower() == ".csv":
-        whiskers = _csv_whiskers(path)
+        whiskers = _read_csv(path)
         return (WhiskerArray(path.stem, whiskers, centred_mount(whiskers)),)
     nodes = settings.read_toml(path) if text is None else settings.parse_toml(text, str(path))
-    return _toml_animals(path, nodes)
+    return _read_toml(path, nodes)
 
 
-def _csv_whiskers(path: Path) -> tuple[Whisker, ...]:
+def _read_csv(path: Path) -> tuple[Whisker, ...]:
     table = settings.read_csv(path)
     settings.check_columns(table, COLUMNS, REQUIRED)
-    whiskers = [(row.where, _whisker(row.where, row.plain())) for row in table.rows]
-    return _distinct(path, whiskers)
+    whiskers = [(row.where, _make_whisker(row.where, row.plain())) for row in table.rows]
+    return _check_distinct(path, whiskers)
 
 
-def _toml_animals(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray, ...]:
+def _read_toml(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray, ...]:
     file: _File = settings.convert(nodes, _File)
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
@@ -222,7 +222,7 @@ def _toml_animals(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray
                 f"{path}: beside [[animal]] tables there is nothing else; name, mirror, "
                 f"gravity_m_s2, mount, sensor and defaults belong in the file of an array"
             )
-        animals = [_animal(path, animal) for animal in file.animal]
+        animals = [_load_animal(path, animal) for animal in file.animal]
         try:
             return place(animals)
         except ConfigError as error:
@@ -236,28 +236,28 @@ def _toml_animals(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray
         where = f"{nodes.at(at).where}: {settings.named(at)}"
         if isinstance(values.get("whisker"), str):
             where += f" ({values['whisker']})"
-        whiskers.append((where, _whisker(where, file.defaults | values)))
-    made = _distinct(path, whiskers)
-    mount = _mount(path, file.mount) if file.mount else centred_mount(made)
+        whiskers.append((where, _make_whisker(where, file.defaults | values)))
+    made = _check_distinct(path, whiskers)
+    mount = _make_mount(path, file.mount) if file.mount else centred_mount(made)
     name = file.name or path.stem
     try:
-        array = WhiskerArray(name, made, mount, _sensor(nodes, file.sensor), file.gravity_m_s2)
+        array = WhiskerArray(name, made, mount, _make_sensor(nodes, file.sensor), file.gravity_m_s2)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return (both_sides(array, name) if file.mirror else array,)
 
 
-def _animal(path: Path, animal: _Animal) -> WhiskerArray:
+def _load_animal(path: Path, animal: _Animal) -> WhiskerArray:
     name = animal.array
     if Path(name).suffix.lower() in ARRAY_FILES:
         if (path.parent / name).resolve() == path.resolve():
             raise ConfigError(f"{path}: an animal's array is another file, not this one")
         name = str(path.parent / name)
     array = load_array(name)
-    return replace(array, mount=_mount(path, animal.mount)) if animal.mount else array
+    return replace(array, mount=_make_mount(path, animal.mount)) if animal.mount else array
 
 
-def _mount(path: Path, mount: _Mount) -> Mount:
+def _make_mount(path: Path, mount: _Mount) -> Mount:
     for angle in mount.roll_pitch_yaw_rad:
         if abs(angle) > TURN:
             raise ConfigError(
@@ -270,7 +270,7 @@ def _mount(path: Path, mount: _Mount) -> Mount:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def _sensor(nodes: settings.SettingNode, sensor: _Sensor | None) -> SensorSpec | None:
+def _make_sensor(nodes: settings.SettingNode, sensor: _Sensor | None) -> SensorSpec | None:
     if sensor is None:
         return None
     given = msgspec.structs.asdict(sensor)
@@ -280,14 +280,14 @@ def _sensor(nodes: settings.SettingNode, sensor: _Sensor | None) -> SensorSpec |
         raise ConfigError(f"{nodes.at(['sensor']).where}: {error}") from None
 
 
-def _whisker(where: str, values: Mapping[str, object]) -> Whisker:
+def _make_whisker(where: str, values: Mapping[str, object]) -> Whisker:
     try:
         return Whisker.from_columns(values)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
 
 
-def _distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker, ...]:
+def _check_distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker, ...]:
     if not whiskers:
         raise ConfigError(f"{path}: has no whiskers; give at least one")
     first: dict[object, str] = {}
@@ -301,7 +301,7 @@ def _distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker,
 
 
 def _check_columns(nodes: settings.SettingNode, path: list[str | int]) -> None:
-    """Refuse a key of a table that is no column."""
+    """Refuse a table with a key that is not a column."""
     for key, node in nodes.at(path).value.items():
         if key not in COLUMNS:
             where, hint = f"{node.where}: {settings.named(path)}", settings.hint(key, COLUMNS)

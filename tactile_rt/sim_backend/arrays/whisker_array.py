@@ -1,4 +1,4 @@
-"""Whisker arrays: which whiskers stand where, on which heads.
+"""Whisker arrays: whiskers and the poses of the heads that carry them.
 
 Lengths in mm and angles in rad, as in `whiskers`. The frame of a head is x lateral (to the
 animal's right), y rostral, z dorsal; the left side of an animal is its right side mirrored in x.
@@ -16,7 +16,7 @@ from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 
 Point = tuple[float, float, float]
-MOST_GRAVITY = 50.0  # m/s^2; more is a slip of the pen
+MOST_GRAVITY = 50.0  # m/s^2; more must be a typing error
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,12 @@ class Mount:
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """(3, 3) from the array frame to the world frame."""
+        """Rotation (3, 3) from the array frame to the world frame."""
         roll, pitch, yaw = self.roll_pitch_yaw
         return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
 
     def mirrored(self) -> "Mount":
-        """The pose seen in a mirror in world x."""
+        """Return the pose mirrored in world x."""
         x, y, z = self.position
         roll, pitch, yaw = self.roll_pitch_yaw
         return Mount((-x, y, z), (roll, -pitch, -yaw))
@@ -55,9 +55,9 @@ class WhiskerArray:
 
     Attributes:
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
-        sensor: What reads the whiskers; None: the base loads are read as they are.
-        gravity: The gravity where the array is mounted, in the world, m/s^2; zeros: its whiskers
-            have no weight. Loads are those above a tare there.
+        sensor: The sensor that reads the whiskers; None: the base loads are read as they are.
+        gravity: The gravity in the world frame, m/s^2; zeros: the whiskers have no weight. Loads
+            are relative to a tare under this gravity.
 
     Raises:
         ConfigError: no whiskers, or two of one name or in one cell of the grid.
@@ -88,11 +88,11 @@ class WhiskerArray:
 
 
 def mirrored(whisker: Whisker) -> Whisker:
-    """The whisker on the other side of the head: its points are reflected in x.
+    """Return the whisker on the other side of the head, its points reflected in x.
 
-    It is as curved, and its frame is a right-handed one again: x along the whisker and y towards
-    its concave side are the reflected axes, z = x cross y is against the reflected one (which
-    makes the base angles -theta, phi, -zeta). So mirrored contact gives the same fx, fy and mz,
+    Its curvature is the same, and its frame is right-handed, too: x along the whisker and y towards
+    its concave side are the reflected axes, and z = x cross y is opposite to the reflected z (which
+    makes the base angles -theta, phi, -zeta). So a mirrored contact gives the same fx, fy and mz,
     and fz, mx and my of the opposite sign.
     """
     x, y, z = whisker.base
@@ -101,11 +101,11 @@ def mirrored(whisker: Whisker) -> Whisker:
 
 
 def both_sides(right: WhiskerArray, name: str) -> WhiskerArray:
-    """An array and its mirror image on one head: ``R.C2`` and ``L.C2``.
+    """Put an array and its mirror image on one head: ``R.C2`` and ``L.C2``.
 
-    The grid is the face as one sees it who looks the animal in the eyes: the right side keeps
-    its cells, on the beholder's left, and the left side mirrors them on his right, so that the
-    most rostral columns meet in the middle (5 x 14 for mouse and rat).
+    The grid is the face seen from the front: the right side keeps its cells, on the viewer's left,
+    and the left side mirrors them, on the viewer's right, so that the most rostral columns meet in
+    the middle (5 x 14 for mouse and rat).
     """
     columns = 2 * max(w.column for w in right.whiskers) + 1
     left = (
@@ -150,7 +150,7 @@ def centred_mount(
     centre: Point = (0.0, 0.0, 0.0),
     roll_pitch_yaw: Point = (0.0, 0.0, 0.0),
 ) -> Mount:
-    """The mount that brings the mean of the base points to a point of the world (mm)."""
+    """Return the mount that brings the mean base point to `centre` (world, mm)."""
     turned = Mount((0.0, 0.0, 0.0), roll_pitch_yaw).rotation
     x, y, z = (centre - turned @ np.mean([w.base for w in whiskers], axis=0)).tolist()
     return Mount((x, y, z), roll_pitch_yaw)

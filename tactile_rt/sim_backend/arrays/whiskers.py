@@ -1,4 +1,4 @@
-"""Whiskers: the geometry and the material of one, and how a row of a table describes it.
+"""The geometry and material of a whisker, and its description by a row of a table.
 
 Lengths in mm and angles in rad here, as the field publishes them; `world` converts.
 """
@@ -45,7 +45,7 @@ NOT_NEGATIVE = ("damping_ratio", "friction", "mount_stiffness", "mount_damping")
 POSITIVE = {"arc_length_mm": "length"} | {
     column: field for column, field in OPTIONAL.items() if field not in NOT_NEGATIVE
 }
-# What lies outside is in another unit, or beyond what can be simulated: in the columns' units.
+# In the columns' units: a value outside is in a wrong unit, or cannot be simulated.
 PLAUSIBLE = {
     "arc_length_mm": (0.1, 500.0),
     "base_radius_mm": (5e-4, 50.0),
@@ -54,7 +54,7 @@ PLAUSIBLE = {
     "density_base_kg_m3": (100.0, 1e5),
     "density_tip_kg_m3": (100.0, 1e5),
 }
-TURN = 2 * math.pi  # rad, beyond which an angle is in degrees
+TURN = 2 * math.pi  # rad; a larger angle must be in degrees
 SOFTEST_MOUNT = 1e-12  # N m / rad: a mouse's whisker has 1e-6 at its base
 NAME = re.compile(r"[\w.+-]+")  # MuJoCo's names are cut at spaces and joined by slashes
 TAKEN = ("world", "head", "object")  # bodies that share a model with the whiskers
@@ -77,8 +77,8 @@ class Whisker:
         young_modulus: Young's modulus E of the material, Pa.
         density_base, density_tip: The mass density at either end, kg/m^3.
         damping_ratio: The damping ratio of the first mode (1 is critical).
-        mount_stiffness: The rotational stiffness of what the whisker stands on, about each axis
-            across the whisker, N m / rad; 0: it does not give.
+        mount_stiffness: The rotational stiffness of the whisker's mount, about each axis across the
+            whisker, N m / rad; 0: the mount is rigid.
         mount_damping: The damping of that rotation, N m s / rad.
     """
 
@@ -111,7 +111,7 @@ class Whisker:
         for what in (self.base, self.angles, (self.curvature,)):
             if not all(map(math.isfinite, what)):
                 raise ConfigError(f"{who}: base, angles and curvature must be finite")
-        # Named as the columns of a table are, which say the unit, too.
+        # Messages name the columns of a table, which include the unit.
         for column, name in POSITIVE.items():
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"{who}: {column} must be positive, not {getattr(self, name):g}")
@@ -146,10 +146,10 @@ class Whisker:
 
     @classmethod
     def from_columns(cls, values: Mapping[str, object]) -> "Whisker":
-        """Make a whisker from a row of a table: texts or numbers by `REQUIRED` and `OPTIONAL`.
+        """Make a whisker from a row: texts or numbers by `REQUIRED` and `OPTIONAL` column.
 
-        Rows are counted from 1 there, as in the field's tables. An optional value that is absent
-        or empty is keratin's; a radius or density given for the base alone holds to the tip.
+        Rows of the grid are counted from 1, as in the field's tables. An absent or empty optional
+        value is keratin's; a radius or density given for the base alone also holds for the tip.
         """
         given = {k: v for k, v in values.items() if v is not None and v != ""}
         missing = [column for column in REQUIRED if column not in given]
@@ -158,9 +158,9 @@ class Whisker:
         name = given["whisker"]
         if not isinstance(name, str):
             raise ConfigError(f"whisker is a name, in quotes, not {name!r}")
-        row, column = _whole(given, "row", 1) - 1, _whole(given, "col", 0)
-        length = _number(given, "arc_length_mm")
-        fields = {field: _number(given, at) for at, field in OPTIONAL.items() if at in given}
+        row, column = _read_integer(given, "row", 1) - 1, _read_integer(given, "col", 0)
+        length = _read_number(given, "arc_length_mm")
+        fields = {field: _read_number(given, at) for at, field in OPTIONAL.items() if at in given}
         for base, tip in (
             ("base_radius_mm", "tip_radius_mm"),
             ("density_base_kg_m3", "density_tip_kg_m3"),
@@ -172,35 +172,35 @@ class Whisker:
         if "base_radius" not in fields:
             radii = keratin_radii(length, row, column)
             fields["base_radius"], fields["tip_radius"] = radii
-        x, y, z = (_number(given, f"base_{axis}_mm") for axis in "xyz")
-        theta, phi, zeta = (_angle(given, f"base_{a}_rad") for a in ("theta", "phi", "zeta"))
+        x, y, z = (_read_number(given, f"base_{axis}_mm") for axis in "xyz")
+        theta, phi, zeta = (_read_angle(given, f"base_{a}_rad") for a in ("theta", "phi", "zeta"))
         return cls(
             name=name.strip(),
             row=row,
             column=column,
             length=length,
-            curvature=_number(given, "curvature_a_per_mm"),
+            curvature=_read_number(given, "curvature_a_per_mm"),
             base=(x, y, z),
             angles=(theta, phi, zeta),
             **fields,
         )
 
     def radius(self, s: Floats) -> Floats:
-        """Radius (mm) at arc length s (mm): linear from base to tip."""
+        """Return the radius (mm) at arc length s (mm): linear from base to tip."""
         base, tip = self.base_radius, self.tip_radius
         return base + (tip - base) * np.asarray(s) / self.length
 
     def density(self, s: Floats) -> Floats:
-        """Mass density (kg/m^3) at arc length s (mm): linear from base to tip."""
+        """Return the mass density (kg/m^3) at arc length s (mm): linear from base to tip."""
         base, tip = self.density_base, self.density_tip
         return base + (tip - base) * np.asarray(s) / self.length
 
     def bending_stiffness(self, s: Floats) -> Floats:
-        """E I (N mm^2) at arc length s (mm), I = pi r^4 / 4."""
+        """Return E I (N mm^2) at arc length s (mm), I = pi r^4/4."""
         return self.young_modulus * 1e-6 * np.pi * self.radius(s) ** 4 / 4
 
     def centreline(self, s: Floats) -> Floats:
-        """Points (len(s), 3) at arc lengths s (mm) in the whisker frame, mm.
+        """Return points (len(s), 3), mm, at arc lengths s (mm) in the whisker frame.
 
         The whisker leaves its base along +x and curves towards +y (-y if negatively curved).
         """
@@ -215,7 +215,7 @@ class Whisker:
 
     @property
     def orientation(self) -> Floats:
-        """(3, 3) rotation from the whisker frame to the array frame (Knutsen et al. 2008)."""
+        """Rotation (3, 3) from the whisker frame to the array frame (Knutsen et al. 2008)."""
         theta, phi, zeta = self.angles
         return (
             rotation("z", theta - np.pi / 2) @ rotation("y", -phi) @ rotation("x", zeta + np.pi / 2)
@@ -223,16 +223,16 @@ class Whisker:
 
 
 def link_nodes(whisker: Whisker, links: int) -> Floats:
-    """(links + 2,) arc lengths (mm) of the links' ends: base, joints in mid-cell, tip."""
+    """Return arc lengths (links + 2,), mm, of base, joints in mid-cell, and tip."""
     joints = (np.arange(links) + 0.5) * (whisker.length / links)
     return np.concatenate([[0.0], joints, [whisker.length]])
 
 
 def joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
-    """Stiffness (uN m / rad) of the joint in the middle of a cell.
+    """Return the stiffness (uN m / rad) of the joint in mid-cell.
 
-    The cell adds to the bend of a tip under a force what the beam's own piece adds, the integral of
-    (L - s)^2 / E I: towards a thin tip that is more than its middle's E I would give.
+    The joint bends a tip under a force as much as the beam's own piece does, by the integral of
+    (L - s)^2 / E I: towards a thin tip, that is more than E I in mid-cell would give.
     """
     s, weights = start + (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
     lever = whisker.length - s
@@ -241,10 +241,10 @@ def joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
 
 
 def link_inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, float, float, float]:
-    """Mass (mg), centroid (mm from start), axial and transverse inertia (mg mm^2) of a link.
+    """Return a link's mass (mg), centroid (mm from start), axial and transverse inertia (mg mm^2).
 
-    Of the tapered piece itself: a uniform link would have its mass too far out, and the whole
-    whisker a first resonance up to 3 % too low.
+    They are those of the tapered piece: with uniform links the mass would lie too far out, and the
+    whisker's first resonance would be up to 3 % too low.
     """
     x, weights = (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
     radius = whisker.radius(start + x)
@@ -256,7 +256,7 @@ def link_inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, fl
 
 
 def rotation(axis: str, angle: float | Floats) -> Floats:
-    """(..., 3, 3) right-handed rotations by angles (rad) about the x, y or z axis."""
+    """Return right-handed rotations (..., 3, 3) by angles (rad) about x, y or z."""
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., 3 - i - j, 3 - i - j] = 1.0
@@ -267,9 +267,9 @@ def rotation(axis: str, angle: float | Floats) -> Floats:
 
 
 def keratin_radii(length: float, row: int, column: int) -> tuple[float, float]:
-    """Base and tip radius (mm) of a rat's or mouse's whisker (Belli et al. 2017).
+    """Return base and tip radius (mm) of a rat's or mouse's whisker (Belli et al. 2017).
 
-    Regressions on arc length (mm) and place on the grid (row and column from 0). The tip is half
+    They are regressions on arc length (mm) and grid cell (row and column from 0). The tip is half
     as thick as the radius slope leaves it, and at least `THINNEST_TIP_MM`, as in the published
     simulator: short rostral whiskers would otherwise end before their tip.
     """
@@ -278,7 +278,7 @@ def keratin_radii(length: float, row: int, column: int) -> tuple[float, float]:
     return base, max((base - slope * length) / 2, THINNEST_TIP_MM)
 
 
-def _number(values: Mapping[str, object], column: str) -> float:
+def _read_number(values: Mapping[str, object], column: str) -> float:
     value = values[column]
     try:
         number = float(value) if isinstance(value, str | int | float) else math.nan
@@ -289,15 +289,15 @@ def _number(values: Mapping[str, object], column: str) -> float:
     return number
 
 
-def _angle(values: Mapping[str, object], column: str) -> float:
-    number = _number(values, column)
+def _read_angle(values: Mapping[str, object], column: str) -> float:
+    number = _read_number(values, column)
     if abs(number) > TURN:
         raise ConfigError(f"{column} must be within a turn, 6.28, not {number:g}: mind the unit")
     return number
 
 
-def _whole(values: Mapping[str, object], column: str, least: int) -> int:
-    number = _number(values, column)
+def _read_integer(values: Mapping[str, object], column: str, least: int) -> int:
+    number = _read_number(values, column)
     if not number.is_integer() or number < least:
         raise ConfigError(f"{column} must be a whole number from {least}, not {values[column]!r}")
     return int(number)

@@ -1,1 +1,1 @@
-"""Sweep sets on disk: recipes, the engines that make them, their checksums and their card."""
+"""Sweep sets on disk: recipes, the engines that make sets, their checksums and their cards."""

@@ -1,4 +1,4 @@
-"""The card of a sweep set: what is in it, measured, with a picture, for whoever may use it.
+"""The card of a sweep set, for its users: counts and measurements, with a picture.
 
 README.md       for reading
 card.png        forces, and a sweep of some categories
@@ -20,7 +20,7 @@ from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.card_survey import Card, Fit, Separability, survey
 
 COLUMNS, EXAMPLES = 4, 12
-FAINTEST = 5000  # times below what networks believe is where a picture begins
+FAINTEST = 5000  # the networks' clip is this many times the faintest load of a picture
 PREFIXES = {0: "", -1: "m", -2: "u", -3: "n", -4: "p"}
 PAPER = (
     "The recipe follows the published generator (Chung et al. 2025): 312 sweeps of an object with "
@@ -30,7 +30,7 @@ PAPER = (
 
 
 def write_card(folder: Path, fit: Fit) -> Card:
-    """Write the card of a set, or of what there is of it, into its folder."""
+    """Write the card of a set, finished or not, into its folder."""
     manifest = SweepManifest.read(folder)
     card, examples = survey(folder, fit)
     write_whole(folder / "card.png", lambda file: _draw_card(card, examples, manifest, file))
@@ -53,20 +53,20 @@ def _write_text(name: str, manifest: SweepManifest, card: Card) -> str:
         f"{versions or 'versions that were not noted'}. `manifest.json` has all that made it.",
         PAPER if str(recipe.get("name", "")).startswith("paper-") else "",
         "## Categories",
-        _counts(manifest, card),
-        _skipped(card),
+        _list_counts(manifest, card),
+        _list_skipped(card),
         "## What was drawn",
         _table(
             ("parameter", "least", "mean", "greatest"),
             [(key, *(f"{v:.4g}" for v in values)) for key, values in card.parameters.items()],
         ),
         "## What is felt",
-        _felt(card),
+        _describe_loads(card),
         "![forces, and one sweep of some categories](card.png)",
         "Share of the sweeps in which each whisker is touched, on the array's grid (%):",
-        _coverage(card, manifest.spec),
+        _map_coverage(card, manifest.spec),
         "## Can it be learnt from?",
-        _separability(card.separability),
+        _list_accuracies(card.separability),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -76,7 +76,7 @@ def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
-def _counts(manifest: SweepManifest, card: Card) -> str:
+def _list_counts(manifest: SweepManifest, card: Card) -> str:
     splits = tuple(card.sweeps)
 
     def count(split: str, category: str) -> str:
@@ -90,14 +90,14 @@ def _counts(manifest: SweepManifest, card: Card) -> str:
     return f"Objects / sweeps of each category in each split:\n\n{table}"
 
 
-def _skipped(card: Card) -> str:
+def _list_skipped(card: Card) -> str:
     if not card.skipped:
         return ""
     rows = sorted(card.skipped.items())
     return f"{len(rows)} objects could not be made:\n\n" + _table(("object", "why"), rows)
 
 
-def _felt(card: Card) -> str:
+def _describe_loads(card: Card) -> str:
     limits = "; ".join(
         f"beyond {limit}: {n} ({100 * n / card.samples:.2g} %)" for limit, n in card.clips.items()
     )
@@ -116,12 +116,12 @@ def _felt(card: Card) -> str:
 
 
 def _amount(value: float, card: Card) -> str:
-    """A load in words, e.g. 39 uN."""
+    """Return a load with its unit, e.g. 39 uN."""
     power = min(max(math.floor(math.log10(value) / 3), -4), 0) if value > 0 else 0
     return f"{value / 1000**power:.3g} {PREFIXES[power]}{card.unit}"
 
 
-def _coverage(card: Card, spec: ArraySpec) -> str:
+def _map_coverage(card: Card, spec: ArraySpec) -> str:
     rows, columns = spec.grid_shape
     cells = {cell: card.coverage[name] for cell, name in zip(spec.grid, spec.elements, strict=True)}
     shown = {cell: f"{100 * share:.0f}" for cell, share in cells.items()}
@@ -129,7 +129,7 @@ def _coverage(card: Card, spec: ArraySpec) -> str:
     return _table(("row", *map(str, range(columns))), lines)
 
 
-def _separability(found: list[Separability]) -> str:
+def _list_accuracies(found: list[Separability]) -> str:
     if not found:
         return "Not checked: there are no training and test sweeps of two categories."
     rows = [

@@ -1,9 +1,9 @@
-"""What is in a sweep set, counted and measured: the numbers of its card.
+"""Counts and measurements of a sweep set: the numbers of its card.
 
-One object is read at a time, so that the set may be larger than the memory. Whether a set can be
-learnt from is checked as published: Chung et al. (2025) decode 2, 3 and 4 classes (cups,
-microwaves, chairs, trains) from the raw loads by support vector machines. Here they are tested on
-objects that they never saw, or they would only have to recognise sweeps of a thing that they know.
+One object is read at a time, so that the set may be larger than the memory. A set's separability
+is checked as published: Chung et al. (2025) decode 2, 3 and 4 classes (cups, microwaves, chairs,
+trains) from the raw loads by support vector machines. Here the machines are tested on objects that
+they never saw, or they would only have to recognise sweeps of known objects.
 """
 
 import math
@@ -26,9 +26,9 @@ TOUCH_N = 1e-6  # a whisker is touched when its load exceeds this, and twice the
 DECADES = (-7, 1)  # of the histogram of forces, N
 BINS_A_DECADE = 5
 PUBLISHED_CLIP = {"N": 1.0, "N m": 1e-2}  # Chung et al. (2025)
-PENALTY = 10.0  # C of the machine
+PENALTY = 10.0  # C of the support vector machine
 PER_CLASS = 120  # sweeps of a class to train on, at most: enough to see that it can be learnt
-# The published classes, each with what comes nearest to it, best first.
+# The published classes, each with the categories nearest to it, best first.
 PUBLISHED = (
     ("cup", "mug"),
     ("microwave", "books", "house", "sofa"),
@@ -36,7 +36,7 @@ PUBLISHED = (
     ("train", "truck", "car", "plane"),
 )
 
-# (sweep, feature) values, (sweep,) names and a penalty -> a machine: other values to their names.
+# Values (sweep, feature), names (sweep,) and a penalty -> a machine that classifies other values.
 Fit = Callable[
     [NDArray[np.float32], NDArray[Any], float], Callable[[NDArray[np.float32]], NDArray[Any]]
 ]
@@ -44,7 +44,7 @@ Fit = Callable[
 
 @dataclass(frozen=True)
 class Features:
-    """What a machine sees of some sweeps."""
+    """Input features of some sweeps, and their categories."""
 
     values: NDArray[np.float32]
     categories: NDArray[np.str_]
@@ -52,10 +52,10 @@ class Features:
 
 @dataclass(frozen=True)
 class Separability:
-    """The accuracy on some classes, on objects that were not trained on.
+    """The accuracy on some classes, for objects that were not trained on.
 
     Attributes:
-        accuracy: The mean over classes of the share of sweeps that are decided rightly, 0 to 1.
+        accuracy: The mean over classes of the share of correctly decided sweeps, 0 to 1.
     """
 
     classes: tuple[str, ...]
@@ -64,12 +64,12 @@ class Separability:
 
 @dataclass
 class Card:
-    """What was counted in a set.
+    """The counts and measurements of a set.
 
     Attributes:
         sweeps, objects: The counts of sweeps and of objects, by split and category.
-        unit: The unit of what counts as load: the force, N, if it is measured, else all channels
-            that have the first one's unit.
+        unit: The unit of the channels that count as load: N if force is measured, else the unit of
+            the first channel.
         load_edges: The (bin + 1,) edges of the histogram of the largest load of every touched
             whisker in every sweep.
         load_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
@@ -100,12 +100,12 @@ class Card:
 
 @dataclass
 class _Findings:
-    """What is gathered from one object after the other."""
+    """Data gathered from one object after the other."""
 
-    # (element,) of every sweep: the largest load; 0 where it is not touched.
+    # (element,) of every sweep: the largest load; 0 for an untouched whisker.
     peaks: list[NDArray[np.float32]] = field(default_factory=list)
     parameters: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
-    # Of the sweeps with a touch, of the splits that a machine is trained and tested on.
+    # Of the sweeps with a touch, in the splits that a machine is trained and tested on.
     features: dict[str, list[NDArray[np.float32]]] = field(
         default_factory=lambda: {"train": [], "test": []}
     )
@@ -114,10 +114,10 @@ class _Findings:
 
 
 def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]]:
-    """Measure a set: the objects that are there.
+    """Measure the existing objects of a set.
 
     Returns:
-        The card, and the load (sample, element) of one sweep of some categories.
+        The card, and the load (sample, element) of a sweep with a touch, by category.
     """
     manifest = SweepManifest.read(folder)
     units = manifest.spec.units
@@ -127,7 +127,7 @@ def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]
     for split, names in manifest.split.items():
         for name in names:
             if has_object(folder, name):
-                _take(card, found, manifest, folder, split, name)
+                _add_object(card, found, manifest, folder, split, name)
     if not found.peaks:
         raise RecordingError(f"{folder} has no sweeps yet: there is nothing to write a card of")
     _summarise(card, found, manifest)
@@ -140,13 +140,13 @@ def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]
     return card, found.examples
 
 
-def _take(
+def _add_object(
     card: Card, found: _Findings, manifest: SweepManifest, folder: Path, split: str, name: str
 ) -> None:
     values, parameters = read_object(folder, name)
     category, units, limits = manifest.category(name), manifest.spec.units, manifest.limits
     own = {unit: float(limits.clip[units.index(unit)]) for unit in dict.fromkeys(units)}
-    loads = _of(units, card.unit)
+    loads = _find_channels(units, card.unit)
     least = TOUCH_N if card.unit == "N" else float(limits.floor[loads].min())
     for counts, n in ((card.objects, 1), (card.sweeps, len(values))):
         counts.setdefault(split, {}).setdefault(category, 0)
@@ -160,7 +160,7 @@ def _take(
     card.samples += values.size
     for label, clips in (("published", PUBLISHED_CLIP), ("networks", own)):
         for unit in dict.fromkeys(u for u in units if u in clips):
-            beyond = np.abs(values[..., _of(units, unit)]) > clips[unit]
+            beyond = np.abs(values[..., _find_channels(units, unit)]) > clips[unit]
             key = f"{clips[unit]:.6g} {unit} ({label})"
             card.clips[key] = card.clips.get(key, 0) + int(beyond.sum())
     for index, sweep in enumerate(values):
@@ -168,7 +168,7 @@ def _take(
             card.not_finite += 1
             continue
         if manifest.lead:
-            sweep = sweep - sweep[: manifest.lead].mean(axis=0)  # a magnet's field is there at rest
+            sweep = sweep - sweep[: manifest.lead].mean(axis=0)  # a magnet has a field at rest
         load = np.linalg.norm(sweep[..., loads], axis=2)  # (sample, element)
         noise = load[: manifest.lead].max(initial=0.0)
         threshold = max(least, float(2 * noise))
@@ -187,14 +187,14 @@ def _take(
             found.categories[split].append(category)
 
 
-def _of(units: tuple[str, ...], unit: str) -> list[int]:
+def _find_channels(units: tuple[str, ...], unit: str) -> list[int]:
     return [i for i, u in enumerate(units) if u == unit]
 
 
 def _summarise(card: Card, found: _Findings, manifest: SweepManifest) -> None:
     for key, drawn in found.parameters.items():
-        all_of_it = np.concatenate(drawn)
-        least, mean, greatest = all_of_it.min(), all_of_it.mean(), all_of_it.max()
+        values = np.concatenate(drawn)
+        least, mean, greatest = values.min(), values.mean(), values.max()
         card.parameters[key] = (float(least), float(mean), float(greatest))
     peaks = np.stack(found.peaks)  # (sweep, element), 0 where untouched
     touched = peaks > 0
@@ -214,7 +214,7 @@ def _summarise(card: Card, found: _Findings, manifest: SweepManifest) -> None:
 def window_features(
     values: NDArray[np.float32], start: int, period_ms: float, limits: ChannelLimits
 ) -> NDArray[np.float32]:
-    """(22 * element * channel,) what a machine sees of one sweep.
+    """Return the input features (22 * element * channel,) of one sweep.
 
     Args:
         values: (sample, element, channel) SI.
@@ -230,7 +230,7 @@ def window_features(
 
 
 def check_separability(train: Features, test: Features, fit: Fit) -> list[Separability]:
-    """Measure the accuracy on 2, 3 and 4 classes, the nearest to the published.
+    """Measure the accuracy on the 2, 3 and 4 classes nearest to the published ones.
 
     Args:
         train, test: sweeps of different objects.
@@ -243,7 +243,7 @@ def check_separability(train: Features, test: Features, fit: Fit) -> list[Separa
 
 
 def _accuracy(train: Features, test: Features, classes: tuple[str, ...], fit: Fit) -> float:
-    """Mean over classes of the share of test sweeps that are decided rightly."""
+    """Return the mean over classes of the share of correctly decided test sweeps."""
     chosen = np.concatenate([np.flatnonzero(train.categories == c)[:PER_CLASS] for c in classes])
     predict = fit(train.values[chosen], train.categories[chosen], PENALTY)
     right = [(predict(test.values[test.categories == c]) == c).mean() for c in classes]

@@ -1,8 +1,8 @@
 """Making a sweep set: many objects, each swept past the array several times with drawn parameters.
 
-Every sweep depends on its recipe, object and index alone, so a set does not depend on who makes
-it, in which order, or how often that was interrupted. An object is one task, and becomes a file
-when all of its sweeps are there.
+Every sweep depends on its recipe, object and index alone, so a set does not depend on the machine,
+the order or any interruptions. An object is one task, and becomes a file when all of its sweeps are
+done.
 """
 
 import hashlib
@@ -40,11 +40,11 @@ from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, engine_version, stamp_samples
 
-# Of a sweep's parameters; the others are numbers.
+# Types of a sweep's parameters; the others are floats.
 KINDS: dict[str, type] = {"draw": np.int64, "touches": np.bool_, "unstable": np.bool_}
-# streams of random numbers beside that of the sweep's parameters
+# streams of random numbers; that of the sweep's parameters is 0
 RANDOMISATION, SENSOR, SHARED = 1, 2, 3
-LOOKS = 3  # for contacts in each stored sample's period
+LOOKS = 3  # checks for contacts in each stored sample's period
 SPARE = 2  # stored samples simulated beyond the last, which the resampler's kernel needs
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 
@@ -52,21 +52,21 @@ Floats = NDArray[np.float32]
 
 
 def describe_set(recipe: SweepRecipe) -> SweepManifest:
-    """The set that a recipe makes.
+    """Return the manifest of the set that a recipe makes.
 
     Raises:
-        ConfigError: objects or array are not there, or cannot be split as the recipe says.
+        ConfigError: objects or array do not exist, or cannot be split as the recipe says.
     """
     objects, animals = choose_objects(recipe.objects), load_animals(recipe.array)
     heads = [(animal.whiskers, animal.mount) for animal in animals]
     morphology = repr(heads if len(heads) > 1 else heads[0])
-    # Said in full: a later release may know more categories.
+    # Listed in full: a later release may know more categories.
     withheld, outliers = objects.withheld, recipe.objects.outliers
     chosen = msgspec.structs.replace(
         recipe.objects, categories=objects.categories, withheld=withheld
     )
-    of_meshes = () if recipe.objects.generated else ("manifold3d",)
-    packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
+    cutter = () if recipe.objects.generated else ("manifold3d",)
+    packages = ("mujoco", "numpy", "scipy", "trimesh", *cutter)
     manifest = SweepManifest(
         spec=device_spec(animals),
         sensor=sensor_of(animals),
@@ -97,22 +97,22 @@ def make_sweeps(
     engine: str = "processes",
     address: str | None = None,
 ) -> Generator[str, None, None]:
-    """Make a sweep set, or what is missing of it; yields each object's name as it is finished.
+    """Make what is missing of a sweep set; yield each object's name when finished.
 
     Args:
-        folder: where; on a cluster, a file system that all of its machines share.
-        processes: how many at a time; None: one per core.
+        folder: the set's; on a cluster, on a file system that all of its machines share.
+        processes: number of processes or tasks at a time; None: one per core.
         engine: "processes" of this machine, or "ray".
 
     Raises:
-        ConfigError: no such split or engine, or the folder holds another set, or sweeps of who
-            knows which.
+        ConfigError: no such split or engine, or the folder holds another set, or sweeps of an
+            unknown one.
         TactileError: an object kills every process that tries to make it.
     """
     if engine not in ENGINES:
         raise ConfigError(no_such("engine", engine, ENGINES))
     manifest = describe_set(recipe)
-    names = manifest.names(splits)  # which refuses unknown ones before anything is written
+    names = manifest.names(splits)  # refuses unknown splits before anything is written
     _refuse_strays(folder, manifest)
     manifest.write(folder)
     remove_leftovers(folder)
@@ -130,7 +130,7 @@ def make_sweeps(
         outcomes = run_processes(work, todo, processes or os.cpu_count() or 1)
     for name, failure in outcomes:
         if failure is not None:
-            if recipe.objects.generated:  # there are no broken ones among them
+            if recipe.objects.generated:  # none of these is broken
                 raise TactileError(f"{name} cannot be made: {failure}")
             skipped[name] = failure
             write_skipped(folder, skipped)
@@ -139,7 +139,7 @@ def make_sweeps(
 
 
 def _spread(manifest: SweepManifest, missing: set[str]) -> list[str]:
-    """Order objects so that sides grow alike, the test twice as fast."""
+    """Order objects so that all splits grow evenly, the test split twice as fast."""
     alike: dict[tuple[str, str], list[str]] = {}
     for side, names in manifest.split.items():
         for name in names:
@@ -153,13 +153,13 @@ def _spread(manifest: SweepManifest, missing: set[str]) -> list[str]:
 
 
 def finished_objects(folder: Path, names: Sequence[str]) -> list[str]:
-    """Which of these objects need no more work: they are there, or cannot be made."""
+    """Return the objects that need no more work: they exist, or cannot be made."""
     skipped = read_skipped(folder) if folder.is_dir() else {}
     return [n for n in names if n in skipped or has_object(folder, n)]
 
 
 def _refuse_strays(folder: Path, manifest: SweepManifest) -> None:
-    """Without its manifest a folder's sweeps may be another set's: take them for no one's."""
+    """Refuse sweeps without their manifest, which may belong to another set."""
     if (folder / MANIFEST).exists() or not any(has_object(folder, n) for n in manifest.names()):
         return
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
@@ -185,7 +185,7 @@ class SweepRecord:
 
 @dataclass(frozen=True)
 class _Work:
-    """Makes all sweeps of the object that it is called with; why it cannot, if so."""
+    """A callable that makes all sweeps of an object, or returns why it cannot."""
 
     recipe: SweepRecipe
     folder: Path
@@ -195,7 +195,7 @@ class _Work:
             raise ConfigError(
                 f"{self.folder} is not there on every machine: a cluster needs a shared file system"
             )
-        if has_object(self.folder, name):  # as another run may have made it meanwhile
+        if has_object(self.folder, name):  # another run may have made it meanwhile
             return None
         try:
             target = self._objects.load(name)
@@ -209,12 +209,12 @@ class _Work:
 
     @property
     def _objects(self) -> ShapeObjects | MeshObjects:
-        return _objects_once(msgspec.json.encode(self.recipe.objects))
+        return _choose_objects_once(msgspec.json.encode(self.recipe.objects))
 
 
 @lru_cache(maxsize=1)
-def _objects_once(choice: bytes) -> ShapeObjects | MeshObjects:
-    """Choose objects, once in a process, as Ray hands each task its own work."""
+def _choose_objects_once(choice: bytes) -> ShapeObjects | MeshObjects:
+    """Choose objects once per process, since Ray hands each task its own work."""
     return choose_objects(msgspec.json.decode(choice, type=ObjectChoice))
 
 
@@ -230,7 +230,7 @@ def _write(folder: Path, name: str, records: Sequence[SweepRecord], target: Tact
 
 
 def fingerprint(target: TactileObject) -> str:
-    """A hash of an object's convex pieces: what was swept, whatever it was made from."""
+    """Return a hash of an object's convex pieces, whatever they were made from."""
     digest = hashlib.sha256()
     for piece in target.pieces:
         digest.update(np.asarray(piece.vertices, dtype="<f8").tobytes())
@@ -239,25 +239,25 @@ def fingerprint(target: TactileObject) -> str:
 
 
 def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> SweepRecord:
-    """Make one sweep of a set, by itself.
+    """Simulate one sweep of a set.
 
     A drawn sweep that misses the array, that too few whiskers reach or that turns unstable is drawn
-    again, up to 20 times; one of the combinations of given values stays.
+    again, up to 20 times; a sweep of a combination of given values is not.
 
     Returns:
-        (sample, element, channel) values, SI, and the parameters of `sweep.Sweep` with `draw`, the
-        sweep's number among those of its combination, `touches`, 0 when it misses the array,
-        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then,
-        `saturated`, the share of the readings that the sensor clips, and `wedged`, how many
-        whiskers had no room, see `SweepSimulation`. With contacts if the recipe asks for them: they
-        are the truth, whatever the sensors make of it.
+        Values (sample, element, channel), SI, and the parameters of `sweep.Sweep` with `draw`, the
+        sweep's number among those of its combination, `touches`, 0 if it misses the array,
+        `unstable`, 1 if it could not be simulated at this profile (its values are 0 then),
+        `saturated`, the share of the readings that the sensor clips, and `wedged`, the number of
+        whiskers that had no room, see `SweepSimulation`. Contacts, if the recipe asks for them, are
+        the true ones, whatever the sensors read.
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
     ideal = load_animals(recipe.array)
     elements = sum(len(animal.whiskers) for animal in ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    # A sweep that misses the array stays where all combinations are to be there.
+    # A sweep that misses the array is kept where a set needs every combination.
     most = DRAWS if recipe.sweeps.combinations() == [{}] else 1
     for tries in range(most):
         shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)
@@ -266,11 +266,11 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         last = tries == most - 1
         if simulation.reached < recipe.sweeps.least_whiskers and not last:
             continue
-        made = _simulated(recipe, simulation) if simulation.touches else None
+        made = _simulate(recipe, simulation) if simulation.touches else None
         if made is not None:
             break
     loads, felt = made or (np.zeros((0, elements, len(LOADS))),) * 2
-    values, saturated = _sensed(recipe, target, index, loads)
+    values, saturated = _apply_sensor(recipe, target, index, loads)
     parameters = {
         **asdict(sweep),
         "draw": recipe.sweeps.draw_index(index),
@@ -279,24 +279,24 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         "saturated": saturated,
         "wedged": float(len(simulation.wedged)),
     }
-    # Through the loads' own resampler, so that a contact is of the same time as what it causes.
+    # Through the same resampler as the loads, so that contacts and their loads are simultaneous.
     contacts = None
     if recipe.contacts:
         felt = felt[..., : len(CONTACT_CHANNELS)]
-        contacts = contact_distances(_resampled(recipe, _chunk(recipe, felt), FASTEST_HZ))
+        contacts = contact_distances(_resample(recipe, _make_chunk(recipe, felt), FASTEST_HZ))
     return SweepRecord(values, parameters, contacts)
 
 
-def _simulated(
+def _simulate(
     recipe: SweepRecipe, simulation: SweepSimulation
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Simulate a sweep at the simulator's own rate; None: it went unstable.
+    """Simulate a sweep at the simulator's own rate; return None if it is unstable.
 
     Returns:
-        (sample, element, load) `sensor_spec.LOADS`, and contacts; of these, nothing unless the
+        (sample, element, load) `sensor_spec.LOADS`, and contacts, which are empty unless the
         recipe asks for them.
     """
-    lead, total = _lengths(recipe)
+    lead, total = _count_samples(recipe)
     try:
         if recipe.contacts:
             every = max(1, int(recipe.period_ms / LOOKS / SAMPLE_MS))
@@ -309,53 +309,53 @@ def _simulated(
     return np.concatenate([loads, simulation.turns()], axis=2), contacts
 
 
-def _sensed(
+def _apply_sensor(
     recipe: SweepRecipe, target: TactileObject, index: int, loads: NDArray[np.float64]
 ) -> tuple[Floats, float]:
     """Return readings (sample, element, channel), and the share of them that the sensor clips.
 
-    Noise, offset and drift that the array's description tells of are left to training, which draws
-    them afresh each time that it takes a sweep.
+    Noise, offset and drift of the array's description are left to training, which draws them anew
+    each time that it uses a sweep.
     """
-    # The description stays the ideal arrays': a robot does not know by how much its own differs.
+    # The description stays that of the ideal arrays: a robot does not know how its own differs.
     ideal = load_animals(recipe.array)
     spec, described = device_spec(ideal), sensor_of(ideal)
     if described is None:
-        chunk: Chunk | None = _chunk(recipe, loads[..., : len(spec.channels)])
+        chunk: Chunk | None = _make_chunk(recipe, loads[..., : len(spec.channels)])
     else:
-        chunk = Transducer(described, spec.elements).push(_chunk(recipe, loads))
-    assert chunk is not None  # of a lead and a sweep there is always a sample
+        chunk = Transducer(described, spec.elements).push(_make_chunk(recipe, loads))
+    assert chunk is not None  # a lead and a sweep give at least one sample
     clipped = 0.0
     if described is not None or recipe.sensor != SensorModel():
         key = recipe.key(target.name, index, SENSOR)
         sensor = Sensor(recipe.sensor, spec, key, described, drawn=False)
         chunk = sensor.push(chunk) or chunk
         clipped = sensor.saturated / chunk.values.size
-    return _resampled(recipe, chunk, spec.rate_hz), clipped
+    return _resample(recipe, chunk, spec.rate_hz), clipped
 
 
-def _lengths(recipe: SweepRecipe) -> tuple[int, int]:
-    """Samples of the lead, and of lead and sweep, at the simulator's own rate."""
+def _count_samples(recipe: SweepRecipe) -> tuple[int, int]:
+    """Return the samples of the lead, and of lead and sweep, at the simulator's rate."""
     per_output = recipe.period_ms / SAMPLE_MS
     # One more, for the first output's kernel: it is centred one period after the first input.
     return round((recipe.lead + 1) * per_output), round((recipe.samples + SPARE) * per_output)
 
 
-def _chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
-    """Loads (sample, element, channel) after a lead at rest, and rest after them if they end early.
+def _make_chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
+    """Make a chunk of a lead at rest, then loads (sample, element, channel), then rest.
 
-    At rest the whiskers carry no load at all, so it needs no simulation.
+    At rest the whiskers carry no load at all, so rest needs no simulation.
     """
-    lead, total = _lengths(recipe)
+    lead, total = _count_samples(recipe)
     values = np.zeros((total, *loads.shape[1:]), dtype=np.float32)
     values[lead : lead + len(loads)] = loads
     return stamp_samples(values)
 
 
-def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> Floats:
-    """(sample, element, channel): what the live stream's own resampler makes of it.
+def _resample(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> Floats:
+    """Resample a chunk to (sample, element, channel), as the live stream is.
 
-    Or, where the recipe says so, the last sample by the time of each output.
+    With `every_nth` in the recipe, take the last sample by the time of each output instead.
     """
     if recipe.every_nth:
         due_ns = chunk.t_ns[0] + recipe.period_ns * np.arange(1, recipe.samples + 1)

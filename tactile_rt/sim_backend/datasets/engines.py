@@ -1,7 +1,7 @@
-"""Who does the work: processes of this machine, or a Ray cluster.
+"""Engines that work through a list of names: processes of this machine, or a Ray cluster.
 
-Work is a function of an object's name that writes its result to a file and can be repeated: what
-it had finished when it was killed is not done again.
+Work is a function of an object's name that writes its result to a file and can be repeated: after
+a kill, finished work is not done again.
 """
 
 import multiprocessing
@@ -25,18 +25,18 @@ PATIENCE_S = 10
 TRIES = 3  # of an object whose process died
 DIED = f"the process that made it died {TRIES} times (out of memory?)"
 
-Work = Callable[[str], str | None]  # a name -> why it cannot be done, or None when it is
-Outcome = tuple[str, str | None]  # the name, and the same
+Work = Callable[[str], str | None]  # a name -> the reason of a failure, or None on success
+Outcome = tuple[str, str | None]  # the name, and the work's answer
 
 
 def run_processes(work: Work, names: Sequence[str], processes: int) -> Iterator[Outcome]:
-    """Work through the names with so many processes; yields each as it is finished.
+    """Work through the names in parallel processes; yield each when it is finished.
 
     An exception in the work ends the run and is raised here. A process that dies is replaced,
     and its name tried again; closing the iterator kills the processes.
 
     Args:
-        work: can be pickled.
+        work: must be picklable.
         processes: at least 1.
     """
     waiting = deque((name, 1) for name in names)
@@ -48,7 +48,7 @@ def run_processes(work: Work, names: Sequence[str], processes: int) -> Iterator[
                 connection, process = idle.pop() if idle else _start(work)
                 name, tries = waiting.popleft()
                 busy[connection] = (process, name, tries)
-                with suppress(OSError):  # it died while it waited: told by the read below
+                with suppress(OSError):  # it died while idle: the read below notices
                     connection.send(name)
             for ready in wait(list(busy)):
                 assert isinstance(ready, Connection)
@@ -80,9 +80,9 @@ def _start(work: Work) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(work, theirs), daemon=True)
-    # Starting the tracker would let in again what is held back.
+    # First, since a start of the tracker unblocks the signals that are blocked below.
     resource_tracker.ensure_running()
-    # Ctrl-C is this process's to handle: the others hear it not even while they begin.
+    # Only this process handles Ctrl-C: the others must not receive it, even while they start.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         with _one_thread():
@@ -95,7 +95,7 @@ def _start(work: Work) -> tuple[Connection, SpawnProcess]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Processes started here use one thread each: there is one for every core already."""
+    """Limit processes started here to one thread each: every core has a process."""
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
@@ -131,19 +131,19 @@ def _die_with_parent() -> None:
 def run_ray(
     work: Work, names: Sequence[str], processes: int | None = None, address: str | None = None
 ) -> Iterator[Outcome]:
-    """Work through the names on a Ray cluster; yields each as it is finished.
+    """Work through the names on a Ray cluster; yield each when it is finished.
 
     A task whose worker or node is lost is tried again elsewhere.
 
     Args:
-        work: can be pickled; runs on any node, so that files it writes must be on a file system
-            that all of them share.
+        work: must be picklable; runs on any node, so the files that it writes must be on a file
+            system that all nodes share.
         processes: tasks at a time; None for one per CPU of the cluster.
         address: of the cluster; None for the one that RAY_ADDRESS names or that runs on this
             machine, or else a new one of this machine alone.
 
     Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
+        ConfigError: Ray is not installed, or no cluster answers at the address.
     """
     with require_extra("this needs", "cluster"):
         import ray

@@ -1,6 +1,6 @@
-"""What there is of a sweep set: its sweeps counted, its files held against their checksums.
+"""Inventory of a sweep set: counts of its sweeps, and checksums of its files.
 
-Neither reads the loads. The checksums are written as the program sha256sum writes them.
+The loads are not decoded. The checksums have the file format of the program sha256sum.
 """
 
 import hashlib
@@ -16,12 +16,12 @@ from tactile_rt.sets.objects import read_arrays, read_skipped
 
 SUMS = "SHA256SUMS"
 COUNTED = ("touches", "unstable", "wedged", "saturated")  # of each sweep
-STALE_S = 60  # no file of a set takes as long to write
+STALE_S = 60  # no file of a set takes this long to write
 
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of a set."""
+    """Counts of a set's sweeps and of its skipped objects."""
 
     sweeps: int = 0
     misses: int = 0
@@ -32,14 +32,14 @@ class Tally:
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Shares of sweeps: that touch a whisker, and with a reading beyond the sensor's range."""
+        """Share of sweeps that touch a whisker, and share that exceed the sensor's range."""
         sweeps = max(1, self.sweeps)
         return (self.sweeps - self.misses) / sweeps, self.saturated / sweeps
 
     @property
     def shortcomings(self) -> str:
-        """What is to be told beside the number of sweeps; nothing if all is well."""
-        told = {
+        """Problems to report beside the number of sweeps; empty if all is well."""
+        problems = {
             f"{self.misses} miss the array (larger `size_mm`, less `distance_mm`, other "
             "`height_mm`)": self.misses,
             f"{self.saturated} exceed the sensor's `range` (more `distance_mm`)": self.saturated,
@@ -47,23 +47,23 @@ class Tally:
             f"{self.wedged} leave no room for a whisker (more `distance_mm`)": self.wedged,
             f"{self.skipped} objects are left out ({SKIPPED} says why)": self.skipped,
         }
-        return ", ".join(text for text, count in told.items() if count)
+        return ", ".join(text for text, count in problems.items() if count)
 
 
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
-    """Count what there is of these objects."""
-    there = [name for name in names if has_object(folder, name)]
+    """Count the sweeps of those objects that a folder has, `sweeps` each."""
+    existing = [name for name in names if has_object(folder, name)]
     counts = dict.fromkeys(COUNTED, 0)
-    for name in there:
+    for name in existing:
         for key, each in read_arrays(object_path(folder, name), *COUNTED).items():
             counts[key] += int((~each if key == "touches" else each > 0).sum())
     misses, unstable, wedged, saturated = counts.values()
     skipped = len(read_skipped(folder))
-    return Tally(len(there) * sweeps, misses, unstable, wedged, saturated, skipped)
+    return Tally(len(existing) * sweeps, misses, unstable, wedged, saturated, skipped)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what killed processes left half-written: hidden files that no one is filling."""
+    """Delete stale hidden files, which killed processes left half-written."""
     names = (MANIFEST, SKIPPED, SUMS, "*.npz")
     for path in (path for name in names for path in folder.glob(f".{name}.*")):
         if time.time() - path.stat().st_mtime > STALE_S:
@@ -71,10 +71,10 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def write_sums(folder: Path) -> None:
-    """Write SHA256SUMS of the set's files; sums that are there already stay.
+    """Write SHA256SUMS of the set's files; sums that exist already stay.
 
-    A file that has rotted since is thereby never declared sound; one that was made anew has the
-    same content, because sweeps depend on nothing but their recipe.
+    So a file that was damaged since never counts as intact; one that was made anew has the same
+    content, because sweeps depend only on their recipe.
     """
     known = _read_sums(folder) if (folder / SUMS).exists() else {}
     names = [MANIFEST, *([SKIPPED] if (folder / SKIPPED).exists() else [])]
@@ -86,7 +86,7 @@ def write_sums(folder: Path) -> None:
 
 
 def written_sum(folder: Path, name: str) -> str | None:
-    """The checksum that a file of a finished set had; None if there is none."""
+    """Return the recorded checksum of a finished set's file; None without one."""
     return _read_sums(folder).get(name) if (folder / SUMS).exists() else None
 
 
@@ -94,11 +94,10 @@ def check_sums(folder: Path) -> int:
     """Compare every file with SHA256SUMS.
 
     Returns:
-        How many files are as they were written.
+        The number of files, all of which are intact.
 
     Raises:
-        RecordingError: there are no sums yet, or a file is missing or another than it was: all
-            such files are named.
+        RecordingError: no sums exist yet, or files are missing or changed: the error names them.
     """
     sums = _read_sums(folder)
     bad = [n for n, s in sums.items() if not (folder / n).exists() or _sha256(folder / n) != s]

@@ -1,4 +1,4 @@
-"""Recipes from files: a user's own in TOML, those that ship, and those that a set was made by."""
+"""Recipes from files: a user's own in TOML, shipped ones, and those stored with a set."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,48 +23,48 @@ DEFAULT_RECIPE = "wide24"
 
 
 def shipped_recipes() -> tuple[str, ...]:
-    """Names of the recipes that ship with the package."""
+    """Return the names of the recipes that ship with the package."""
     folder = resources.files(__package__) / "recipes"
     return tuple(sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".toml")))
 
 
 def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ()) -> SweepRecipe:
-    """The recipe of this name that ships with the package, or the one in a TOML file.
+    """Read a shipped recipe by its name, or the recipe in a TOML file.
 
     Args:
-        folder: where folders and files in it are found from; None: the working directory, as they
-            are on a command line.
-        sets: ``key=value`` each, of which ``objects.test=3`` is one of a table.
+        folder: the base of relative paths in a TOML file; None: the working directory, as on a
+            command line.
+        sets: settings ``key=value``; ``objects.test=3`` sets a key of a table.
     """
     if Path(name).suffix == ".toml":
-        return _recipe(settings.set_keys(settings.read_toml(Path(name)), sets, SweepRecipe), folder)
+        return _parse(settings.set_keys(settings.read_toml(Path(name)), sets, SweepRecipe), folder)
     if name not in shipped_recipes():
         known = settings.no_such("recipe", name, shipped_recipes())
         raise ConfigError(f"{known} (or give a file that ends in .toml)")
     shipped = resources.files(__package__) / "recipes" / f"{name}.toml"
     nodes = settings.parse_toml(shipped.read_text(encoding="utf-8"), name)
-    return _recipe(settings.set_keys(nodes, sets, SweepRecipe))
+    return _parse(settings.set_keys(nodes, sets, SweepRecipe))
 
 
 def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepRecipe:
-    """The recipe that a set's manifest or a model's card holds.
+    """Return the recipe that is stored in a set's manifest or a model's card.
 
     Raises:
-        ConfigError: it is not one that this release knows.
+        ConfigError: this release does not understand the recipe.
     """
     nodes = settings.make_node(recipe, "the set's recipe", 0, Path())
-    return _recipe(settings.set_keys(nodes, sets, SweepRecipe))
+    return _parse(settings.set_keys(nodes, sets, SweepRecipe))
 
 
-def _recipe(nodes: settings.SettingNode, folder: Path | None = None) -> SweepRecipe:
+def _parse(nodes: settings.SettingNode, folder: Path | None = None) -> SweepRecipe:
     _add_usual_values(nodes, folder)
     recipe: SweepRecipe = settings.convert(nodes, SweepRecipe)
     objects = recipe.objects
     if Path(recipe.array).suffix:
-        recipe = replace(recipe, array=_absolute(recipe.array, folder))
+        recipe = replace(recipe, array=_make_absolute(recipe.array, folder))
     if objects.generated:
         return recipe
-    source = _absolute(objects.source, folder)
+    source = _make_absolute(objects.source, folder)
     slip = get_close_matches(objects.source, GENERATED, 1, 0.8)
     if slip and not Path(source).exists():
         why = f"no such folder {objects.source!r}; did you mean {slip[0]}?"
@@ -76,34 +76,34 @@ def _add_usual_values(nodes: settings.SettingNode, folder: Path | None) -> None:
     """Add the distance, period and lengths that follow from a recipe's array."""
     written = nodes.plain()
     array, period_ms = written.get("array", SweepRecipe.array), SweepRecipe.period_ms
-    sweeps = nodes.value.setdefault("sweeps", _node(nodes, {})).value
-    with suppress(ConfigError, TypeError):  # of an array that is not there: told when it is needed
-        animals = load_animals(_absolute(array, folder) if Path(array).suffix else array)
+    sweeps = nodes.value.setdefault("sweeps", _make_node(nodes, {})).value
+    with suppress(ConfigError, TypeError):  # a missing array is reported when it is needed
+        animals = load_animals(_make_absolute(array, folder) if Path(array).suffix else array)
         period_ms = max(period_ms, 1e3 / device_spec(animals).rate_hz)
         if isinstance(sweeps, dict):
-            sweeps.setdefault("distance_mm", _node(nodes, usual_distance(animals)))
+            sweeps.setdefault("distance_mm", _make_node(nodes, usual_distance(animals)))
     period_ms = written.get("period_ms", period_ms)
     usual = {"period_ms": period_ms}
     if isinstance(period_ms, int | float) and period_ms >= SAMPLE_MS:
-        usual["lead_ms"], usual["length_ms"] = _usual_lengths(period_ms)
+        usual["lead_ms"], usual["length_ms"] = _find_usual_lengths(period_ms)
     for name, value in usual.items():
-        nodes.value.setdefault(name, _node(nodes, value))
+        nodes.value.setdefault(name, _make_node(nodes, value))
 
 
-def _node(nodes: settings.SettingNode, value: Any) -> settings.SettingNode:
+def _make_node(nodes: settings.SettingNode, value: Any) -> settings.SettingNode:
     return settings.make_node(value, nodes.file, nodes.line, nodes.folder)
 
 
-def _usual_lengths(period_ms: float) -> tuple[float, float]:
-    """Lead and length of a sweep of that sample time, ms, enough for baseline and window."""
-    # A baseline takes so many samples, however long they last; a window so many steps, and spare.
+def _find_usual_lengths(period_ms: float) -> tuple[float, float]:
+    """Return lead and length (ms) of a sweep, enough for baseline and window."""
+    # A baseline takes a fixed number of samples; a window a fixed number of steps, and spare.
     lead_ms = max(SweepRecipe.lead_ms, SweepRecipe.lead_ms / SweepRecipe.period_ms * period_ms)
     after_ms = SweepRecipe.length_ms - SweepRecipe.lead_ms
     step_ms = Timing.of(round(period_ms * 1e6)).substeps * period_ms
     return lead_ms, lead_ms + after_ms * max(1.0, step_ms / STEP_MS)
 
 
-def _absolute(path: str, folder: Path | None) -> str:
+def _make_absolute(path: str, folder: Path | None) -> str:
     """Make a path absolute: parts of a set may be made from other folders."""
     try:
         return str(((folder or Path()) / Path(path).expanduser()).absolute())

@@ -1,4 +1,4 @@
-"""The objects of a recipe: their names, their split, and each by its name."""
+"""The objects of a recipe: their names, their split, and their loading by name."""
 
 import zlib
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ class ShapeObjects:
     """
 
     choice: ObjectChoice
-    # a category is of one kind, all can be made, and none is a mesh: see `MeshObjects`
+    # each category has one kind, all objects can be made, and none is a mesh: see `MeshObjects`
     kind_of: ClassVar[dict[str, str]] = {}
     skipped: ClassVar[dict[str, str]] = {}
     mesh_options: ClassVar[dict[str, Any]] = {}
@@ -40,7 +40,7 @@ class ShapeObjects:
     def categories(self) -> tuple[str, ...]:
         """Names of the classes, in the order of their labels."""
         known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.added_categories())
-        _check(self.choice.categories, known)
+        _check_categories(self.choice.categories, known)
         unknown = (*self.choice.withheld, *self.choice.outliers)
         return self.choice.categories or tuple(c for c in shapes.CATEGORIES if c not in unknown)
 
@@ -49,7 +49,7 @@ class ShapeObjects:
         """Names of the categories that training never sees."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
         known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.OUTLIERS)
-        _check(unknown, (*known, *shapes.added_categories()))
+        _check_categories(unknown, (*known, *shapes.added_categories()))
         return self.choice.withheld or (shapes.WITHHELD if self.choice.per_withheld else ())
 
     @cached_property
@@ -75,33 +75,32 @@ class ShapeObjects:
 
     @property
     def _prefix(self) -> str:
-        """What the names of all objects begin with."""
+        """Prefix of all object names."""
         return VARIED if self.choice.source == VARIED_SHAPES else ""
 
     @property
     def category_of(self) -> dict[str, str]:
-        """Category of every object whose name does not tell it."""
+        """Category of every object whose name does not give it."""
         if not self._prefix:
             return {}
         names = chain.from_iterable(self.split.values())
         return {name: name[len(self._prefix) : name.rindex("-")] for name in names}
 
     def load(self, name: str) -> TactileObject:
-        """An object by its name."""
+        """Load an object by its name."""
         return load_object(name)
 
     def target(self, name: str) -> str:
-        """What a ``sim:`` URL calls an object: its name."""
+        """Return the object's name, as a ``sim:`` URL names it."""
         return name
 
 
 @dataclass(frozen=True)
 class MeshObjects:
-    """Objects out of a folder of meshes, see `object_sets`.
+    """Objects from a folder of meshes, see `object_sets`.
 
-    Which of them are held out depends on their names alone, so that a folder that grows moves few
-    from one side to the other. Those that the folder says are of one shape stay together, and count
-    as one.
+    The split depends on their names alone, so that a folder that grows moves few of them from one
+    side to the other. Objects of one shape in the folder's table stay together, and count as one.
 
     Raises:
         ConfigError: no such folder, a category is not in it, or has too few objects for the split.
@@ -111,14 +110,14 @@ class MeshObjects:
 
     @cached_property
     def _set(self) -> "ObjectSet":
-        # Here: what cuts meshes is slow to import.
+        # Imported here, since it cuts meshes and is slow to import.
         from tactile_rt.sim_backend.objects.object_sets import open_objects
 
         return open_objects(Path(self.choice.source), self.choice.mesh)
 
     @cached_property
     def _names(self) -> dict[str, str]:
-        """The folder's name of every object, by a name that a file can have."""
+        """Name of every object in its folder, by a valid file name."""
         names = {name.replace("/", "-"): name for name in self._set.names}
         if len(names) < len(self._set.names):
             raise ConfigError(f"{self.choice.source}: two objects differ by / and - alone")
@@ -126,15 +125,15 @@ class MeshObjects:
 
     @cached_property
     def _by_category(self) -> dict[str, list[list[str]]]:
-        """The objects of each category, those of one shape together."""
-        origins, left, only = self._set.origins, self.choice.without_source, self.choice.only_source
+        """Objects of each category, those of one shape together."""
+        origins, omit, only = self._set.origins, self.choice.without_source, self.choice.only_source
         sources = {name: origin.source for name, origin in origins.items()}
-        for source in filter(None, (left, only)):
+        for source in filter(None, (omit, only)):
             if source not in sources.values():
                 raise ConfigError(no_such("source", source, sorted(set(sources.values()))))
         alike: dict[str, dict[str, list[str]]] = {}
         for name, own in sorted(self._names.items()):
-            if not left or sources.get(own) != left:
+            if not omit or sources.get(own) != omit:
                 shapes = alike.setdefault(self._set.categories[own], {})
                 shape = origins[own].shape if own in origins else ""
                 shapes.setdefault(shape or own, []).append(name)
@@ -143,7 +142,7 @@ class MeshObjects:
             groups = list(shapes.values())
             if only:
                 groups = [g for g in groups if {sources.get(self._names[n]) for n in g} == {only}]
-            if groups:  # in a mixed order that is the same on every machine
+            if groups:  # in a shuffled order that is the same on every machine
                 found[category] = sorted(groups, key=lambda g: (zlib.crc32(g[0].encode()), g))
         return found
 
@@ -151,7 +150,7 @@ class MeshObjects:
     def categories(self) -> tuple[str, ...]:
         """Names of the classes, in the order of their labels."""
         known = tuple(sorted(self._by_category))
-        _check(self.choice.categories, known)
+        _check_categories(self.choice.categories, known)
         unknown = (*self.withheld, *self.choice.outliers)
         return self.choice.categories or tuple(c for c in known if c not in unknown)
 
@@ -159,7 +158,7 @@ class MeshObjects:
     def withheld(self) -> tuple[str, ...]:
         """Names of the categories that training never sees."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
-        _check(unknown, tuple(sorted(self._by_category)))
+        _check_categories(unknown, tuple(sorted(self._by_category)))
         return self.choice.withheld
 
     @cached_property
@@ -200,41 +199,41 @@ class MeshObjects:
 
     @property
     def kind_of(self) -> dict[str, str]:
-        """Kind of every object of which the folder says it."""
+        """Kind of every object for which the folder's table has one."""
         names, origins = chain.from_iterable(self.split.values()), self._set.origins
         known = {name: origins[own].kind for name in names if (own := self._names[name]) in origins}
         return {name: kind for name, kind in known.items() if kind}
 
     @property
     def skipped(self) -> dict[str, str]:
-        """What of the folder cannot be used, and why, as far as a look at it tells."""
+        """Reasons why objects cannot be used, by name, as found so far."""
         return dict(self._set.skipped)
 
     def load(self, name: str) -> TactileObject:
-        """An object by its name."""
+        """Load an object by its name."""
         return self._set.load(self._names[name])
 
     def target(self, name: str) -> str:
-        """What a ``sim:`` URL calls an object: its mesh file."""
+        """Return the path of the object's mesh file, for a ``sim:`` URL."""
         return str(self._set.path(self._names[name]))
 
     @property
     def mesh_options(self) -> dict[str, Any]:
-        """What a ``sim:`` URL says of mesh files, for them to be the same objects."""
+        """Options of a ``sim:`` URL that turn mesh files into the same objects."""
         return self._set.detail.differing()
 
 
 def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
-    """What a recipe's choice of objects comes to."""
+    """Return the objects that a recipe chooses."""
     return ShapeObjects(choice) if choice.generated else MeshObjects(choice)
 
 
-def _count(wanted: float, of: int) -> int:
-    """So many, or such a fraction: at least one, if any."""
-    return max(1, round(wanted * of)) if 0 < wanted < 1 else int(wanted)
+def _count(number: float, total: int) -> int:
+    """Return `number`, or below 1 that fraction of `total`, at least one."""
+    return max(1, round(number * total)) if 0 < number < 1 else int(number)
 
 
-def _check(names: Sequence[str], known: Sequence[str]) -> None:
+def _check_categories(names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             raise ConfigError(no_such("category", name, known))

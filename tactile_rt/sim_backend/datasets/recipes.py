@@ -1,29 +1,29 @@
-"""What a sweep set is: its objects and their split, and how each is swept past the array.
+"""Recipes of sweep sets: the objects, their split, and how each is swept past the array.
 
-`recipe_files` reads them, by name or from TOML:
+`recipe_files` reads recipes, by name or from TOML:
 
     name = "mine"
     array = "mouse"
     profile = "realtime"
     seed = 0
     period_ms = 9             # of the stored samples; 1 keeps the simulator's own 1 kHz
-    contacts = true           # keep where each whisker touches, too; left out, it is not kept
-    every_nth = true          # keep the sample of each period as it is, not resampled (the paper)
+    contacts = true           # also store where each whisker touches; left out: false
+    every_nth = true          # store one sample of each period, not resampled (the paper)
     [objects]
     from = "shapes"           # the parametric ones, "varied-shapes", or a folder of meshes
     per_category = 60
     [sweeps]
     draws = 12                # for every combination of the `each` values
     height_mm = { each = [-5, 0] }
-    distance_mm = 6.5         # left out, in proportion to how far the array's whiskers reach
+    distance_mm = 6.5         # left out: in proportion to the reach of the array's whiskers
     speed_mm_s = { between = [28, 40] }
-    yaw_deg = { between = [0, 89], plus = [0, 90] }    # two sweeps: a quarter turn further
+    yaw_deg = { between = [0, 89], plus = [0, 90] }    # two sweeps, a quarter turn apart
     size_mm = { between = [20, 60], once = true }      # the same for all combinations of a draw
     roll_deg = { between = [-180, 180], peak = 3 }     # mostly near the middle
 
-Every sweep is drawn from (seed, object, sweep index) alone, so that any one of them can be made
-again by itself, and a set at another profile holds the very same sweeps (but for the few that
-one of the profiles cannot simulate, which are drawn again).
+Every sweep is drawn from (seed, object, sweep index) alone, so that any sweep can be made again
+by itself, and a set at another profile holds the same sweeps (except for the few that one of the
+profiles cannot simulate, which are drawn again).
 """
 
 import zlib
@@ -47,7 +47,7 @@ SHAPES, VARIED_SHAPES = "shapes", "varied-shapes"
 GENERATED = (SHAPES, VARIED_SHAPES)  # sources of objects; any other is a folder
 MOST_OBJECTS = 100_000
 LONGEST_MS = 600_000.0
-STEEPEST = 10.0  # peak of an interval: beyond it all is in the middle
+STEEPEST = 10.0  # largest `Range.peak`: beyond it nearly all draws are in the middle
 OF_SHAPES = {"per_category": 60, "validation": 4, "test": 12}
 OF_A_FOLDER = {"per_category": 0, "validation": 0.1, "test": 0.1}  # all; the published 8 : 1 : 1
 
@@ -59,11 +59,11 @@ class Range(msgspec.Struct, frozen=True, omit_defaults=True):
 
     Attributes:
         between: The ends of the interval, the lower first.
-        each: Every one of these values is taken, with every one of the other parameters'.
+        each: The values to take, each combined with every value of the other parameters.
         once: Whether all combinations of a draw share one value; else every sweep has its own.
-        plus: Every one of these values is added, with every one of the other parameters'.
-        peak: The power to which the distance from the middle, drawn evenly in half intervals, is
-            raised: 1 draws evenly, and at 3 half of what is drawn is in the middle eighth.
+        plus: The values to add, each combined with every value of the other parameters.
+        peak: The power to which the distance from the middle, drawn uniformly in half intervals, is
+            raised: 1 draws uniformly, and at 3 half of the draws are in the middle eighth.
 
     Raises:
         ConfigError: neither an interval nor values, ends in the wrong order, or a peak out of
@@ -91,12 +91,12 @@ class Range(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def combined(self) -> tuple[float, ...]:
-        """The values that are combined with the other parameters'."""
+        """Values that are combined with those of the other parameters."""
         return self.each or self.plus
 
     @property
     def ends(self) -> tuple[float, ...]:
-        """The values that may be taken, or the least and greatest of them."""
+        """Possible values, or the least and greatest of them."""
         if self.each:
             return self.each
         more = self.plus or (0.0,)
@@ -121,23 +121,23 @@ class ObjectChoice(msgspec.Struct, frozen=True):
     Attributes:
         source: The origin of the objects: "shapes" (the parametric ones, each kind of one plan),
             "varied-shapes" (of any plan) or a folder of meshes.
-        categories: The names of the classes; empty: all that there are.
-        classes: The categories that count as one class, by its name; what an object was made as
-            is then its kind. Any other category is a class by itself.
+        categories: The names of the classes; empty: all that exist.
+        classes: The categories that count as one class, by its name; an object's own category is
+            then its kind. Any other category is a class by itself.
         withheld: The categories of the extra split "withheld", which is for open-set tests: their
             objects are in no other split. Empty: none, or `catalogue.WITHHELD` if `per_withheld`
             asks for some.
-        outliers: The categories of the extra split "outliers": unknown things, too, but ones that a
-            model may learn to refuse; those of `withheld` test whether it does.
-        per_category: The number of objects of every category; 0: all that the folder has.
+        outliers: The categories of the extra split "outliers": unknown objects, too, which a model
+            may learn to refuse; those of `withheld` test whether it does.
+        per_category: The number of objects in each category; 0: all that the folder has.
         validation, test: The numbers of objects of every category that are held out; below 1 a
             fraction.
-        per_withheld: The number of objects of every category of these two; 0: 12, or all that the
-            folder has.
-        without_source: Objects of a folder from this source, as its `objects.csv` has it, are left
-            out; empty: none.
-        only_source: Objects of a folder from this source only, all of them held out for a test,
-            without those that are like one from elsewhere; empty: of all sources.
+        per_withheld: The number of objects in each category of `withheld` and `outliers`; 0: 12, or
+            all that the folder has.
+        without_source: The source, in a folder's `objects.csv`, whose objects are left out; empty:
+            none.
+        only_source: The only source whose objects are taken, all held out for a test, without those
+            that are like one from elsewhere; empty: all sources.
         surface_error_mm, max_pieces, hull, up: The settings of `MeshDetail`, for a folder.
     """
 
@@ -146,7 +146,7 @@ class ObjectChoice(msgspec.Struct, frozen=True):
     classes: dict[str, tuple[str, ...]] = {}
     withheld: tuple[str, ...] = ()
     outliers: tuple[str, ...] = ()
-    # None where nothing is said: then as `OF_SHAPES` or `OF_A_FOLDER` has it.
+    # None if left out: then the value of `OF_SHAPES` or `OF_A_FOLDER`.
     per_category: int = None  # type: ignore[assignment]
     validation: float = None  # type: ignore[assignment]
     test: float = None  # type: ignore[assignment]
@@ -160,24 +160,24 @@ class ObjectChoice(msgspec.Struct, frozen=True):
 
     @property
     def generated(self) -> bool:
-        """Whether the objects are parametric ones and not a folder's."""
+        """True if the objects are parametric, False if they are from a folder."""
         return self.source in GENERATED
 
     @property
     def class_of(self) -> dict[str, str]:
-        """The class of each category that counts as another one."""
-        return {own: one for one, categories in self.classes.items() for own in categories}
+        """Class of each category that counts as another one."""
+        return {own: name for name, categories in self.classes.items() for own in categories}
 
     @property
     def mesh(self) -> MeshDetail:
-        """The way in which meshes become pieces."""
+        """Settings for cutting meshes into pieces."""
         return MeshDetail(**{f.name: getattr(self, f.name) for f in fields(MeshDetail)})
 
     def __post_init__(self) -> None:
         for name, usual in (OF_SHAPES if self.generated else OF_A_FOLDER).items():
             if getattr(self, name) is None:
                 msgspec.structs.force_setattr(self, name, usual)
-        _ = self.mesh  # which checks it
+        _ = self.mesh  # checks the settings
         for key in ("categories", "withheld", "outliers"):
             names = getattr(self, key)
             if twice := [n for i, n in enumerate(names) if n in names[:i]]:
@@ -200,15 +200,15 @@ class ObjectChoice(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class SweepChoice:
-    """How every object is swept: see `sweep.Sweep` for the parameters.
+    """The choice of sweeps of every object: see `sweep.Sweep` for the parameters.
 
     Attributes:
         draws: The number of sweeps of every combination of the `each` values.
         held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
             `draws` and above.
-        held_out: The number of sweeps of every training object, drawn for each, that no training
-            learns from: the split ``new-sweeps``.
-        least_whiskers: The least number of whiskers that can reach the object as it goes by; sweeps
+        held_out: The number of sweeps of every training object, drawn for each, that are excluded
+            from training: the split ``new-sweeps``.
+        least_whiskers: The least number of whiskers that can reach the object as it passes; sweeps
             that fewer reach are drawn again.
     """
 
@@ -253,10 +253,10 @@ class SweepChoice:
         for name in PARAMETERS:
             choice = getattr(self, name)
             for value in choice.ends if isinstance(choice, Range) else (choice,):
-                Sweep(**{name: value})  # which checks it
+                Sweep(**{name: value})  # checks the value
 
     def combinations(self) -> list[dict[str, float]]:
-        """Every combination of the values that are combined; the last varies fastest."""
+        """Return every combination of the combined values; the last varies fastest."""
         ranges = {n: c for n in PARAMETERS if isinstance(c := getattr(self, n), Range)}
         each = {name: chosen.combined for name, chosen in ranges.items() if chosen.combined}
         return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
@@ -265,14 +265,14 @@ class SweepChoice:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
     def draw_index(self, index: int) -> int:
-        """Which draw of its combination sweep `index` of an object is, from 0."""
+        """Return the number, from 0, of sweep `index` among those of its combination."""
         return index % (self.draws + self.held_out_draws)
 
     def draw(self, rng: np.random.Generator, index: int, shared: np.random.Generator) -> Sweep:
         """Draw the parameters of sweep `index`.
 
         Args:
-            shared: in the same state for all sweeps of a draw, see `Range.once`.
+            shared: a generator in the same state for all sweeps of a draw, see `Range.once`.
         """
         values = self.combinations()[index // (self.draws + self.held_out_draws)]
         for name in PARAMETERS:
@@ -291,7 +291,7 @@ PARAMETERS = tuple(f.name for f in fields(SweepChoice) if f.name not in COUNTS)
 
 @dataclass(frozen=True)
 class SweepRecipe:
-    """How a sweep set is made.
+    """The recipe of a sweep set.
 
     Attributes:
         array: The name or file of the array, see `files.load_animals`.
@@ -300,14 +300,13 @@ class SweepRecipe:
         period_ms: The period of the stored samples, ms.
         lead_ms: The time at rest before the simulation starts, ms: enough for a baseline.
         length_ms: The length of one sweep with its lead, ms.
-        contacts: Whether to store where along each whisker it touches, beside the loads.
-        every_nth: Whether to store every n-th of the simulator's samples as it is, with what that
-            aliases, as the paper does; else they go through the live stream's resampler.
-        sensor: What the sensors make of the loads; perfect ones unless it says otherwise.
-        randomisation: The way the array of each sweep differs from its description; not at all
-            unless it says so.
-        faults: What training draws to be wrong with the sensor, each time that it takes a sweep; no
-            file of the set has any of it.
+        contacts: Whether to store, beside the loads, where along each whisker it touches.
+        every_nth: Whether to store every n-th of the simulator's samples as it is, with aliasing,
+            as the paper does; else they go through the live stream's resampler.
+        sensor: The model of the sensors; perfect ones by default.
+        randomisation: The deviations of each sweep's array from its description; none by default.
+        faults: The sensor faults that training draws each time that it uses a sweep; no file of the
+            set contains them.
     """
 
     name: Text = "unnamed"
@@ -350,32 +349,32 @@ class SweepRecipe:
 
     @property
     def lead(self) -> int:
-        """Stored samples before the object can touch."""
+        """Number of stored samples before the object can touch."""
         return round(self.lead_ms / self.period_ms)
 
     @property
     def samples(self) -> int:
-        """Stored samples of one sweep."""
+        """Number of stored samples of one sweep."""
         return round(self.length_ms / self.period_ms)
 
     def rng(self, name: str, index: int, stream: int = 0) -> np.random.Generator:
-        """The random numbers of sweep `index` of an object, see `key`."""
+        """Return the random generator of sweep `index` of an object, see `key`."""
         return np.random.default_rng(self.key(name, index, stream))
 
     def key(self, name: str, index: int, stream: int = 0) -> list[int]:
-        """What the random numbers of a sweep are seeded with.
+        """Return the seed of a sweep's random numbers.
 
         Args:
-            stream: 0 for the sweep's parameters; others are for what may be added to them, so
-                that a sensor model changes no sweep.
+            stream: 0 for the sweep's parameters; others are for optional models, so that a sensor
+                model changes no sweep.
         """
         # crc32 because hash() of a string differs from one process to the next
         return [self.seed, zlib.crc32(name.encode()), index, *([stream] if stream else [])]
 
     def to_dict(self) -> dict[str, Any]:
-        """Write it in full as a recipe file has it; `recipe_files.recipe_of_set` reads it."""
-        # asdict, as msgspec leaves out what it has decoded from a default
+        """Return the whole recipe as in a file, for `recipe_files.recipe_of_set`."""
+        # asdict, as msgspec leaves out fields that it filled with a default
         plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(self)))
         if not self.sweeps.held_out:
-            del plain["sweeps"]["held_out"]  # sets that hold nothing out are as they were
+            del plain["sweeps"]["held_out"]  # manifests without held-out sweeps stay the same
         return plain

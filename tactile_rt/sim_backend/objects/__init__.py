@@ -1,1 +1,1 @@
-"""What whiskers sweep past: parametric shapes, and mesh files cut into convex pieces."""
+"""Objects that whiskers sweep past: parametric shapes, and mesh files cut into convex pieces."""

@@ -1,8 +1,8 @@
-"""What is swept past the whiskers: a named thing made of convex pieces.
+"""Objects by name, made of convex pieces: drawn ones by category, and mesh files.
 
-`make_object` draws the n-th mug, bottle, ...; `load_object` also takes a mesh file. "mug-17" is of
-the one plan that its kind has; "varied-mug-17" is of any plan, see `shapes.varied`. Other packages
-may add categories (`core.packages`): of one plan, and known by their names only.
+`make_object` draws the n-th mug, bottle, ...; `load_object` also reads a mesh file. "mug-17" has
+the only plan of its kind; "varied-mug-17" has any plan, see `shapes.varied`. Other packages may add
+categories (`core.packages`), which have one plan each and are used only where they are named.
 """
 
 import difflib
@@ -74,7 +74,7 @@ _KNOWN: dict[str, _Builder] = {
     "table": furniture.table,
 }
 
-# each a neighbour of a category that is trained: of lamp, chair, mug, car
+# each resembles a category to train on: lamp, chair, mug, car
 _UNKNOWN: dict[str, _Builder] = {
     "goblet": vessels.goblet,
     "stool": furniture.stool,
@@ -82,7 +82,7 @@ _UNKNOWN: dict[str, _Builder] = {
     "truck": vehicles.truck,
 }
 
-# of no kind at all: what a model may learn to refuse
+# objects of no kind, which a model may learn to refuse
 _OUTLIERS: dict[str, _Builder] = {
     "assembly": mixtures.assembly,
     "medley": partial(mixtures.medley, builders=tuple(_KNOWN.values())),
@@ -90,23 +90,23 @@ _OUTLIERS: dict[str, _Builder] = {
 
 _BUILDERS = _KNOWN | _UNKNOWN | _OUTLIERS
 
-VARIED = "varied-"  # before the name of a kind
-PLAIN_SHARE = 0.25  # of the varied ones are of the one plan, stretched
-STRETCH = 1.25  # at most, across against along and up
+VARIED = "varied-"  # prefix of a kind's name
+PLAIN_SHARE = 0.25  # share of varied objects with the kind's only plan, stretched
+STRETCH = 1.25  # largest factor along each axis
 
 CATEGORIES: tuple[str, ...] = tuple(sorted(_KNOWN))  # for training
-WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained: what is new to a classifier
-OUTLIERS: tuple[str, ...] = tuple(_OUTLIERS)  # of no kind: what a model may learn to refuse
+WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained on: new to a classifier
+OUTLIERS: tuple[str, ...] = tuple(_OUTLIERS)  # of no kind: a model may learn to refuse them
 
 
 def added_categories() -> tuple[str, ...]:
-    """Names of the categories that other packages add."""
+    """Return the names of the categories that other packages add."""
     return packages.added_names(packages.OBJECTS)
 
 
 def make_object(category: str, index: int) -> TactileObject:
-    """Instance `index` (0 or more) of a category: the same one every time, everywhere."""
-    kind = _check(category, index)
+    """Draw instance `index` (0 or more) of a category, the same on every machine."""
+    kind = _find_kind(category, index)
     # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])
     build: _Builder = _BUILDERS.get(kind) or packages.added(packages.OBJECTS, kind)
@@ -120,14 +120,14 @@ def make_object(category: str, index: int) -> TactileObject:
 
 
 def load_object(target: str, detail: MeshDetail = STANDARD) -> TactileObject:
-    """The object named "mug-17" or "mug" (the same as "mug-0"), or the one in a mesh file."""
+    """Load an object by name ("mug-17"; "mug" is "mug-0") or from a mesh file."""
     return promised_object(target, detail)()
 
 
 def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], TactileObject]:
-    """What gives the object that `load_object` would, made when it is first asked for.
+    """Return a factory that makes the object of `load_object` when first called.
 
-    That a name means nothing, or that a mesh cannot be used, is told at once: a mesh is read here.
+    An unknown name or an unusable mesh raises its error here: a mesh is read at once.
     """
     if Path(target).suffix or "/" in target or "\\" in target:
         mesh = load_mesh(Path(target), detail)
@@ -136,12 +136,12 @@ def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], 
         return lambda: mesh
     match = re.fullmatch(r"(.+)-(\d+)", target)
     category, index = (match[1], int(match[2])) if match else (target, 0)
-    _check(category, index)
+    _find_kind(category, index)
     return cache(partial(make_object, category, index))
 
 
-def _check(category: str, index: int) -> str:
-    """The kind of thing of a category, which must exist."""
+def _find_kind(category: str, index: int) -> str:
+    """Return the kind of a category; refuse an unknown category or a negative index."""
     kind = category.removeprefix(VARIED)
     if kind not in _BUILDERS and kind not in (added := added_categories()):
         near = difflib.get_close_matches(kind, (*_BUILDERS, *added), n=1, cutoff=0.3)

@@ -1,18 +1,18 @@
 """Convex pieces of a surface: of a closed solid, and of a sheet that encloses nothing.
 
-Patches of the surface are joined with their neighbours, the smallest first, as long as the join is
-near enough.
+Patches of the surface are joined with their neighbours, the smallest first, as long as the result
+stays near enough to the surface.
 
 Every face of a solid begins as a piece of its own, some tenths of a millimetre or more deep, and
 neighbours are joined as long as no point of the surface lies deeper in their common convex hull
 than the tolerance. So a convex solid becomes one piece, an L two boxes, and a smooth hollow facets
-as wide as the tolerance allows. What is still empty in the middle is filled at last; no whisker
-gets there. Decompositions that cut a whole in two (CoACD, Wei et al. 2022) cost more; see
+as wide as the tolerance allows. Space left empty in the middle is filled last; no whisker gets
+there. Decompositions that cut a whole in two (CoACD, Wei et al. 2022) cost more; see
 docs/decisions/0023.
 
 The faces of a sheet are joined to flat patches of convex outline. Each becomes a plate that reaches
-equally far to both sides of the sheet; plates of neighbours share their corners, so that nothing
-gapes where the sheet bends.
+equally far to both sides of the sheet; neighbouring plates share corners, so that no gap opens
+where the sheet bends.
 """
 
 import heapq
@@ -30,23 +30,22 @@ from tactile_rt.sim_backend.objects.deviation import FACES, TILE, shuffled, surf
 from tactile_rt.sim_backend.objects.polygons import Floats, flat
 
 P = TypeVar("P")
-FOLDED = 0.5  # cosine of the angle by which a patch's parts may be turned against it
-ALONG = np.linspace(0, 1, 4, endpoint=False)[:, None, None]  # where an outline is looked at
-DEEP = 0.05  # of a face's piece, in largest extents, at most: 2 mm at 40 mm
-SHALLOW = 2e-4  # at least
-SHARE = 0.6  # of the way through the solid, at most: the pieces of opposite walls overlap
-ASIDE = 1e-5  # from a corner begins the ray that looks how far it is through the solid
-APART = TILE / 2  # points on the surface that are nearer than this tell the same
-OUT = 2.0  # from any place in the unit box, that is out of it
-VOID, VOID_DEPTH = 1e-7, 5e-5  # volume, and volume over area, of what is too small to be filled
-MOST_VOIDS = 2000  # looked at
+FOLDED = 0.5  # least cosine between the normals of a patch and of the parts joined to it
+ALONG = np.linspace(0, 1, 4, endpoint=False)[:, None, None]  # points checked on an outline's edge
+DEEP = 0.05  # largest depth of a face's piece, in largest extents: 2 mm at 40 mm
+SHALLOW = 2e-4  # least depth of a face's piece
+SHARE = 0.6  # largest depth as a share of the thickness: the pieces of opposite walls overlap
+ASIDE = 1e-5  # distance from a corner at which the ray that measures thickness begins
+APART = TILE / 2  # spacing to which points on the surface are thinned out
+OUT = 2.0  # a distance that leads out of the unit box from anywhere in it
+VOID, VOID_DEPTH = 1e-7, 5e-5  # volume, and volume over area, below which a void stays empty
+MOST_VOIDS = 2000  # checked
 
 
 class Joining(Generic[P]):
-    """Patches that grow by being joined with neighbours, the smallest first.
+    """Patches that are joined with their neighbours, the smallest first.
 
-    A join that was refused once stays so however the two grow, until it is asked with more
-    indulgence.
+    A refused pair stays refused however the two grow, until the next call of `join`.
     """
 
     def __init__(
@@ -66,14 +65,14 @@ class Joining(Generic[P]):
 
     @property
     def patches(self) -> list[P]:
-        """Those that there are now."""
+        """The present patches."""
         return list(self._alive.values())
 
     def join(self, joined: Callable[[P, P], P | None]) -> None:
-        """Join whatever can be.
+        """Join neighbours until no more can be joined.
 
         Args:
-            joined: what two patches become together; None: they don't.
+            joined: returns the patch that two patches become, or None to refuse the pair.
         """
         refused: dict[int, set[int]] = {k: set() for k in self._alive}
         queue = [
@@ -108,17 +107,17 @@ class Joining(Generic[P]):
 
 @dataclass(frozen=True)
 class _Patch:
-    area: Floats  # (3,) normal, as long as the area
+    area: Floats  # (3,) normal whose length is the area
     corners: frozenset[int]
     outline: frozenset[tuple[int, int]]
 
 
 class SheetPieces:
-    """The plates of a sheet: `join` them, then ask for their `corners`.
+    """The plates of a sheet: call `join`, then `corners`.
 
     Args:
         sheet: any surface, in the unit box.
-        half: how far a plate reaches to either side, in largest extents.
+        half: half the thickness of a plate, in largest extents.
     """
 
     def __init__(self, sheet: trimesh.Trimesh, half: float) -> None:
@@ -141,11 +140,11 @@ class SheetPieces:
         self._joining.join(self._join_pair)
 
     def corners(self) -> list[Floats]:
-        """The (n, 3) corners of each plate."""
+        """Return the corners (n, 3) of each plate."""
         mesh, plates = self._mesh, []
         for patch in self._joining.patches:
             size = float(np.linalg.norm(patch.area))
-            if size == 0:  # a needle; what is beside it reaches to its corners
+            if size == 0:  # a needle; its neighbours reach to its corners
                 continue
             normal = patch.area / size
             index = np.array(sorted(patch.corners))
@@ -154,8 +153,8 @@ class SheetPieces:
             if hull is None:
                 continue
             index, points = index[hull.vertices], points[hull.vertices]
-            # towards the common normal of all that meet in a corner, as far as is needed for the
-            # plate to be as thick as it should
+            # along the common normal of the faces that meet in a corner, scaled so that the plate
+            # has its full thickness
             ways = mesh.vertex_normals[index]
             along = ways @ normal
             ways = np.where(
@@ -189,7 +188,7 @@ class SheetPieces:
 
 
 class SolidPieces:
-    """The pieces of a solid: `join` them, then ask for their `corners`."""
+    """The pieces of a solid: call `join`, then `corners`."""
 
     def __init__(self, solid: Manifold) -> None:
         self._solid = solid
@@ -200,37 +199,37 @@ class SolidPieces:
         points = np.concatenate([middles, mesh.vertices, edges])
         self._surface = points[np.argsort(points[:, 0], kind="stable")]
         self._tolerance = 0.0
-        self._joining: Joining[Floats] | None = None  # None: it is convex
+        self._joining: Joining[Floats] | None = None  # None: the solid is convex
 
     def __len__(self) -> int:
         return len(self._joining) if self._joining else 1
 
     def join(self, tolerance: float) -> None:
-        """Join pieces as far as a tolerance allows, in largest extents; each time a larger one."""
+        """Join pieces within a tolerance, in largest extents, larger at each call."""
         self._tolerance = tolerance
         if self._joining is None:
             if self._near_enough(_hull(self._mesh.vertices)):
                 return
             areas, neighbours = self._mesh.area_faces, self._mesh.face_adjacency.tolist()
-            self._joining = Joining(self._faces(), areas, neighbours)
+            self._joining = Joining(self._make_pieces(), areas, neighbours)
         self._joining.join(self._join_pair)
 
     def corners(self, spare: int) -> list[Floats]:
-        """The (n, 3) corners of each piece, those of the pieces in the middle at the end."""
+        """Return the corners (n, 3) of each piece, at most `spare` in the middle last."""
         if self._joining is None:
             return [self._mesh.vertices]
         outer = [p for p in self._joining.patches if _hull(p) is not None]
-        return outer + self._middle(outer, spare)
+        return outer + self._fill_middle(outer, spare)
 
-    def _faces(self) -> list[Floats]:
-        """The piece behind each face, as deep as it can be."""
+    def _make_pieces(self) -> list[Floats]:
+        """Return the piece behind each face, as deep as possible."""
         mesh = self._mesh
         ways = -mesh.vertex_normals
         starts, ends = mesh.vertices + ASIDE * ways, mesh.vertices + OUT * ways
         free = np.zeros(len(starts))
         for k, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
             hits = self._solid.ray_cast(start, end)
-            if len(hits) % 2:  # else it begins outside, where the surface is folded over
+            if len(hits) % 2:  # else it begins outside, where the surface folds over
                 free[k] = OUT * hits[0].distance
         behind = mesh.vertices + ways * np.clip(SHARE * free, SHALLOW, DEEP)[:, None]
         pieces = []
@@ -250,7 +249,7 @@ class SolidPieces:
         return both[hull.vertices] if self._near_enough(hull) else None
 
     def _near_enough(self, hull: ConvexHull | None) -> bool:
-        """Whether no point of the surface lies deeper in a hull than the tolerance."""
+        """Return whether no surface point lies deeper in a hull than the tolerance."""
         if hull is None:
             return False
         low, high = hull.min_bound, hull.max_bound
@@ -259,14 +258,14 @@ class SolidPieces:
         y, z = points[:, 1], points[:, 2]
         points = points[(y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])]
         planes = shuffled(hull.equations)
-        for k in range(0, len(planes), FACES):  # few points stay deeper for long
+        for k in range(0, len(planes), FACES):  # few points remain after some planes
             some = planes[k : k + FACES]
             depth = -(points @ some[:, :3].T + some[:, 3]).max(axis=1, initial=-np.inf)
             points = points[depth > self._tolerance]
         return len(points) == 0
 
-    def _middle(self, outer: list[Floats], spare: int) -> list[Floats]:
-        """Pieces that fill what others leave empty."""
+    def _fill_middle(self, outer: list[Floats], spare: int) -> list[Floats]:
+        """Return at most `spare` pieces that fill the space left by the outer ones."""
         union = Manifold.batch_boolean([Manifold.hull_points(p) for p in outer], OpType.Add)
         voids, pieces = (self._solid - union).decompose(), list[Floats]()
         for _ in range(MOST_VOIDS):
@@ -291,7 +290,7 @@ class SolidPieces:
 
 
 def _hull(points: Floats) -> ConvexHull | None:
-    """The convex hull; None of what is flat."""
+    """Return the convex hull; None if the points are flat."""
     try:
         return ConvexHull(points)
     except QhullError:

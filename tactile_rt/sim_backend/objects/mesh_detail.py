@@ -1,4 +1,4 @@
-"""How finely a mesh is told apart into pieces, and which way is up in it."""
+"""Settings for cutting a mesh into convex pieces."""
 
 from dataclasses import asdict, dataclass
 
@@ -10,18 +10,18 @@ UP = ("y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class MeshDetail:
-    """How a mesh becomes convex pieces.
+    """Settings for cutting a mesh into convex pieces.
 
     Attributes:
-        surface_error_mm: The largest distance allowed between pieces and mesh, mm, where the
-            largest extent of the mesh is 40 mm; about so far the plates of an open surface reach to
-            either side of it, too.
-        max_pieces: The largest number of pieces; where it does not suffice, the distance is larger
-            (and known).
-        hull: Whether to take one piece only, the convex hull; its distance is measured but not
+        surface_error_mm: The largest distance allowed between pieces and mesh, mm, for a largest
+            extent of 40 mm; also about half the thickness of the plates that an open surface
+            becomes.
+        max_pieces: The largest number of pieces; if it does not suffice, the distance is larger
+            (and measured).
+        hull: Whether to take a single piece, the convex hull; its distance is measured but not
             bounded.
-        up: The axis of the file that points up, "y" or "z"; empty: as its format has it (y in
-            glTF), else z.
+        up: The axis of the file that points up, "y" or "z"; empty: that of its format (y in glTF),
+            else z.
     """
 
     surface_error_mm: float = 0.1
@@ -41,7 +41,7 @@ class MeshDetail:
             raise ConfigError(f"up must be one of {', '.join(UP)}, not {self.up!r}")
 
     def differing(self) -> dict[str, float | int | bool | str]:
-        """What of it is not as it is by default."""
+        """Return the settings that differ from the defaults."""
         usual = asdict(STANDARD)
         return {k: getattr(self, k) for k in usual if getattr(self, k) != usual[k]}
 

@@ -1,9 +1,8 @@
-"""Mesh files: read into triangles, or refused with one line that says why.
+"""Mesh files, read into triangles or refused with a reason of one line.
 
-A file may come from elsewhere. Formats of plain numbers are as long as what they hold, and their
-readers notice if not (see `mesh_formats`). The others can say in a few bytes what takes gigabytes:
-archives that unpack to them, scenes that hold a thing that holds a thing ten times, meshes that
-Draco compressed. Of these the sizes are looked up before a library builds them.
+A file may be untrusted. A format of plain numbers is as long as its content, and its reader checks
+that (see `mesh_formats`). Other formats can expand from a few bytes to gigabytes: archives, scenes
+of nested copies, meshes compressed by Draco. Their sizes are checked before a library builds them.
 """
 
 import base64
@@ -28,26 +27,26 @@ from tactile_rt.core.files import check_no_pointer
 from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.mesh_formats import MOST_NODES, check_number, load_meshes
 
-MOST_UNPACKED: Final = 256 << 20  # bytes of an archive ...
-MOST_RATIO: Final = 100  # ... and times its own size; XML of numbers has 10
+MOST_UNPACKED: Final = 256 << 20  # bytes that an archive may unpack to ...
+MOST_RATIO: Final = 100  # ... and their ratio to its own size; XML of numbers has 10
 SMALL: Final = 16 << 20  # bytes that an archive may unpack to at any ratio
-MOST_OBJECTS: Final = 100_000  # of glTF's JSON
-MOST_POINTS: Final = 6_000_000  # of a mesh that Draco compressed
+MOST_OBJECTS: Final = 100_000  # in the JSON of a glTF
+MOST_POINTS: Final = 6_000_000  # of a mesh compressed by Draco
 
-# Extensions of glTF that may be required: they do not change where a triangle is, or are read.
+# Required glTF extensions that are accepted: they move no triangle, or the library reads them.
 HARMLESS: Final = re.compile(
     "[A-Z]+_(draco_mesh_compression|mesh_quantization|materials|texture|lights|xmp|animation)"
 )
-GLB_JSON: Final = struct.Struct("<4sIIII")  # head of the file and of its first chunk
+GLB_JSON: Final = struct.Struct("<4sIIII")  # headers of the file and of its first chunk
 DRACO: Final = b"DRACO"
 NO_GLTF: Final = (ValueError, KeyError, TypeError, AttributeError, IndexError)
-POINT = 1e-9  # of all extents: smaller is none
-STRAY, AWAY = 5e-3, 3.0  # share of the area that may not make a mesh so many times longer
+POINT = 1e-9  # of the largest extent or coordinate: a smaller extent counts as zero
+STRAY, AWAY = 5e-3, 3.0  # share of area at either end, stray if it makes a mesh this much longer
 TO_Z_UP: Final = {  # from the axis that points up
     "x": np.array([[0, -1.0, 0], [0, 0, -1.0], [1.0, 0, 0]]),
     "y": np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
 }
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # what matters of a file is told here
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # this module reports what matters
 
 
 def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
@@ -62,7 +61,7 @@ def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     for name, text in models.items():
         if b"beamlattice>" in text:
             raise ValueError("it holds a beam lattice; export it as a mesh of triangles")
-        # of a file within, the library takes all parts for each
+        # the library takes all parts of an inner file for each of them
         if "3d/3dmodel.model" not in name.lower() and text.count(b"<mesh>") > 1:
             raise ValueError("several parts share a file within it; export it as one mesh")
         for _, thing in etree.iterparse(BytesIO(text), tag="{*}object"):
@@ -74,8 +73,8 @@ def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
 
 
 def _check_nodes(used: Mapping[str, Sequence[str]]) -> None:
-    """Refuse scenes that use nodes more often than can be built, or in a circle."""
-    times: dict[str, int] = {}  # nodes that a node is, with all that it uses
+    """Refuse scenes that use nodes too often to be built, or in a circle."""
+    times: dict[str, int] = {}  # number of nodes that each node expands to
     try:
         for node in TopologicalSorter(used).static_order():
             times[node] = 1 + sum(times[below] for below in used.get(node, ()))
@@ -101,12 +100,12 @@ def _read_gltf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     _check_supported(scene)
     for buffer in (binary, *_read_buffers(path, scene)):
         for match in re.finditer(DRACO, buffer):
-            if max(_draco_sizes(buffer[match.start() : match.start() + 64])) > MOST_POINTS:
+            if max(_read_draco_sizes(buffer[match.start() : match.start() + 64])) > MOST_POINTS:
                 raise ValueError(f"Draco's data tells of more than {MOST_POINTS} points")
-    told = -1
+    expected = -1
     with suppress(*NO_GLTF):
-        told = _count_drawn(scene)
-    meshes = load_meshes(path, content, told)
+        expected = _count_triangles(scene)
+    meshes = load_meshes(path, content, expected)
     for mesh in meshes:
         if DRACO in content and len(mesh.vertices) and not np.ptp(mesh.vertices, axis=0).any():
             raise ValueError("what Draco compressed cannot be unpacked")
@@ -131,7 +130,7 @@ def _read_buffers(path: Path, scene: Any) -> Iterator[bytes]:
 
 
 def _check_supported(scene: Any) -> None:
-    """Refuse what of a glTF the mesh library would leave out or misread."""
+    """Refuse glTF features that the mesh library would leave out or misread."""
     for required in scene.get("extensionsRequired", ()):
         if not HARMLESS.match(required):
             how = "; `gltfpack -noq -i IN -o OUT` writes it without" * ("meshopt" in required)
@@ -149,8 +148,8 @@ def _check_supported(scene: Any) -> None:
             raise ValueError("its vertices are normalized; `gltf-transform dequantize IN OUT`")
 
 
-def _count_drawn(scene: Any) -> int:
-    """Count the triangles of all nodes of the scene that is shown."""
+def _count_triangles(scene: Any) -> int:
+    """Count the triangles of all nodes of the default scene."""
     drawn, todo = 0, list(scene["scenes"][scene.get("scene", 0)].get("nodes", ()))
     while todo:
         node = scene["nodes"][todo.pop()]
@@ -161,8 +160,8 @@ def _count_drawn(scene: Any) -> int:
     return drawn
 
 
-def _draco_sizes(data: bytes) -> tuple[int, ...]:
-    """Read the two numbers of faces, points or vertices that Draco's data begins with."""
+def _read_draco_sizes(data: bytes) -> tuple[int, ...]:
+    """Read the two counts (faces, points or vertices) at the start of Draco data."""
     found, at = [0, 0], 11 if data[8:9] == b"\0" else 12
     for i in range(2):
         for shift in range(0, 70, 7):
@@ -189,7 +188,7 @@ UNREAD_SUFFIXES = (".step", ".stp", ".iges", ".igs", ".fbx", ".3ds", ".wrl", ".u
 
 
 def check_mesh_file(path: Path) -> None:
-    """Look whether there is such a file, of a format that can be read."""
+    """Refuse a missing or empty file, a Git LFS pointer or an unknown format."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise ConfigError(
@@ -204,7 +203,7 @@ def check_mesh_file(path: Path) -> None:
 
 
 def mesh_content(path: Path) -> bytes:
-    """Return the bytes of a mesh file and of the files of numbers that a .gltf names."""
+    """Return the bytes of a mesh file, and of the buffers that a .gltf names."""
     content = path.read_bytes()
     if path.suffix.lower() == ".gltf" and content.count(b"{") <= MOST_OBJECTS:
         with suppress(*NO_GLTF, RecursionError, ConfigError):
@@ -213,11 +212,11 @@ def mesh_content(path: Path) -> bytes:
 
 
 def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
-    """All triangles of a file in one mesh, z up, moved and scaled into the unit box.
+    """Read all triangles of a file into one mesh in the unit box, z up.
 
     Args:
-        path: the file; a scene is taken as one rigid object, its unit does not matter.
-        up: the axis that points up in it, "y" or "z"; empty: as its format has it, else z.
+        path: the file; a scene counts as one rigid object, its unit does not matter.
+        up: the axis of the file that points up, "y" or "z"; empty: that of its format, else z.
     """
     mesh = read_parts([path], up)
     mesh.vertices = (mesh.vertices - mesh.bounds.mean(axis=0)) / mesh.extents.max()
@@ -225,8 +224,8 @@ def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
 
 
 def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
-    """All triangles of the files of one object in one mesh, z up, in the unit of the files."""
-    mesh = _join([_part(path, up) for path in paths])
+    """Read the files of one object into one mesh, z up, in their unit."""
+    mesh = _join([_read_part(path, up) for path in paths])
     largest = max(mesh.extents.max(), np.abs(mesh.bounds).max())
     if np.sort(mesh.extents)[1] <= POINT * largest:
         raise ConfigError(f"{paths[0]}: all its triangles lie on one line; export it again")
@@ -242,19 +241,19 @@ def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
 
 
 def _join(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    # by hand: what colours and textures the bodies have is dropped
+    # by hand, which drops the colours and textures of the bodies
     joined = trimesh.util.append_faces([m.vertices for m in meshes], [m.faces for m in meshes])
     return trimesh.Trimesh(*joined, process=False)
 
 
-def _part(path: Path, up: str) -> trimesh.Trimesh:
+def _read_part(path: Path, up: str) -> trimesh.Trimesh:
     check_mesh_file(path)
     suffix = path.suffix.lower()
     before, after = f"{path}: cannot be read as {suffix} (", "); export it again"
     with explain_errors(ConfigError, before, after, most=120):
         try:
             meshes = READERS[suffix](path, path.read_bytes())
-        except ImportError:  # what guesses at encodings is not installed
+        except ImportError:  # the library that guesses encodings is not installed
             raise ValueError(
                 "cut short, or neither binary as it should be nor UTF-8 text"
             ) from None

@@ -1,7 +1,7 @@
-"""Readers of mesh formats: what a file tells of itself is held against what it has.
+"""Readers of mesh formats that check the counts in a file's header against its content.
 
-A mesh library leaves out what it does not know, and cuts every polygon as a fan. A `ValueError` of
-a reader says what is wrong with the file.
+A mesh library leaves out what it does not know, and cuts every polygon as a fan. A reader raises a
+`ValueError` that says what is wrong with the file.
 """
 
 import re
@@ -22,49 +22,49 @@ from tactile_rt.sim_backend.objects.polygons import cut_polygons
 
 Array = NDArray[Any]
 Meshes = list[trimesh.Trimesh]
-PLY_TYPES: Final = {  # the others are called as in NumPy
+PLY_TYPES: Final = {  # other names are the same as in NumPy
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8",
 }  # fmt: skip
-MOST_NODES: Final = 10_000  # of a scene, with every time that one is used
-SAME: Final = 1e-9  # so far areas of the same triangles may be from each other, of them
-MAX_FACES = 2_000_000  # a minute
+MOST_NODES: Final = 10_000  # of a scene, counted every time that one is used
+SAME: Final = 1e-9  # relative difference in area within which two readings are the same
+MAX_FACES = 2_000_000  # which take a minute
 
 
 def check_number(path: Path, faces: int) -> None:
-    """Refuse more triangles than can be dealt with."""
+    """Refuse more than `MAX_FACES` triangles."""
     if faces > MAX_FACES:
         raise ConfigError(
             f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
         )
 
 
-class _Beside(trimesh.resolvers.FilePathResolver):
-    """Files that a .gltf names, as URLs write them."""
+class _UrlFiles(trimesh.resolvers.FilePathResolver):
+    """A resolver of the files that a .gltf names in percent-encoded URLs."""
 
     def get(self, name: str) -> Any:
         return super().get(unquote(name))
 
 
-def load_meshes(path: Path, content: bytes, told: int = -1) -> Meshes:
-    """Let the library read the bodies of a file.
+def load_meshes(path: Path, content: bytes, expected: int = -1) -> Meshes:
+    """Read the bodies of a file with the mesh library.
 
     Args:
-        told: how many triangles they must have; negative: not known.
+        expected: number of triangles that they must have; -1: unknown.
     """
     kind = path.suffix.lower()[1:]
-    # materials would be dropped, and pictures that are missing be complained of
+    # materials are not needed, and the library would complain of missing pictures
     materials: dict[str, Any] = {} if kind in ("stl", "3mf") else {"skip_materials": True}
     scene = trimesh.load_scene(
-        BytesIO(content), file_type=kind, process=False, resolver=_Beside(str(path)), **materials
+        BytesIO(content), file_type=kind, process=False, resolver=_UrlFiles(str(path)), **materials
     )
     names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
-    # told before a mesh that is used a thousand times is copied
+    # checked before a mesh that is used a thousand times is copied
     check_number(path, sum(len(getattr(scene.geometry[name], "faces", ())) for name in names))
     meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]
     number = sum(len(mesh.faces) for mesh in meshes)
-    if told not in (-1, number):
-        raise ValueError(f"it tells {told} triangles, {number} of them can be read")
+    if expected not in (-1, number):
+        raise ValueError(f"it tells {expected} triangles, {number} of them can be read")
     for mesh in meshes:
         _check_corners(mesh.vertices, mesh.faces)
     return meshes
@@ -80,8 +80,8 @@ def _check_corners(vertices: Array, corners: Array, base: int = 0) -> None:
         )
 
 
-def _mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> trimesh.Trimesh:
-    """Make a mesh of polygons, whose vertices the file counts from `base`."""
+def _make_mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> trimesh.Trimesh:
+    """Make a mesh of polygons; `base` is the file's first vertex number, for messages."""
     if len(sizes) and sizes.min() < 3:
         raise ValueError(f"face {sizes.argmin() + 1} has {sizes.min()} corners; is it cut short?")
     if len(corners) != sizes.sum():
@@ -91,25 +91,25 @@ def _mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> trime
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
-def _plain(content: bytes) -> bytes:
-    """Return text as UTF-8 without a byte order mark, its lines ended by line feeds."""
+def _normalise_text(content: bytes) -> bytes:
+    """Return text as UTF-8 without a byte order mark, lines ended by line feeds."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         content = content.decode("utf-16").encode()
     text = content.removeprefix(b"\xef\xbb\xbf")
     return text if b"\n" in text else text.replace(b"\r", b"\n")
 
 
-def _numbers(text: bytes, kind: type) -> Array:
+def _parse_numbers(text: bytes, kind: type) -> Array:
     return np.fromstring(text.decode("latin-1"), sep=" ", dtype=kind)
 
 
 def read_obj(path: Path, content: bytes) -> Meshes:
-    """Read an OBJ file however its rows are indented, continued, commented and numbered.
+    """Read an OBJ file with rows indented, continued, commented and numbered in any way.
 
-    What the library reads is taken if its triangles are as many and cover as much; relative numbers
-    it takes for others.
+    The library's own meshes are preferred if they have the same number of triangles and the same
+    area; the library misreads relative vertex numbers.
     """
-    text = _plain(content).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    text = _normalise_text(content).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     rows = re.findall(rb"^[ \t]*(v|f|surf)[ \t]+([^#\n]*)", text, re.MULTILINE)
     kinds = np.array([kind for kind, _ in rows], "S4")
     if (kinds == b"surf").any():
@@ -117,16 +117,16 @@ def read_obj(path: Path, content: bytes) -> Meshes:
     places = [values for kind, values in rows if kind == b"v"]
     faces = [values for kind, values in rows if kind == b"f"]
     sizes = np.array([len(face.split()) for face in faces], np.int64)
-    vertices = _numbers(b" ".join(places), float)
+    vertices = _parse_numbers(b" ".join(places), float)
     if len(vertices) == 3 * len(places):
         vertices = vertices.reshape(-1, 3)
     else:  # weights, or colours
         vertices = np.array([row.split()[:3] for row in places], float)
-    corners = _numbers(re.sub(rb"/\S*", b"", b" ".join(faces)), np.int64)
-    before = np.cumsum(kinds == b"v")[kinds == b"f"]  # relative numbers count back from there
+    corners = _parse_numbers(re.sub(rb"/\S*", b"", b" ".join(faces)), np.int64)
+    before = np.cumsum(kinds == b"v")[kinds == b"f"]  # relative numbers count back from it
     back = corners + np.repeat(before, sizes)[: len(corners)] + 1
     relative = corners < 0
-    mesh = _mesh(vertices, np.where(relative, np.maximum(back, 0), corners) - 1, sizes, 1)
+    mesh = _make_mesh(vertices, np.where(relative, np.maximum(back, 0), corners) - 1, sizes, 1)
     with suppress(Exception):
         theirs = load_meshes(path, content, len(mesh.faces))
         covered = sum(float(m.area) for m in theirs)
@@ -136,7 +136,7 @@ def read_obj(path: Path, content: bytes) -> Meshes:
 
 
 def read_off(path: Path, content: bytes) -> Meshes:
-    text = re.sub(rb"#[^\n]*", b"", _plain(content))
+    text = re.sub(rb"#[^\n]*", b"", _normalise_text(content))
     head = re.match(rb"\s*(?:ST)?C?N?OFF(\s+BINARY)?\s", text)
     if not head or head[1]:
         raise ValueError("binary OFF; save it as text" if head else "it does not begin with OFF")
@@ -151,7 +151,7 @@ def read_off(path: Path, content: bytes) -> Meshes:
     sizes = np.array([int(row[0]) for row in rows[points + 1 :]], np.int64)
     polygons = [row[1 : size + 1] for row, size in zip(rows[points + 1 :], sizes, strict=True)]
     corners = np.array(list(map(int, chain.from_iterable(polygons))), np.int64)
-    return [_mesh(vertices, corners, sizes)]
+    return [_make_mesh(vertices, corners, sizes)]
 
 
 def read_ply(path: Path, content: bytes) -> Meshes:
@@ -161,7 +161,7 @@ def read_ply(path: Path, content: bytes) -> Meshes:
         raise ValueError("it does not begin with the header of a PLY file, or that is cut short")
     text, order = lines[1][1] == "ascii", "<>"["big" in lines[1][1]]
     body = body[re.match(rb"[^\n\r]*\r?\n?", body).end() :]  # type: ignore[union-attr]
-    data = _numbers(body, float).tobytes() if text else body
+    data = _parse_numbers(body, float).tobytes() if text else body
     elements: dict[str, tuple[int, dict[str, list[str]]]] = {}
     for line in lines:
         if line[0] == "element":
@@ -182,18 +182,18 @@ def read_ply(path: Path, content: bytes) -> Meshes:
     lists = [key for key, kinds in elements.get("face", (0, {}))[1].items() if len(kinds) > 1]
     if "tristrips" in elements:
         raise ValueError("it holds strips of triangles, `tristrips`; save it as faces")
-    called = [key for key in ("vertex_index", "vertex_indices", *lists) if key in lists]
-    return [_mesh(vertices, *found["face"][called[0]][::-1])] if called else []
+    known = [key for key in ("vertex_index", "vertex_indices", *lists) if key in lists]
+    return [_make_mesh(vertices, *found["face"][known[0]][::-1])] if known else []
 
 
 def _read_rows(
     element: str, data: bytes, at: int, count: int, kinds: dict[str, list[str]]
 ) -> tuple[dict[str, tuple[Array, Array]], int]:
-    """Read an element: sizes of lists and all values of each property."""
+    """Read an element: list sizes and all values of each property, and its end."""
     sizes: dict[str, list[Array]] = {key: [np.zeros(0, int)] for key in kinds}
     values: dict[str, list[Array]] = {key: [np.zeros(0, int)] for key in kinds}
     left, step = count * bool(kinds), count
-    while left:  # rows whose lists are as long as those of the first of them
+    while left:  # at a time, rows whose lists are as long as the first row's
         fields = list[Any]()
         with suppress(ValueError):
             for key, kind in kinds.items():
@@ -222,10 +222,10 @@ def _read_rows(
 
 
 def read_stl(path: Path, content: bytes) -> Meshes:
-    told = int.from_bytes(content[80:84], "little")
-    there = len(content) - 84
-    if 0 <= there == 50 * told:
-        return load_meshes(path, content, told)
+    count = int.from_bytes(content[80:84], "little")
+    size = len(content) - 84
+    if 0 <= size == 50 * count:
+        return load_meshes(path, content, count)
     facets = len(re.findall(rb"\bfacet[ \t]+normal\b", content, re.IGNORECASE))
     if content.lstrip()[:5].lower() == b"solid" and facets:
         if not content.lower().rstrip().rpartition(b"\n")[2].lstrip().startswith(b"endsolid"):
@@ -233,9 +233,9 @@ def read_stl(path: Path, content: bytes) -> Meshes:
         return load_meshes(path, content, facets)
     raise ValueError(
         "cut short, or no STL: neither text nor a header"
-        if there < 0
-        else f"{'cut short: ' * (there < 50 * told)}its header tells {told} triangles of 50 bytes, "
-        f"{there} bytes are there"
+        if size < 0
+        else f"{'cut short: ' * (size < 50 * count)}its header tells {count} triangles of 50 bytes,"
+        f" {size} bytes are there"
     )
 
 
@@ -263,9 +263,9 @@ def read_dae(path: Path, content: bytes) -> Meshes:
             meshes.extend(m.apply_transform(matrix) for m in _make_meshes(node.geometry))
         elif isinstance(node, collada.scene.Node):
             element = getattr(node, "node", node).xmlnode
-            told = [e for e in element if e.tag in parts and e.get("url") not in curves]
+            listed = [e for e in element if e.tag in parts and e.get("url") not in curves]
             known = (collada.scene.GeometryNode, collada.scene.ControllerNode, collada.scene.Node)
-            if len(told) > sum(isinstance(child, known) for child in node.children):
+            if len(listed) > sum(isinstance(child, known) for child in node.children):
                 raise ValueError(f"a part of its scene: {file.errors[0]}")
             for child in node.children:
                 visit(child, np.dot(matrix, node.matrix))
@@ -282,16 +282,16 @@ def _make_meshes(geometry: Any) -> Iterator[trimesh.Trimesh]:
     places = {e.get("source") for e in inputs}
     for source in geometry.xmlnode.iter("{*}source"):
         if f"#{source.get('id')}" in places and "nan" in "".join(source.itertext()).lower():
-            raise ValueError("a vertex is not a number but nan")  # the library reads 0
+            raise ValueError("a vertex is not a number but nan")  # the library would read 0
     for primitive in geometry.primitives:
         index, sizes = primitive.vertex_index, getattr(primitive, "vcounts", None)
         if index is None or not hasattr(primitive, "normal"):  # lines
             continue
         if sizes is None:
             sizes = np.full(len(index), 3)
-        told = len(primitive)
+        count = len(primitive)
         if primitive.xmlnode.tag.endswith(("triangles", "polylist")):
-            told = int(primitive.xmlnode.get("count", told))
-        if told != len(sizes):
-            raise ValueError(f"it tells {told} faces where {len(sizes)} are; cut short?")
-        yield _mesh(primitive.vertex, index.ravel(), sizes)
+            count = int(primitive.xmlnode.get("count", count))
+        if count != len(sizes):
+            raise ValueError(f"it tells {count} faces where {len(sizes)} are; cut short?")
+        yield _make_mesh(primitive.vertex, index.ravel(), sizes)

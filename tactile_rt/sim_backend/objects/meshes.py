@@ -1,20 +1,20 @@
-"""Mesh files as convex pieces, which is what can be collided.
+"""Mesh files as convex pieces, which a simulator can collide.
 
-A simulator fills every hollow of a mesh given to it whole. What a file becomes is written into the
-object's `made_by`:
+A simulator fills the hollows of a mesh that is not cut into convex pieces. The object's `made_by`
+says what a file became:
 
-    bodies      its bodies as they are: all are convex
-    pieces      its solid bodies in convex pieces (see `convex_parts`), to 0.1 mm of 40 mm if it can
-    plates      the same, and what encloses nothing as thin plates (see `convex_parts`)
-    hull        its convex hull, as asked for
+    bodies      its bodies as they are, since all are convex
+    pieces      solid bodies in convex pieces (see `convex_parts`), to 0.1 mm at 40 mm if possible
+    plates      the same, with surfaces that enclose nothing as thin plates (see `convex_parts`)
+    hull        its convex hull, if requested
 
-How far the outside of the pieces is from the mesh, and the mesh from them, is measured every time
-and kept as the object's `surface_error`.
+The distance between the outside of the pieces and the mesh is measured every time, in both
+directions, and kept as the object's `surface_error`.
 
-Cutting a mesh takes seconds and reading pieces does not, so they are kept in $TACTILE_RT_CACHE,
-else $XDG_CACHE_HOME/tactile_rt/pieces, else ~/.cache/tactile_rt/pieces: one .npz each, named by a
-hash of all that they depend on. A file that is damaged counts as missing; a folder that cannot be
-written to is no error.
+Cutting a mesh takes seconds, so the pieces are cached in $TACTILE_RT_CACHE, else
+$XDG_CACHE_HOME/tactile_rt/pieces, else ~/.cache/tactile_rt/pieces: one .npz per object, named by a
+hash of everything that the pieces depend on. A damaged file counts as missing; a folder that cannot
+be written to is no error.
 """
 
 import contextlib
@@ -48,32 +48,32 @@ from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM, STANDARD, MeshDe
 from tactile_rt.sim_backend.objects.mesh_files import check_mesh_file, mesh_content, read_triangles
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-SHARES = (0.25, 0.5, 1.0)  # of the most triangles, that are tried
-HASTE = (3.0, 7.0, 10.0)  # how fast the cost of an edge that goes may grow, until few are left
+SHARES = (0.25, 0.5, 1.0)  # of the most triangles, tried in turn
+HASTE = (3.0, 7.0, 10.0)  # aggressiveness of `simplify`, raised until few enough triangles are left
 Floats = NDArray[np.float64]
 log = logging.getLogger("tactile_rt.sim_backend.objects")
-RECIPE = 6  # of the pieces; raised when the same file would become others
-DIGITS = 7  # of a largest extent: corners nearer than 4e-6 mm at 40 mm are one
-MERGE_DIGITS = 6  # vertices closer than 1e-6 of the largest extent are one
-SPECK = 1e-6  # a body of less volume than this (largest extent cubed) touches nothing
-FOIL = 1e-5  # a body of which this is volume over area, in largest extents, is a sheet
-# What is allowed of the distance for fewer triangles, and for joining pieces; the rest is for what
-# falls between the points looked at.
+RECIPE = 6  # version of the pieces; raised when the same file gives different ones
+DIGITS = 7  # decimals, in largest extents: corners within 4e-6 mm at 40 mm are merged
+MERGE_DIGITS = 6  # decimals: vertices within 1e-6 of the largest extent are merged
+SPECK = 1e-6  # least volume of a solid body (largest extent cubed)
+FOIL = 1e-5  # least volume over area of a solid body, in largest extents; a thinner one is a sheet
+# Shares of the tolerance for dropping triangles and for joining pieces; the rest covers deviations
+# between the points that are measured.
 SIMPLER, JOINED = 0.4, 0.55
-WIDER, WIDEST = 1.25, 0.2  # distances that are tried where the pieces allowed are too few
-MOST_FACES = 6000  # of all bodies and the sheet together, where there are more
-LEAST_FACES = 400  # that each of them may keep
-GONE = 5e-3  # so far from what is left is a face that simplification took away: 0.2 mm at 40 mm
-FLAPS = 1e-4  # of area (largest extent squared) of what hangs on a solid without having volume
-SMALL_HOLE = 0.05  # of which this is the length round it is damage, not an opening
-LONGEST_LOOP = 64  # of edges round a hole that is looked at
-FLUSH = 0.999  # so parallel (cosine) to a neighbour is a face that got lost
-MANY = 2000  # triangles that take some seconds
+WIDER, WIDEST = 1.25, 0.2  # growth and limit of the tolerance where `max_pieces` does not suffice
+MOST_FACES = 6000  # of all bodies and the sheet together, after simplification
+LEAST_FACES = 400  # that each body or sheet may keep
+GONE = 5e-3  # a face this far from the simplified sheet was lost, and is restored: 0.2 mm at 40 mm
+FLAPS = 1e-4  # most area (largest extent squared) of flaps without volume on a solid
+SMALL_HOLE = 0.05  # perimeter, in largest extents, below which a hole is damage, not an opening
+LONGEST_LOOP = 64  # most edges round a hole that may be closed
+FLUSH = 0.999  # least cosine between the normals of a lost face and a neighbour
+MANY = 2000  # triangles; more take some seconds, which is logged
 
 
 def read_pieces(key: str) -> TactileObject | None:
-    """Read the pieces under this key; None if there are none, or they are damaged."""
-    path = _path(key)
+    """Read the cached pieces under a key; None if they are missing or damaged."""
+    path = _find_cache_file(key)
     if path is None:
         return None
     try:
@@ -81,7 +81,7 @@ def read_pieces(key: str) -> TactileObject | None:
             corners = np.split(file["vertices"], np.cumsum(file["corners"])[:-1])
             faces = np.split(file["faces"].astype(np.int64), np.cumsum(file["sides"])[:-1])
             error, made_by = float(file["surface_error"]), str(file["made_by"])
-    except Exception:  # damage shows itself in a dozen ways
+    except Exception:  # damage raises many kinds of error
         return None
     meshes = tuple(
         trimesh.Trimesh(v, f, process=False) for v, f in zip(corners, faces, strict=True)
@@ -90,8 +90,8 @@ def read_pieces(key: str) -> TactileObject | None:
 
 
 def write_pieces(key: str, thing: TactileObject) -> None:
-    """Keep the pieces under this key, if there is a place to keep them."""
-    path = _path(key)
+    """Write pieces into the cache under a key, if the cache can be written to."""
+    path = _find_cache_file(key)
     if path is None:
         return
     arrays: dict[str, Any] = {
@@ -107,26 +107,26 @@ def write_pieces(key: str, thing: TactileObject) -> None:
         write_whole(path, lambda file: np.savez(file, **arrays))
 
 
-def _path(key: str) -> Path | None:
-    """Return the file of a key; None where a user has no home."""
+def _find_cache_file(key: str) -> Path | None:
+    """Return the cache file of a key; None if the user has no home."""
     own = os.environ.get("TACTILE_RT_CACHE")
     if own:
         return Path(own) / f"{key}.npz"
     base = os.environ.get("XDG_CACHE_HOME", "")
-    if not os.path.isabs(base):  # the specification has relative paths ignored
+    if not os.path.isabs(base):  # the XDG specification ignores relative paths
         base = os.path.expanduser("~/.cache")
     return Path(base) / "tactile_rt" / "pieces" / f"{key}.npz" if os.path.isabs(base) else None
 
 
 def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh.Trimesh:
-    """Take triangles away within a tolerance, to about `most` of them.
+    """Simplify a mesh within a tolerance, to at most about `most` triangles.
 
-    Edges go in the order of quadric error metrics (Garland and Heckbert 1997); how far the surface
-    has moved is measured, both ways. A mesh with more triangles than can be dealt with is
-    simplified farther than the tolerance.
+    Edges collapse in the order of quadric error metrics (Garland and Heckbert 1997); the movement
+    of the surface is measured in both directions. Where even `most` triangles are too few for the
+    tolerance, it is exceeded.
 
     Args:
-        tolerance: how far the surface may move, in largest extents.
+        tolerance: largest allowed movement of the surface, in largest extents.
     """
     if len(mesh.faces) <= SHARES[0] * most:
         return mesh
@@ -135,7 +135,7 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
     for number in (round(share * most) for share in SHARES):
         if len(mesh.faces) <= number:
             return mesh
-        fewer = _with_faces(mesh, number)
+        fewer = _reduce_faces(mesh, number)
         after = TriangleSurface(fewer.triangles)
         moved = max(after.distance(points).max(), before.distance(some(after.points)).max())
         if moved <= tolerance:
@@ -143,7 +143,7 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
     return fewer
 
 
-def _with_faces(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
+def _reduce_faces(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
     arrays, fewer = (np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32)), mesh
     for haste in HASTE:
         corners, faces = simplify(*arrays, target_count=number, agg=haste)
@@ -154,9 +154,9 @@ def _with_faces(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
 
 
 def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:
-    """What a mesh file holds, as convex pieces in the unit box.
+    """Load a mesh file as convex pieces in the unit box.
 
-    A scene is taken as one rigid object. The unit of the file does not matter.
+    A scene counts as one rigid object. The unit of the file does not matter.
     """
     check_mesh_file(path)
     asked = (detail.surface_error_mm, detail.max_pieces, detail.hull, detail.up)
@@ -173,22 +173,22 @@ def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:
                 "%s: %d triangles to pieces; this takes some seconds, once", path, len(mesh.faces)
             )
         with np.errstate(all="ignore"):  # parts without a volume have no centre
-            thing = _pieces(mesh, detail)
+            thing = _cut_into_pieces(mesh, detail)
         write_pieces(key, thing)
         if slow:
             error, took = SIZE_MM * thing.surface_error, time.monotonic() - began
-            told = "%s: %d pieces within %.2f mm at 40 mm, %.1f s"
-            log.info(told, path, len(thing.pieces), error, took)
+            message = "%s: %d pieces within %.2f mm at 40 mm, %.1f s"
+            log.info(message, path, len(thing.pieces), error, took)
     return replace(thing, name=path.stem, category=path.stem)
 
 
-def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject:
+def _cut_into_pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject:
     drawn = TriangleSurface(mesh.triangles)
     if detail.hull:
         hull = (mesh.convex_hull,)
         return TactileObject("", "", hull, deviation(drawn, hull), "hull")
     tolerance = detail.surface_error_mm / SIZE_MM
-    bodies, sheet = _simplify_parts(*_bodies_and_sheet(_mended(mesh)), SIMPLER * tolerance)
+    bodies, sheet = _simplify_parts(*_split_bodies_and_sheet(_repair(mesh)), SIMPLER * tolerance)
     if len(bodies) > detail.max_pieces:
         bodies = [outer_solid(bodies)]
     solids = [SolidPieces(body) for body in bodies]
@@ -206,7 +206,7 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject:
     for solid in solids:
         left -= len(solid)
         corners += solid.corners(spare=max(0, detail.max_pieces - len(corners) - left - len(solid)))
-    # Corners that rounding doubled would leave faces without area.
+    # Corners that coincide after rounding would leave faces without area.
     rounded = (np.unique(c.round(DIGITS), axis=0) for c in corners)
     pieces = tuple(map(trimesh.convex.convex_hull, rounded))
     error = deviation(drawn, pieces, bodies)
@@ -214,20 +214,20 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject:
     return TactileObject("", "", pieces, error, made_by)
 
 
-def _mended(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with vertices that are one joined, and small damage to it repaired."""
+def _repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the mesh with coincident vertices merged and small damage repaired."""
     mesh = mesh.copy()
-    if not mesh.is_watertight:  # merged only if need be: bodies that touch would grow together
+    if not mesh.is_watertight:  # merged only if necessary: touching bodies would grow together
         mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=MERGE_DIGITS)
         mesh.update_faces(mesh.nondegenerate_faces())
         mesh.remove_unreferenced_vertices()
     if mesh.is_watertight:
         return mesh
-    return trimesh.Trimesh(mesh.vertices, [*mesh.faces.tolist(), *_lost(mesh)], process=False)
+    return trimesh.Trimesh(mesh.vertices, [*mesh.faces.tolist(), *_fill_holes(mesh)], process=False)
 
 
-def _lost(mesh: trimesh.Trimesh) -> list[list[int]]:
-    """Faces that close holes which are small, or flush with a face beside them."""
+def _fill_holes(mesh: trimesh.Trimesh) -> list[list[int]]:
+    """Return faces that fill holes which are small, or flush with a neighbour."""
     single = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
     beside: dict[int, list[int]] = {}
     faces: dict[int, list[Floats]] = {}
@@ -257,9 +257,9 @@ def _lost(mesh: trimesh.Trimesh) -> list[list[int]]:
     return found
 
 
-def _bodies_and_sheet(mesh: trimesh.Trimesh) -> tuple[list[Manifold], trimesh.Trimesh]:
-    """The solid bodies of a mesh, and the faces that enclose nothing."""
-    # first by all edges that faces share, then, of what is not closed, by those of two faces only
+def _split_bodies_and_sheet(mesh: trimesh.Trimesh) -> tuple[list[Manifold], trimesh.Trimesh]:
+    """Split a mesh into its solid bodies and the faces that enclose nothing."""
+    # connect faces by all shared edges first, then those left open by edges of two faces only
     edges = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)[1].ravel()
     order = np.argsort(edges, kind="stable")
     same = edges[order][1:] == edges[order][:-1]
@@ -269,7 +269,7 @@ def _bodies_and_sheet(mesh: trimesh.Trimesh) -> tuple[list[Manifold], trimesh.Tr
         among = neighbours[np.isin(neighbours, left).all(axis=1)]
         open_faces = []
         for part in trimesh.graph.connected_components(among, nodes=left):
-            found = _solid(mesh.submesh([part], append=True, repair=False))
+            found = _make_solids(mesh.submesh([part], append=True, repair=False))
             bodies += found
             if not found:
                 open_faces.append(part)
@@ -283,16 +283,16 @@ def _bodies_and_sheet(mesh: trimesh.Trimesh) -> tuple[list[Manifold], trimesh.Tr
 def _simplify_parts(
     bodies: list[Manifold], sheet: trimesh.Trimesh, tolerance: float
 ) -> tuple[list[Manifold], trimesh.Trimesh]:
-    """Simplify bodies and sheet, each to its share of the triangles allowed."""
+    """Simplify bodies and sheet, each to its share of the allowed triangles."""
     number = sum(body.num_tri() for body in bodies) + len(sheet.faces)
     share = MOST_FACES / max(number, MOST_FACES)
     simpler = []
     for body in bodies:
         least = max(LEAST_FACES, round(share * body.num_tri()))
-        found = _solid(simplify_mesh(surface_of(body), tolerance, least))
+        found = _make_solids(simplify_mesh(surface_of(body), tolerance, least))
         simpler += found or [body]
     fewer = simplify_mesh(sheet, tolerance, max(LEAST_FACES, round(share * len(sheet.faces))))
-    if len(fewer.faces) < len(sheet.faces):  # a large face at a border may have gone altogether
+    if len(fewer.faces) < len(sheet.faces):  # a large face at a border may be lost
         places = np.concatenate([sheet.triangles, sheet.triangles_center[:, None]], axis=1)
         away = TriangleSurface(fewer.triangles).distance(places.reshape(-1, 3)).reshape(-1, 4)
         gone = sheet.faces[away.max(axis=1) > GONE]
@@ -302,23 +302,23 @@ def _simplify_parts(
     return simpler, fewer
 
 
-def _solid(part: Any) -> list[Manifold]:
-    """The solid bodies that a part of a mesh encloses; none if it is open."""
+def _make_solids(part: Any) -> list[Manifold]:
+    """Return the solid bodies that a part of a mesh encloses; none if open."""
     counts = np.unique(part.edges_sorted, axis=0, return_counts=True)[1]
     if (counts % 2).any() or len(part.faces) < 4:
         return []
-    if not _balanced(part) or part.volume < 0:
+    if not _has_balanced_edges(part) or part.volume < 0:
         trimesh.repair.fix_normals(part, multibody=part.body_count > 1)
-    if not _balanced(part):
+    if not _has_balanced_edges(part):
         return []
     bodies = bodies_of(part)
     thick = all(b.volume() > max(SPECK, FOIL * b.surface_area()) for b in bodies)
-    lost = part.area - sum(b.surface_area() for b in bodies)  # faces that lie on each other
+    lost = part.area - sum(b.surface_area() for b in bodies)  # area of faces that lie on each other
     return bodies if thick and lost < FLAPS else []
 
 
-def _balanced(mesh: trimesh.Trimesh) -> bool:
-    """Whether every edge is run through as often one way as the other."""
+def _has_balanced_edges(mesh: trimesh.Trimesh) -> bool:
+    """Return whether the faces traverse every edge equally often in both directions."""
     edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)[1].ravel()
     way = np.where(mesh.edges[:, 0] < mesh.edges[:, 1], 1, -1)
     return not np.bincount(edge, weights=way).any()

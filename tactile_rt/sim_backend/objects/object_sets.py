@@ -1,15 +1,15 @@
-"""Folders of mesh files: which objects they hold, of which categories, and each by its name.
+"""Folders of mesh files: their objects by category and name.
 
-Two layouts, told apart by what is there:
+The files that exist decide between two layouts:
 
     ShapeNetCore    <synset>/<object id>/models/model_normalized.obj, and taxonomy.json beside them,
-                    whose names the categories get (else they are called by their synset)
+                    which names the categories (else their synsets do)
     plain           <category>/<object>.obj (or another of `mesh_files.MESH_SUFFIXES`), and
-                    perhaps objects.csv, which says which are alike and where they are from
+                    optionally objects.csv, with sources and the objects that are alike
 
 ShapeNet's meshes (Chang et al. 2015) are y-up and mostly sheets that enclose nothing. The published
-sweeps took such ones through a convex decomposition of their voxels (Chung et al. 2025); here the
-sheets become thin plates.
+sweeps use convex decompositions of their voxels (Chung et al. 2025); here the sheets become thin
+plates.
 """
 
 import json
@@ -35,14 +35,14 @@ FOLDER_TABLE = "objects.csv"
 
 
 class Origin(msgspec.Struct, frozen=True):
-    """What a folder's `objects.csv` says of an object, in the columns of these names.
+    """The origin of an object, from the columns of these names in a folder's `objects.csv`.
 
     Attributes:
         shape: The same for objects of a category that are variants, mirror images or copies of one
             thing; empty: no other is like it.
-        licence: The SPDX name of the licence that it comes under.
-        kind: What it is called, where categories are shapes.
-        attribution: Whom to name where the licence asks for it.
+        licence: The SPDX name of the object's licence.
+        kind: The object's kind within its category, where categories are shapes.
+        attribution: The credit that the licence demands.
     """
 
     shape: str = ""
@@ -76,7 +76,7 @@ class ObjectSet:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of all objects."""
+        """Names of all objects."""
         return tuple(self.paths)
 
     @cached_property
@@ -85,16 +85,16 @@ class ObjectSet:
         return {name: name.rpartition("/")[0] for name in self.paths}
 
     def path(self, name: str) -> Path:
-        """An object's file."""
+        """Return an object's file."""
         if name not in self.paths:
             raise ConfigError(f"{self.folder}: holds no object {name!r}")
         return self.paths[name]
 
     def load(self, name: str) -> TactileObject:
-        """An object as convex pieces, called ``category-object``.
+        """Load an object as convex pieces, named ``category-object``.
 
         Raises:
-            ConfigError: no such object, or its mesh cannot be used; `skipped` has it then.
+            ConfigError: no such object, or its mesh cannot be used: then `skipped` has the reason.
         """
         path = self.path(name)
         try:
@@ -107,7 +107,7 @@ class ObjectSet:
     def check(
         self, progress: Callable[[str], None] = lambda name: None
     ) -> dict[str, TactileObject]:
-        """Load every object once: the usable ones, without pieces; see `skipped`."""
+        """Load every object once; return the usable ones without pieces, see `skipped`."""
         found = {}
         for name in self.names:
             progress(name)
@@ -117,7 +117,7 @@ class ObjectSet:
 
 
 def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
-    """The objects in a folder.
+    """Find the objects in a folder.
 
     Args:
         detail: how meshes become pieces; in a ShapeNet folder y is up, unless it says otherwise.
@@ -127,29 +127,29 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
         raise ConfigError(f"{folder}: no such folder of objects")
     shapenet = sorted(folder.glob(f"*/*/{SHAPENET_FILE.as_posix()}"))
     if shapenet:
-        called = _taxonomy(folder)
-        named = [(called.get(p.parents[2].name, p.parents[2].name), p.parents[1].name, p)
+        titles = _read_taxonomy(folder)
+        named = [(titles.get(p.parents[2].name, p.parents[2].name), p.parents[1].name, p)
                  for p in shapenet]  # fmt: skip
-        return ObjectSet(folder, _named(folder, named), replace(detail, up=detail.up or "y"))
+        return ObjectSet(folder, _name_files(folder, named), replace(detail, up=detail.up or "y"))
     files = sorted(folder.glob("[!.]*/[!.]*"))
     plain = [p for p in files if p.suffix.lower() in MESH_SUFFIXES]
     read = {p.with_suffix("") for p in plain}
     unread = [p for p in files if p.suffix.lower() in UNREAD_SUFFIXES]
-    plain += [p for p in unread if p.with_suffix("") not in read]  # which are named, and why
+    plain += [p for p in unread if p.with_suffix("") not in read]  # to be refused with a reason
     if not plain:
         raise ConfigError(
             f"{folder}: holds no objects: expected category/object.obj (or "
             f"{', '.join(MESH_SUFFIXES[1:])}), or ShapeNet's synset/id/{SHAPENET_FILE.as_posix()}"
         )
     named = [(p.parent.name, p.stem, p) for p in plain]
-    return ObjectSet(folder, _named(folder, named), detail, dict(read_table(folder)))
+    return ObjectSet(folder, _name_files(folder, named), detail, dict(read_table(folder)))
 
 
-def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
-    """Files by names that files can have."""
+def _name_files(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
+    """Return files by object names that are valid as file names."""
     paths: dict[str, Path] = {}
     for category, stem, path in found:
-        name = f"{_safe(category)}/{_safe(stem)}"
+        name = f"{_clean_name(category)}/{_clean_name(stem)}"
         if name in paths:
             raise ConfigError(
                 f"{folder}: {paths[name].relative_to(folder)} and {path.relative_to(folder)} would "
@@ -160,7 +160,7 @@ def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
 
 
 def read_table(folder: Path) -> dict[str, ObjectRow]:
-    """Read the rows of a folder's table by their objects' names; none without a table."""
+    """Read the rows of a folder's table by object name; none without a table."""
     path = folder / FOLDER_TABLE
     if not path.exists():
         return {}
@@ -168,15 +168,15 @@ def read_table(folder: Path) -> dict[str, ObjectRow]:
     known = ("category", "name", *Origin.__struct_fields__)
     check_columns(table, known, known[:2])
     rows: list[ObjectRow] = [convert(row, ObjectRow) for row in table.rows]
-    return {f"{_safe(row.category)}/{_safe(row.name)}": row for row in rows}
+    return {f"{_clean_name(row.category)}/{_clean_name(row.name)}": row for row in rows}
 
 
-def _safe(name: str) -> str:
+def _clean_name(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name.strip())
 
 
-def _taxonomy(folder: Path) -> dict[str, str]:
-    """Name of every synset: the first of its synonyms."""
+def _read_taxonomy(folder: Path) -> dict[str, str]:
+    """Read the name of every synset: the first of its synonyms."""
     path = folder / TAXONOMY
     if not path.exists():
         return {}

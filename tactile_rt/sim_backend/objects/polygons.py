@@ -1,12 +1,12 @@
-"""Polygons cut into triangles: as fans where these are right, at their ears where they are not."""
+"""Triangulation of polygons: as fans where these are valid, by clipping ears where they are not."""
 
 import numpy as np
 from manifold3d import triangulate
 from numpy.typing import NDArray
 
 MOST_CORNERS = 10_000
-SLIVER = 1e-9  # of all extents squared: a triangle of less area shows nowhere
-FOLD = 1e-6  # of a polygon's area: a triangle of a fan that lies so far outside folds back over it
+SLIVER = 1e-9  # of the largest extent squared: a triangle of less area is ignored
+FOLD = 1e-6  # of a polygon's area: a fan's triangle of more negative area folds back over it
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 
@@ -15,12 +15,12 @@ def cut_polygons(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Cut polygons into triangles that cover them, in their order.
 
     Args:
-        vertices: (n, 3) places.
-        corners: the vertices of all polygons, one after the other.
-        sizes: how many corners each has, 3 at least.
+        vertices: (n, 3) positions.
+        corners: the vertex numbers of all polygons, one polygon after the other.
+        sizes: number of corners of each polygon, at least 3.
 
     Returns:
-        (m, 3) vertices of triangles, `size - 2` for each polygon.
+        (m, 3) vertex numbers of triangles, `size - 2` for each polygon.
     """
     if sizes.max(initial=3) > MOST_CORNERS:
         raise ValueError(f"a face has {sizes.max()} corners, more than {MOST_CORNERS}; split it")
@@ -45,7 +45,7 @@ def cut_polygons(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
         ears = ring[np.asarray(triangulate([seen]), np.int64)]
         a, b, c = (places[:, corner] for corner in ears.T)
         sizes_of = (np.linalg.norm(x, axis=0).sum() for x in (_cross(b - a, c - a), areas[:, own]))
-        if np.subtract(*sizes_of) < -FOLD * area[own][0]:  # else it crosses itself
+        if np.subtract(*sizes_of) < -FOLD * area[own][0]:  # else the polygon crosses itself
             faces[own] = ears
     return faces
 
@@ -55,7 +55,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def flat(points: Floats, normal: Floats) -> Floats:
-    """Project points (n, 3) along a normal: (n, 2)."""
+    """Project points (n, 3) along a normal to (n, 2)."""
     one = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     one /= np.linalg.norm(one)
     seen: Floats = points @ np.stack([one, np.cross(normal, one)], axis=1)

@@ -1,7 +1,7 @@
 """A tactile object, and the convex building blocks that objects are made of.
 
-Lengths are in whatever unit the caller draws in; z is up. A block that cannot be one convex
-piece (a tube, a hollow wall) comes back as a list of pieces.
+Lengths are in the caller's own unit; z is up. A block that is not convex (a tube, a hollow wall)
+is returned as a list of convex pieces.
 """
 
 from collections.abc import Sequence
@@ -15,23 +15,23 @@ import trimesh
 Points = npt.NDArray[np.float64]
 Profile = Sequence[tuple[float, float]]  # (radius, z) from the bottom up
 
-# A 24-sided round of 40 mm departs from the circle by 0.17 mm, below what a whisker resolves.
+# A 24-sided polygon of 40 mm departs from its circle by 0.17 mm, less than a whisker resolves.
 ROUND = 24
 
 
 @dataclass(frozen=True)
 class TactileObject:
-    """A rigid thing: its bounding box centred at the origin, largest extent 1 (no unit), z up."""
+    """Rigid object, bounding box centred at the origin, largest extent 1 (no unit), z up."""
 
     name: str  # "mug-17", or the file's stem
     category: str  # "mug", or the file's stem for a mesh file
     pieces: tuple[trimesh.Trimesh, ...]  # convex, watertight, wound outward; union = the object
-    surface_error: float = 0.0  # farthest that the pieces' surface is from the mesh's, of extent 1
-    made_by: str = "drawn"  # how it became pieces: drawn so, or see `meshes`
+    surface_error: float = 0.0  # largest distance of the pieces from the mesh, in largest extents
+    made_by: str = "drawn"  # origin of the pieces: drawn as such, or as in `meshes`
 
 
 def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
-    """The pieces moved and scaled together into the unit box."""
+    """Return the pieces moved and scaled together into the unit box."""
     corners = np.vstack([piece.bounds for piece in pieces])
     low, high = corners.min(axis=0), corners.max(axis=0)
     centre, scale = (low + high) / 2, 1 / (high - low).max()
@@ -42,13 +42,13 @@ def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]
 
 
 def moved(points: Points, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Points:
-    """(n, 3) points moved by so much."""
-    there: Points = points + np.array([x, y, z])
-    return there
+    """Return points (n, 3) shifted by (x, y, z)."""
+    shifted: Points = points + np.array([x, y, z])
+    return shifted
 
 
 def stretched(pieces: Sequence[trimesh.Trimesh], factors: npt.ArrayLike) -> list[trimesh.Trimesh]:
-    """The pieces made longer or shorter along x, y and z by positive factors."""
+    """Return the pieces scaled along x, y and z by positive factors."""
     return [
         trimesh.Trimesh(piece.vertices * np.asarray(factors), piece.faces, process=False)
         for piece in pieces
@@ -56,7 +56,7 @@ def stretched(pieces: Sequence[trimesh.Trimesh], factors: npt.ArrayLike) -> list
 
 
 def hull(*points: npt.ArrayLike) -> trimesh.Trimesh:
-    """Convex hull of one or more (n, 3) groups of points."""
+    """Return the convex hull of one or more groups of points (n, 3)."""
     solid: trimesh.Trimesh = trimesh.convex.convex_hull(np.vstack(points))
     return solid
 
@@ -64,7 +64,7 @@ def hull(*points: npt.ArrayLike) -> trimesh.Trimesh:
 def ring(
     radius: float, z: float, sides: int = ROUND, squash: float = 1.0, turn: float = 0.0
 ) -> Points:
-    """(sides, 3) points of a horizontal circle at height z, its y scaled by `squash`."""
+    """Return points (sides, 3) of a horizontal circle at height z, y scaled by `squash`."""
     angle = turn + np.arange(sides) * (2 * np.pi / sides)
     return np.column_stack(
         [radius * np.cos(angle), squash * radius * np.sin(angle), np.full(sides, z)]
@@ -72,7 +72,7 @@ def ring(
 
 
 def slab(x: float, y: float, z: float, cut: float = 0.0, centre: float = 0.0) -> Points:
-    """(4 or 8, 3) corners of a horizontal x by y rectangle at height z, corners cut by `cut`."""
+    """Return corners (8, 3) of an x by y rectangle at z, chamfered by `cut`."""
     a, b = x / 2, y / 2
     corners = [(a - cut, b), (a, b - cut), (a, cut - b), (a - cut, -b)]
     quarter = corners + [(-u, -v) for u, v in corners]
@@ -80,13 +80,13 @@ def slab(x: float, y: float, z: float, cut: float = 0.0, centre: float = 0.0) ->
 
 
 def box(centre: Sequence[float], size: Sequence[float]) -> trimesh.Trimesh:
-    """Axis-aligned box."""
+    """Return an axis-aligned box."""
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return hull(np.asarray(centre) + signs * np.asarray(size) / 2)
 
 
 def ball(centre: npt.ArrayLike, radius: float) -> trimesh.Trimesh:
-    """Ball of 48 corners, its flats 0.05 radii inside the sphere at most."""
+    """Return a ball of 48 corners, its flats at most 0.05 radii inside the sphere."""
     rings = [
         ring(np.cos(a), np.sin(a), 12, turn=(k % 2) * np.pi / 12)
         for k, a in enumerate(np.radians([-67.5, -22.5, 22.5, 67.5]))
@@ -94,11 +94,11 @@ def ball(centre: npt.ArrayLike, radius: float) -> trimesh.Trimesh:
     return hull(np.asarray(centre) + radius * np.vstack(rings))
 
 
-def _across(start: Points, end: Points) -> Points:
-    """(2, 3) unit vectors across the line from start to end.
+def _find_section_axes(start: Points, end: Points) -> Points:
+    """Return unit vectors (2, 3) across the line from start to end.
 
-    Along x and y for a steep line, horizontal and upward for a flat one: so that a rectangular
-    section never rolls about its own axis.
+    They lie along x and y for a steep line, horizontal and upward for a flat one, so that a
+    rectangular section never rolls about its own axis.
     """
     along = (end - start) / np.linalg.norm(end - start)
     steep = abs(along[2]) > 0.8
@@ -109,9 +109,9 @@ def _across(start: Points, end: Points) -> Points:
 
 
 def _loft(start: npt.ArrayLike, end: npt.ArrayLike, one: Points, two: Points) -> trimesh.Trimesh:
-    """Hull of the (n, 2) section `one` set across the line at its start and `two` at its end."""
+    """Return the hull of sections `one` and `two` (n, 2), set across a line's ends."""
     a, b = np.asarray(start, float), np.asarray(end, float)
-    across = _across(a, b)
+    across = _find_section_axes(a, b)
     return hull(a + one @ across, b + two @ across)
 
 
@@ -122,7 +122,7 @@ def rod(
     end_radius: float | None = None,
     sides: int = 12,
 ) -> trimesh.Trimesh:
-    """Round bar, tapered when `end_radius` is given."""
+    """Return a round bar, tapered if `end_radius` is given."""
     circle = ring(1.0, 0.0, sides)[:, :2]
     return _loft(start, end, radius * circle, (end_radius or radius) * circle)
 
@@ -130,7 +130,7 @@ def rod(
 def bar(
     start: npt.ArrayLike, end: npt.ArrayLike, width: float, height: float, taper: float = 1.0
 ) -> trimesh.Trimesh:
-    """Rectangular bar: width by height at the start, `taper` times that at the end.
+    """Return a rectangular bar, width by height, scaled by `taper` towards its end.
 
     `width` is the x side of a steep bar and the horizontal side of a flat one.
     """
@@ -139,7 +139,7 @@ def bar(
 
 
 def tube(path: Sequence[npt.ArrayLike], radius: float, sides: int = 10) -> list[trimesh.Trimesh]:
-    """Round bars along a path, one a segment, each run a little into the next at the bends."""
+    """Return round bars along a path, one per segment, overlapping at the bends."""
     points = np.asarray(path, float)
     steps = np.diff(points, axis=0)
     extra = 0.4 * radius * steps / np.linalg.norm(steps, axis=1, keepdims=True)
@@ -150,17 +150,17 @@ def tube(path: Sequence[npt.ArrayLike], radius: float, sides: int = 10) -> list[
 
 
 def lathe(profile: Profile, sides: int = ROUND) -> list[trimesh.Trimesh]:
-    """Solid of revolution: one frustum for each step of the profile."""
+    """Return a solid of revolution: one frustum for each step of the profile."""
     return [
         hull(ring(r0, z0, sides), ring(r1, z1, sides)) for (r0, z0), (r1, z1) in pairwise(profile)
     ]
 
 
 def wall(profile: Profile, thickness: float, segments: int = 8) -> list[trimesh.Trimesh]:
-    """Hollow solid of revolution: `segments` staves standing round an empty middle.
+    """Return a hollow solid of revolution: `segments` staves around an empty middle.
 
-    The outside follows the profile (which must bulge outward) with ROUND sides; the inside of a
-    stave is flat, which only the inside shows.
+    The outside follows the profile (which must bulge outward) with ROUND sides; each stave is
+    flat on the inside.
     """
     facets = ROUND // segments
     staves = []

@@ -1,4 +1,4 @@
-"""Things in a room, to sit on, sit at, climb and light it: legs, seats, treads, a shade."""
+"""Furniture to sit on, sit at, climb and light a room: legs, seats, treads, a shade."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,7 +8,7 @@ from tactile_rt.sim_backend.objects.solids import bar, box, hull, lathe, ring, r
 
 
 def chair(rng: Generator) -> list[Trimesh]:
-    """Four legs, a seat at half height, an open or closed back."""
+    """Build four legs, a seat at half height and an open or closed back."""
     u = rng.uniform
     w, d, seat, leg = u(0.4, 0.52), u(0.38, 0.5), u(0.4, 0.5), u(0.035, 0.055)
     thick, lean, splay = u(0.035, 0.07), u(0.0, 0.1), u(0.0, 0.05)
@@ -22,7 +22,7 @@ def chair(rng: Generator) -> list[Trimesh]:
     tip = -x - lean
 
     def back(z: float) -> float:
-        """x of the leaning back at height z."""
+        """Return x of the leaning back at height z."""
         return -x + (tip + x) * (z - seat) / (top - seat)
 
     pieces += [bar((-x, j * y, seat), (tip, j * y, top), leg, leg) for j in (-1, 1)]
@@ -48,17 +48,17 @@ def chair(rng: Generator) -> list[Trimesh]:
 
 
 def ladder(rng: Generator) -> list[Trimesh]:
-    """A stepladder: treads between leaning front rails, two back legs, a cap."""
+    """Build a stepladder: treads between leaning front rails, two back legs, a cap."""
     u = rng.uniform
     bottom, reach, rail = u(0.4, 0.52), u(0.2, 0.3), u(0.03, 0.04)
     top, depth, back = bottom * u(0.6, 0.8), u(0.07, 0.11), u(0.16, 0.26)
 
     def front(side: float, z: float) -> tuple[float, float, float]:
-        """A point of the front rails at height z; side -1 to 1 across."""
+        """Return a point of the front rails at height z, side -1 to 1."""
         return (-0.04 - reach * (1 - z), side * (bottom + (top - bottom) * z) / 2, z)
 
     def rear(side: float, z: float) -> tuple[float, float, float]:
-        """The same on the back legs."""
+        """Return the same point of the back legs."""
         return (0.04 + back * (1 - z), 0.9 * side * (bottom + (top - bottom) * z) / 2, z)
 
     pieces = [box((0, 0, 0.985), (0.16, top + rail, 0.03))]
@@ -74,7 +74,7 @@ def ladder(rng: Generator) -> list[Trimesh]:
 
 
 def lamp(rng: Generator) -> list[Trimesh]:
-    """A flat base, a thin pole, a wide open shade."""
+    """Build a flat base, a thin pole and a wide open shade."""
     u = rng.uniform
     base, foot, pole = u(0.16, 0.25), u(0.03, 0.05), u(0.02, 0.032)
     low, rim = u(0.47, 0.58), u(0.25, 0.34)
@@ -90,9 +90,9 @@ def lamp(rng: Generator) -> list[Trimesh]:
 
 
 def stool(rng: Generator) -> list[Trimesh]:
-    """A small thick seat on three or four splayed legs, joined by rungs.
+    """Build a small thick seat on three or four splayed legs, joined by rungs.
 
-    By touch: a few round posts drawn together upward, bridged half way up.
+    By touch: a few round posts that converge upward, bridged half way up.
     """
     u = rng.uniform
     legs, seat, thick, leg = int(rng.integers(3, 5)), u(0.24, 0.32), u(0.06, 0.1), u(0.028, 0.042)
@@ -101,7 +101,7 @@ def stool(rng: Generator) -> list[Trimesh]:
     turns = 2 * np.pi * (np.arange(legs) + 0.5) / legs
 
     def on(turn: float, z: float) -> tuple[float, float, float]:
-        """The axis of the leg at height z."""
+        """Return the point of a leg's axis at height z; `turn` in rad."""
         r = spread + (0.7 * seat - spread) * z
         return (r * np.cos(turn), r * np.sin(turn), z)
 
@@ -114,7 +114,7 @@ def stool(rng: Generator) -> list[Trimesh]:
 
 
 def table(rng: Generator) -> list[Trimesh]:
-    """A wide top on three to six legs."""
+    """Build a wide top on three to six legs."""
     u = rng.uniform
     depth, height, thick, leg = u(0.55, 0.95), u(0.55, 0.75), u(0.035, 0.06), u(0.045, 0.075)
     splay, taper, inset = u(0.0, 0.06), u(0.55, 1.0), u(0.05, 0.1)

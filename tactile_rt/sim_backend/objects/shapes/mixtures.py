@@ -1,4 +1,4 @@
-"""Things of no kind, from which a model can learn what it does not know.
+"""Objects of no kind, from which a model can learn to refuse unknown objects.
 
 Each builder draws one object from `rng`, upright, in a unit of its own.
 """
@@ -15,14 +15,14 @@ Builder = Callable[[Generator], list[Trimesh]]
 
 
 def assembly(rng: Generator) -> list[Trimesh]:
-    """Two to seven solids of any form, each grown into one that was there before."""
-    pieces = [_solid(rng)]
+    """Build two to seven solids of any form, each grown into an earlier one."""
+    pieces = [_draw_solid(rng)]
     for _ in range(int(rng.integers(1, 7))):
-        other = _solid(rng)
+        other = _draw_solid(rng)
         host = pieces[int(rng.integers(len(pieces)))]
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-        # its nearest corner inside its host, towards the host's farthest
+        # put its nearest corner inside its host, close to the host's farthest corner
         far = host.vertices[(host.vertices @ direction).argmax()]
         near = other.vertices[(other.vertices @ direction).argmin()]
         inside = far + rng.uniform(0.2, 0.5) * (host.centroid - far)
@@ -31,13 +31,13 @@ def assembly(rng: Generator) -> list[Trimesh]:
 
 
 def medley(rng: Generator, builders: Sequence[Builder]) -> list[Trimesh]:
-    """The lower part of a thing of one kind, a board on it, the upper part of another's on that.
+    """Build the lower part of one kind, a board on it, and another's upper part.
 
-    What the board does not reach hangs in the air.
+    Pieces that the board does not reach hang in the air.
     """
     first, second = rng.choice(len(builders), 2, replace=False)
-    lower = _half(builders[first](rng), below=True)
-    upper = _half(builders[second](rng), below=False)
+    lower = _take_half(builders[first](rng), below=True)
+    upper = _take_half(builders[second](rng), below=False)
     top = max(float(piece.bounds[1, 2]) for piece in lower)
     foot = min(float(piece.bounds[0, 2]) for piece in upper)
     raised = [hull(moved(piece.vertices, z=top - foot)) for piece in upper]
@@ -48,8 +48,8 @@ def medley(rng: Generator, builders: Sequence[Builder]) -> list[Trimesh]:
     return stretched([*lower, board, *raised], 1.25 ** rng.uniform(-1, 1, 3))
 
 
-def _solid(rng: Generator) -> Trimesh:
-    """A box, a prism, a cone or a ball, stretched and turned; about 1 large."""
+def _draw_solid(rng: Generator) -> Trimesh:
+    """Draw a box, prism, cone or ball, stretched, half of them turned; about 1 large."""
     form = rng.integers(4)
     if form == 0:
         points = np.vstack([slab(1, 1, -0.5), slab(1, 1, 0.5)])
@@ -69,8 +69,8 @@ def _solid(rng: Generator) -> Trimesh:
     return hull(points)
 
 
-def _half(pieces: Sequence[Trimesh], below: bool) -> list[Trimesh]:
-    """The pieces of a thing whose middle is below that of the whole, or the others; or all."""
+def _take_half(pieces: Sequence[Trimesh], below: bool) -> list[Trimesh]:
+    """Return the pieces centred below or above the middle of the whole; all if none."""
     whole = normalised(pieces)
     mine = [piece for piece in whole if (float(piece.centroid[2]) < 0) == below]
     return mine or list(whole)

@@ -1,4 +1,4 @@
-"""Things met outside: buildings, and what grows or stands in a garden, a wood or a desert."""
+"""Outdoor objects: buildings, and what grows or stands in a garden, a wood or a desert."""
 
 import numpy as np
 from numpy.random import Generator
@@ -7,10 +7,10 @@ from trimesh import Trimesh
 from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, lathe, ring, rod
 
 
-def _ribbed(
+def _build_column(
     base: tuple[float, float, float], height: float, radius: float, ribs: int
 ) -> list[Trimesh]:
-    """A column of star section with a domed top: blades crossed on one axis, two ribs a blade."""
+    """Build a domed column of star section from crossed blades, two ribs per blade."""
     blades, pieces = ribs // 2, []
     half = 0.55 * radius * np.sin(np.pi / ribs)
     dome = [(1.0, 0.0), (1.0, height - 0.8 * radius), (0.75, height - 0.25 * radius), (0.3, height)]
@@ -27,7 +27,7 @@ def _ribbed(
 
 
 def beehive(rng: Generator) -> list[Trimesh]:
-    """A straw skep: coils laid on one another, drawing in to a closed top, on a stand.
+    """Build a straw skep: stacked coils narrowing to a closed top, perhaps on a stand.
 
     By touch: round ridges, level and close, each a little behind the one below.
     """
@@ -45,10 +45,10 @@ def beehive(rng: Generator) -> list[Trimesh]:
 
 
 def cactus(rng: Generator) -> list[Trimesh]:
-    """A ribbed column with one to three ribbed arms bent upward."""
+    """Build a ribbed column with one to three ribbed arms bent upward."""
     u = rng.uniform
     radius, arms = u(0.11, 0.16), int(rng.integers(1, 4))
-    pieces = _ribbed((0, 0, 0), 1.0, radius, int(rng.choice([8, 10])))
+    pieces = _build_column((0, 0, 0), 1.0, radius, int(rng.choice([8, 10])))
     first = u(0, 2 * np.pi)
     for a in range(arms):
         turn = first + 2 * np.pi * a / max(arms, 2) + u(-0.3, 0.3)
@@ -57,12 +57,12 @@ def cactus(rng: Generator) -> list[Trimesh]:
         elbow = (*(reach * out), z)
         pieces.append(rod((0, 0, z), elbow, 0.85 * thin))
         base = (elbow[0], elbow[1], z - 0.85 * thin)
-        pieces += _ribbed(base, u(0.25, 0.85 - z + 0.1), thin, 6)
+        pieces += _build_column(base, u(0.25, 0.85 - z + 0.1), thin, 6)
     return pieces
 
 
 def castle(rng: Generator) -> list[Trimesh]:
-    """Curtain walls between four round towers under pointed or flat tops.
+    """Build curtain walls between four round towers under pointed or flat tops.
 
     By touch: a round column at each corner of a flat wall that stands back between them.
     """
@@ -89,7 +89,7 @@ def castle(rng: Generator) -> list[Trimesh]:
 
 
 def grapes(rng: Generator) -> list[Trimesh]:
-    """A bunch hanging from its stalk: rounds of berries, fewer to a round downward.
+    """Build a bunch on a stalk: rounds of berries, fewer in each lower round.
 
     By touch: small round bumps on all sides, above and beside one another, no flat between.
     """
@@ -113,7 +113,7 @@ def grapes(rng: Generator) -> list[Trimesh]:
 
 
 def house(rng: Generator) -> list[Trimesh]:
-    """Walls under a gabled roof with eaves, a chimney, a wing on some.
+    """Build walls under a gabled roof with eaves and a chimney, perhaps a wing.
 
     By touch: a flat wall, an edge that juts out over it, a slope that recedes above.
     """
@@ -123,7 +123,7 @@ def house(rng: Generator) -> list[Trimesh]:
     long = 1 - 2 * gable
 
     def roof(x: float, y: float, length: float, width: float, rise: float) -> Trimesh:
-        """A solid gable along x with its eaves at the top of the walls."""
+        """Build a solid gable along x with its eaves at the top of the walls."""
         a, b = length / 2, width / 2
         low = [
             (x + i * a, y + j * b, wall - k) for i in (-1, 1) for j in (-1, 1) for k in (0, thick)
@@ -147,7 +147,7 @@ def house(rng: Generator) -> list[Trimesh]:
 
 
 def mushroom(rng: Generator) -> list[Trimesh]:
-    """A wide round cap on a thick stem.
+    """Build a wide round cap on a thick stem.
 
     By touch: a broad rim with nothing below it but a stem far behind, and a dome above.
     """
@@ -165,7 +165,7 @@ def mushroom(rng: Generator) -> list[Trimesh]:
 
 
 def pagoda(rng: Generator) -> list[Trimesh]:
-    """Storeys of a tower, each under a wide roof with thin eaves, a spire on top.
+    """Build a tower of storeys under wide roofs with thin eaves, and a spire.
 
     By touch: square shelves that jut far out one above the other, drawing in upward.
     """
@@ -188,14 +188,14 @@ def pagoda(rng: Generator) -> list[Trimesh]:
 
 
 def pumpkin(rng: Generator) -> list[Trimesh]:
-    """Six to eight fat lobes round a core, a stalk.
+    """Build six to eight fat lobes round a core, with a stalk.
 
     By touch: broad smooth bulges side by side, a crease running up between each two.
     """
     u = rng.uniform
     lobes, out, squash = int(rng.integers(6, 9)), u(0.24, 0.29), u(0.75, 1.05)
     radius, lean = 0.5 - out, u(-0.06, 0.06)
-    wide = out * np.tan(np.pi / lobes) * u(1.25, 1.5)  # half of a lobe, past its neighbour's
+    wide = out * np.tan(np.pi / lobes) * u(1.25, 1.5)  # half a lobe's width, with an overlap
     pieces = []
     for turn in 2 * np.pi * np.arange(lobes) / lobes:
         c, s = np.cos(turn), np.sin(turn)
@@ -211,7 +211,7 @@ def pumpkin(rng: Generator) -> list[Trimesh]:
 
 
 def snowman(rng: Generator) -> list[Trimesh]:
-    """Three balls, each smaller than the one below, a hat, a nose, stick arms.
+    """Build three balls, smaller upward, with a hat, a nose and stick arms.
 
     By touch: round bulges with a deep crease between them, and a twig at either side.
     """

@@ -1,4 +1,4 @@
-"""Things handled: from a shelf, a workshop, a gymnasium or a toy box."""
+"""Handheld objects from a shelf, a workshop, a gymnasium or a toy box."""
 
 from itertools import pairwise
 
@@ -10,7 +10,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, ball, hull, lathe, rod,
 
 
 def birdcage(rng: Generator) -> list[Trimesh]:
-    """Upright wires round a floor, bent together over it, with a knob.
+    """Build upright wires round a floor, bent together over it, with a knob.
 
     By touch: thin posts at even steps round a circle, air behind them.
     """
@@ -31,7 +31,7 @@ def birdcage(rng: Generator) -> list[Trimesh]:
 
 
 def dumbbell(rng: Generator) -> list[Trimesh]:
-    """A bar lying flat with a weight at either end: a cut prism, plates or a ball."""
+    """Build a lying bar with a weight at either end: prism, plates or ball."""
     u = rng.uniform
     r, grip = u(0.19, 0.26), u(0.03, 0.045)
     kind, sides, inner = rng.integers(3), int(rng.choice([6, 8])), u(0.14, 0.22)
@@ -61,7 +61,7 @@ def dumbbell(rng: Generator) -> list[Trimesh]:
 
 
 def gear(rng: Generator) -> list[Trimesh]:
-    """A thick toothed ring lying flat."""
+    """Build a thick toothed ring lying flat."""
     u = rng.uniform
     teeth, half, root = int(rng.integers(8, 15)), u(0.13, 0.22), u(0.37, 0.42)
     hole, twist = u(0.1, 0.2), u(-0.12, 0.12)  # radians between bottom and top: helical teeth
@@ -80,7 +80,7 @@ def gear(rng: Generator) -> list[Trimesh]:
 
 
 def hourglass(rng: Generator) -> list[Trimesh]:
-    """Two bulbs that meet in a narrow neck, a plate at either end.
+    """Build two bulbs that meet in a narrow neck, with a plate at either end.
 
     By touch: a round body that narrows to almost nothing half way up and swells again.
     """
@@ -98,7 +98,7 @@ def hourglass(rng: Generator) -> list[Trimesh]:
 
 
 def jack(rng: Generator) -> list[Trimesh]:
-    """The playing piece: three crossed bars, a ball at every end, or points at two of the six.
+    """Build a toy jack: three crossed bars ending in balls, two perhaps in points.
 
     By touch: knobs on thin stalks, far apart, nothing between.
     """
@@ -123,7 +123,7 @@ def jack(rng: Generator) -> list[Trimesh]:
 
 
 def spring(rng: Generator) -> list[Trimesh]:
-    """A steep coil of thick wire.
+    """Build a steep coil of thick wire.
 
     By touch: slanting round ridges one above the other, a gap under each.
     """

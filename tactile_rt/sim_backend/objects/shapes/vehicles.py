@@ -1,4 +1,4 @@
-"""Things that go: on wheels, through the air. Each heads along +x."""
+"""Vehicles on wheels and in the air. Each heads along +x."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,7 +8,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, box, hull, ring, rod, s
 
 
 def car(rng: Generator) -> list[Trimesh]:
-    """A low body with a cabin, on four wheels: saloon, estate, van or pickup."""
+    """Build a low body with a cabin on four wheels: saloon, estate, van or pickup."""
     u = rng.uniform
     width, wheel = u(0.36, 0.44), u(0.095, 0.125)
     belt = wheel + u(0.11, 0.15)
@@ -42,7 +42,7 @@ def car(rng: Generator) -> list[Trimesh]:
 
 
 def plane(rng: Generator) -> list[Trimesh]:
-    """An airliner in level flight: fuselage, swept wings, tail, engines under the wings."""
+    """Build an airliner in level flight: fuselage, swept wings, tail, engines under the wings."""
     u = rng.uniform
     r, sweep, taper = u(0.055, 0.08), u(0.05, 0.28), u(0.35, 0.7)
     span, chord, rise = u(0.4, 0.5), u(0.16, 0.24), u(-0.02, 0.08)
@@ -54,7 +54,7 @@ def plane(rng: Generator) -> list[Trimesh]:
     ]
 
     def blade(x: float, z: float, tip: tuple[float, float, float], long: float) -> Trimesh:
-        """A tapered plate from the middle line to its tip, the leading edges at x and tip."""
+        """Build a tapered plate from the middle line to `tip`, its leading edge at x."""
         n = np.array([0, 0, 0.016]) if tip[1] else np.array([0, 0.016, 0])
         start, end = np.array([x, 0, z]), np.array(tip)
         edges = [(start, 0.0), (start, long), (end, 0.0), (end, taper * long)]
@@ -75,13 +75,13 @@ def plane(rng: Generator) -> list[Trimesh]:
 
 
 def _disc(x: float, radius: float, z: float = 0.0) -> np.ndarray:
-    """A circle of the fuselage at x, its middle at height z."""
+    """Return points (16, 3) of a fuselage circle at x, its centre at height z."""
     circle = ring(radius, 0.0, 16)
     return np.column_stack([np.full(16, x), circle[:, 0], z + circle[:, 1]])
 
 
 def truck(rng: Generator) -> list[Trimesh]:
-    """A cab, a gap, a tall box, three axles.
+    """Build a cab, a gap, a tall box and three axles.
 
     By touch: two flat upright walls with a slot between them, over wheels.
     """

@@ -1,4 +1,4 @@
-"""Things that hold a drink: turned on a wheel, with or without a spout or a handle."""
+"""Vessels turned on a wheel, with or without a spout or a handle."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,7 +8,7 @@ from tactile_rt.sim_backend.objects.solids import lathe, rod, tube, wall
 
 
 def bottle(rng: Generator) -> list[Trimesh]:
-    """A slender body, a shoulder, a neck with a lip."""
+    """Build a slender body, a shoulder and a neck with a lip."""
     u = rng.uniform
     r, body, shoulder = u(0.13, 0.2), u(0.48, 0.64), u(0.1, 0.24)
     neck, waist, lip = r * u(0.3, 0.42), u(0.82, 1.0), u(0.035, 0.06)
@@ -25,7 +25,7 @@ def bottle(rng: Generator) -> list[Trimesh]:
 
 
 def bowl(rng: Generator) -> list[Trimesh]:
-    """A wide open cup on a small foot."""
+    """Build a wide open cup on a small foot."""
     u = rng.uniform
     foot, height, thick = u(0.17, 0.25), u(0.3, 0.46), u(0.05, 0.075)
     straight = u(0.0, 0.6)  # between a quarter ellipse and a cone
@@ -38,7 +38,7 @@ def bowl(rng: Generator) -> list[Trimesh]:
 
 
 def goblet(rng: Generator) -> list[Trimesh]:
-    """A round foot, a stem with a knob, a deep cup.
+    """Build a round foot, a stem with a knob and a deep cup.
 
     By touch: a thin stem below a round cup that overhangs it and grows wider upward.
     """
@@ -56,7 +56,7 @@ def goblet(rng: Generator) -> list[Trimesh]:
 
 
 def mug(rng: Generator) -> list[Trimesh]:
-    """A thick hollow cylinder with a handle at one side."""
+    """Build a thick hollow cylinder with a handle at one side."""
     u = rng.uniform
     low, high, thick = u(0.32, 0.42), u(0.35, 0.43), u(0.05, 0.075)
     middle = max(low, high) * u(1.0, 1.06) if rng.random() < 0.4 else (low + high) / 2
@@ -73,9 +73,9 @@ def mug(rng: Generator) -> list[Trimesh]:
 
 
 def teapot(rng: Generator) -> list[Trimesh]:
-    """A round belly with a spout, a handle opposite, a lid.
+    """Build a round belly with a spout, a handle opposite and a lid.
 
-    By touch: a ball, led or followed by a rising spout on one side and an open loop on the other.
+    By touch: a ball with a rising spout on one side and an open loop on the other.
     """
     u = rng.uniform
     radius, tall, base = u(0.27, 0.33), u(0.46, 0.6), u(0.55, 0.75)

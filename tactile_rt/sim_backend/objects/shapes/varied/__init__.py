@@ -1,8 +1,8 @@
-"""The same kinds drawn far more freely: as they differ from maker to maker, and in games and toys.
+"""The same kinds drawn more freely, as they differ between makers, and in games and toys.
 
-The builders of `shapes` draw each kind from one plan; a network learns that plan. Those here draw
-the plan, too: how many legs, whether there is a back, a handle, a roof or none, round or square,
-parts grown into one another or left out. A kind without a builder here is `shapes`' own.
+The builders of `shapes` draw each kind from one plan, which a network learns. Those here draw the
+plan, too: the number of legs, with or without back, handle or roof, round or square, parts grown
+into one another or left out. A kind without a builder here is built by `shapes`.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Things in a room, from one leg to five, from bars to blocks."""
+"""Furniture of any plan, from one leg to five, from bars to blocks."""
 
 from itertools import pairwise
 
@@ -20,16 +20,16 @@ from tactile_rt.sim_backend.objects.solids import (
 )
 
 
-def _plate(rng: Generator, x: float, y: float, low: float, high: float) -> Trimesh:
-    """A horizontal plate: a rectangle with more or less cut corners, or an oval."""
+def _build_plate(rng: Generator, x: float, y: float, low: float, high: float) -> Trimesh:
+    """Build a horizontal plate: a rectangle with more or less cut corners, or an oval."""
     if rng.random() < 0.3:
         return hull(ring(x / 2, low, squash=y / x), ring(x / 2, high, squash=y / x))
     cut = rng.uniform(0.005, 0.3) * min(x, y) / 2
     return hull(slab(x, y, low, cut), slab(x, y, high, cut))
 
 
-def _supports(rng: Generator, x: float, y: float, high: float, solid: float) -> list[Trimesh]:
-    """What carries a plate of x by y at a height: legs, a foot, runners, panels or a block."""
+def _build_supports(rng: Generator, x: float, y: float, high: float, solid: float) -> list[Trimesh]:
+    """Build supports of an x by y plate: legs, foot, runners, panels or block."""
     u = rng.uniform
     if rng.random() < solid:
         inset = u(0.8, 1.0)
@@ -92,22 +92,22 @@ def _supports(rng: Generator, x: float, y: float, high: float, solid: float) -> 
 
 
 def chair(rng: Generator) -> list[Trimesh]:
-    """A seat on anything, with a back of any make, arms on some."""
+    """Build a seat on any supports, with any kind of back, perhaps with arms."""
     u = rng.uniform
     wide, deep, seat = u(0.36, 0.75), u(0.34, 0.7), u(0.25, 0.5)
     thick, lean, top = u(0.025, 0.2), u(-0.02, 0.2), u(0.65, 1.1)
-    pieces = [_plate(rng, deep, wide, seat, seat + thick)]
-    pieces += _supports(rng, deep, wide, seat + 0.01, 0.3)
+    pieces = [_build_plate(rng, deep, wide, seat, seat + thick)]
+    pieces += _build_supports(rng, deep, wide, seat + 0.01, 0.3)
     back, post = -deep / 2 + 0.03, u(0.03, 0.08)
 
     def at(side: float, z: float) -> tuple[float, float, float]:
-        """A point of the leaning back; side -1 to 1 across."""
+        """Return a point of the leaning back at height z, side -1 to 1."""
         x = back - lean * (z - seat) / (top - seat)
         return (x, side * (wide - post) / 2 * 0.95, z)
 
     kind = rng.integers(5)
     low = seat + thick * u(0.0, 1.0)
-    if kind == 0:  # a solid one
+    if kind == 0:  # a solid back
         pieces.append(bar(at(0, low), at(0, top), u(0.02, 0.16), wide * u(0.7, 1.0), u(0.7, 1)))
     elif kind == 1:  # a plate on posts
         gap = seat + thick + u(0.05, 0.5) * (top - seat - thick)
@@ -148,11 +148,11 @@ def chair(rng: Generator) -> list[Trimesh]:
 
 
 def table(rng: Generator) -> list[Trimesh]:
-    """A plate of any outline at any height, on anything; a shelf, drawers or rims on some."""
+    """Build a plate on any supports, perhaps with a shelf, drawers or a frame."""
     u = rng.uniform
     deep, high, thick = u(0.4, 1.0), u(0.25, 0.9), u(0.02, 0.12)
-    pieces = [_plate(rng, 1.0, deep, high - thick, high)]
-    pieces += _supports(rng, 0.95, 0.95 * deep, high - thick, 0.3)
+    pieces = [_build_plate(rng, 1.0, deep, high - thick, high)]
+    pieces += _build_supports(rng, 0.95, 0.95 * deep, high - thick, 0.3)
     if rng.random() < 0.2:  # a board below
         pieces.append(box((0, 0, u(0.1, 0.6) * high), (0.9, 0.93 * deep, 0.03)))
     if rng.random() < 0.2:  # drawers under one side
@@ -165,7 +165,7 @@ def table(rng: Generator) -> list[Trimesh]:
 
 
 def ladder(rng: Generator) -> list[Trimesh]:
-    """Two rails and rungs: upright, leaning, or one half of a pair that stand together."""
+    """Build two rails with rungs, upright or leaning, or a pair that stand together."""
     u = rng.uniform
     wide, reach, rail = u(0.2, 0.5), u(0.0, 0.35), u(0.025, 0.06)
     narrow, rungs = u(0.6, 1.0), int(rng.integers(3, 11))
@@ -188,7 +188,7 @@ def ladder(rng: Generator) -> list[Trimesh]:
 
 
 def lamp(rng: Generator) -> list[Trimesh]:
-    """Something that shines on a stand: a shade, a ball, a hood on an arm, a lantern on a post."""
+    """Build a lamp: shade or ball on a pole, street lamp, desk lamp or lantern."""
     u = rng.uniform
     pole, base = u(0.012, 0.05), u(0.08, 0.28)
     foot = u(0.02, 0.1)

@@ -19,7 +19,7 @@ from tactile_rt.sim_backend.objects.solids import (
 
 
 def cactus(rng: Generator) -> list[Trimesh]:
-    """A column or a barrel, ribbed or smooth, with none to four arms."""
+    """Build a column or a barrel, ribbed or smooth, with none to four arms."""
     u = rng.uniform
     if rng.random() < 0.3:
         return plain.cactus(rng)
@@ -44,7 +44,7 @@ def cactus(rng: Generator) -> list[Trimesh]:
 
 
 def castle(rng: Generator) -> list[Trimesh]:
-    """Towers, round or square, joined by walls round a yard or grown into a keep."""
+    """Build round or square towers joined by walls, with or without a keep."""
     u = rng.uniform
     towers, r = int(rng.integers(2, 7)), u(0.07, 0.17)
     high, curtain, aspect = u(0.35, 0.95), u(0.4, 0.95), u(0.6, 1.0)
@@ -87,7 +87,7 @@ def castle(rng: Generator) -> list[Trimesh]:
 
 
 def grapes(rng: Generator) -> list[Trimesh]:
-    """A bunch of any number of berries, small or large, slender or broad."""
+    """Build a slender or broad bunch of few or many, small or large berries."""
     u = rng.uniform
     berry, wide, rounds = u(0.08, 0.18), u(0.15, 0.36), int(rng.integers(3, 7))
     z, turn, pieces = 0.0, u(0, 2 * np.pi), []
@@ -107,7 +107,7 @@ def grapes(rng: Generator) -> list[Trimesh]:
 
 
 def house(rng: Generator) -> list[Trimesh]:
-    """One block or several, of one floor or five, under a gable, a hip, a slope or a flat roof."""
+    """Build one or two blocks of one to five floors: gabled, hipped, sloped or flat."""
     u = rng.uniform
 
     def block(x: float, y: float, long: float, wide: float, wall: float) -> list[Trimesh]:
@@ -160,10 +160,10 @@ def house(rng: Generator) -> list[Trimesh]:
 
 
 def mushroom(rng: Generator) -> list[Trimesh]:
-    """A cap of any slope on a stem, or a few together."""
+    """Build one to three mushrooms, each a cap of any slope on a stem."""
     u = rng.uniform
     count = int(rng.choice([1, 1, 1, 2, 3]))
-    pieces = lathe([(0.55, -0.05), (0.5, 0.01)]) if count > 1 else []  # what they grow on
+    pieces = lathe([(0.55, -0.05), (0.5, 0.01)]) if count > 1 else []  # the ground
     for k in range(count):
         size = 1.0 if k == 0 else u(0.35, 0.75)
         turn = u(0, 2 * np.pi)
@@ -181,7 +181,7 @@ def mushroom(rng: Generator) -> list[Trimesh]:
 
 
 def pagoda(rng: Generator) -> list[Trimesh]:
-    """Two to seven storeys, of four to eight sides or round, each under a roof of its own."""
+    """Build two to seven storeys, polygonal or round, each under its own roof."""
     u = rng.uniform
     storeys, sides = int(rng.integers(2, 8)), int(rng.choice([4, 4, 6, 8, ROUND]))
     wide, shrink, jut, room = u(0.18, 0.4), u(0.75, 1.0), u(1.15, 1.9), u(0.3, 0.7)
@@ -207,14 +207,14 @@ def pagoda(rng: Generator) -> list[Trimesh]:
 
 
 def pumpkin(rng: Generator) -> list[Trimesh]:
-    """Smooth, faintly creased or deeply lobed; flat or tall; with or without a stalk."""
+    """Build a smooth, faintly creased or deeply lobed body, perhaps with a stalk."""
     u = rng.uniform
     squash, deep = u(0.5, 1.1), u(0.0, 0.12) if rng.random() < 0.6 else u(0.12, 0.3)
     lobes = int(rng.integers(5, 13))
     levels = np.radians([-80, -50, -20, 10, 40, 70])
     power, dent = u(0.6, 1.0), u(0.0, 0.15)
     pieces = []
-    # a wedge each: its middle stands out, its sides are the creases
+    # each lobe is a wedge: its middle stands out, its sides are the creases
     for k in range(lobes):
         points = [(0.0, 0.0, squash * 0.5 * (1 - dent) * s) for s in (-1, 1)]
         for level in levels:
@@ -231,7 +231,7 @@ def pumpkin(rng: Generator) -> list[Trimesh]:
 
 
 def snowman(rng: Generator) -> list[Trimesh]:
-    """Two or three balls of any size, a hat, a scarf, arms or none."""
+    """Build two or three balls of any size, perhaps with hat, scarf and arms."""
     u = rng.uniform
     balls = int(rng.choice([2, 3, 3]))
     radii = u(0.2, 0.34) * np.cumprod([1.0, *u(0.62, 0.95, balls - 1)])

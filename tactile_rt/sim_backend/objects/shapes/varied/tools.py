@@ -1,4 +1,4 @@
-"""Things handled, of any make."""
+"""Handheld objects of any plan."""
 
 from itertools import pairwise
 
@@ -10,7 +10,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, lathe,
 
 
 def birdcage(rng: Generator) -> list[Trimesh]:
-    """Wires round a floor, few or many, thin or thick, under a dome, a cone or a lid."""
+    """Build wires round a floor, few or many, under a dome, cone or lid."""
     u = rng.uniform
     wires, r, wire = int(rng.integers(5, 15)), u(0.2, 0.48), u(0.012, 0.032)
     eave, top, lean = u(0.4, 0.85), u(0.85, 1.0), u(-0.25, 0.25)
@@ -41,7 +41,7 @@ def birdcage(rng: Generator) -> list[Trimesh]:
 
 
 def dumbbell(rng: Generator) -> list[Trimesh]:
-    """A bar between two weights of any outline and number of sides."""
+    """Build a bar between two weights of any outline and number of sides."""
     u = rng.uniform
     r, grip, inner = u(0.12, 0.34), u(0.02, 0.08), u(0.08, 0.34)
     sides = int(rng.choice([4, 6, 8, ROUND, ROUND]))
@@ -64,7 +64,7 @@ def dumbbell(rng: Generator) -> list[Trimesh]:
 
 
 def gear(rng: Generator) -> list[Trimesh]:
-    """A toothed wheel: thin or thick, few or many teeth, square or pointed, spoked or whole."""
+    """Build a thin or thick toothed wheel, teeth square or pointed, spoked or whole."""
     u = rng.uniform
     teeth, half, root = int(rng.integers(6, 22)), u(0.06, 0.3), u(0.3, 0.45)
     hole, twist = u(0.05, 0.8) * root, u(-0.2, 0.2)
@@ -92,7 +92,7 @@ def gear(rng: Generator) -> list[Trimesh]:
 
 
 def hourglass(rng: Generator) -> list[Trimesh]:
-    """Two bulbs and a neck between them, with or without plates, posts round them on some."""
+    """Build two bulbs joined by a neck, between end plates, perhaps with posts."""
     u = rng.uniform
     plate, thick, neck = u(0.18, 0.42), u(0.02, 0.12), u(0.025, 0.12)
     bulb, full, shoulder, curve = plate * u(0.7, 1.0), u(0.4, 0.9), u(0.4, 1.0), u(0.15, 0.7)
@@ -112,7 +112,7 @@ def hourglass(rng: Generator) -> list[Trimesh]:
 
 
 def spring(rng: Generator) -> list[Trimesh]:
-    """A coil: few turns or many, thin wire or thick, straight, conical or waisted."""
+    """Build a coil of few or many turns, thin or thick, straight, conical or waisted."""
     u = rng.uniform
     turns, r, wire = u(2.0, 5.5), u(0.18, 0.48), u(0.025, 0.085)
     turns = min(turns, 0.8 / (2.2 * wire))

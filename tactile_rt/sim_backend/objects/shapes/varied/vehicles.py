@@ -1,4 +1,4 @@
-"""Things that go, from a box with wheels to a bare shell; each heads along +x."""
+"""Vehicles of any plan, from a box with wheels to a bare shell; each heads along +x."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,7 +8,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, moved,
 
 
 def car(rng: Generator) -> list[Trimesh]:
-    """Any body on wheels, hidden or not: racer, saloon, hatchback, van, bus, rover, open car."""
+    """Build any car, its wheels hidden or not: racer, saloon, van, bus, rover, open."""
     u = rng.uniform
     wide, wheel = u(0.3, 0.65), u(0.06, 0.17)
     low, belt = u(0.3, 1.1) * wheel, wheel + u(0.06, 0.24)
@@ -54,7 +54,7 @@ def car(rng: Generator) -> list[Trimesh]:
 
 
 def plane(rng: Generator) -> list[Trimesh]:
-    """A body with wings and a tail: slim or fat, swept or straight, one pair of wings or two."""
+    """Build a slim or fat body, swept or straight wings in one or two decks."""
     u = rng.uniform
     r, nose, tail = u(0.045, 0.15), u(0.1, 0.25), u(0.2, 0.5)
     flat = u(0.8, 1.3)
@@ -76,7 +76,7 @@ def plane(rng: Generator) -> list[Trimesh]:
             found.append(hull(inner - shift, inner + shift, outer - shift, outer + shift))
         return found
 
-    decks = (0.0,) if rng.random() < 0.8 else (-0.9 / max(flat, 1.0), 1.4)  # two: an old one
+    decks = (0.0,) if rng.random() < 0.8 else (-0.9 / max(flat, 1.0), 1.4)  # two: a biplane
     low = u(-0.8, 0.9) * r if len(decks) == 1 else 0.0
     for deck in decks:
         pieces += wing(root, flat * deck * r + low, span, chord, rise)

@@ -1,4 +1,4 @@
-"""Things that hold a drink: round, square or cut, with or without what one holds them by."""
+"""Vessels of any plan: round, square or cut, with or without a handle."""
 
 import numpy as np
 from numpy.random import Generator
@@ -8,7 +8,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, hull, lathe, moved, rin
 
 
 def bottle(rng: Generator) -> list[Trimesh]:
-    """A body of any outline and section that draws in to a neck; a cork, a lip, a grip on some."""
+    """Build any body that narrows to a neck, perhaps with cork, lip or grip."""
     u = rng.uniform
     kind, wide, neck = rng.integers(4), u(0.1, 0.36), u(0.035, 0.11)
     neck = min(neck, 0.8 * wide)
@@ -51,7 +51,7 @@ def bottle(rng: Generator) -> list[Trimesh]:
 
 
 def bowl(rng: Generator) -> list[Trimesh]:
-    """Wide and open, from nearly flat to deep, with or without a foot or a rim."""
+    """Build a wide open bowl, shallow to deep, with or without foot and rim."""
     u = rng.uniform
     foot, high, thick = u(0.1, 0.4), u(0.14, 0.6), u(0.03, 0.09)
     straight, lip = u(0.0, 1.0), u(-0.03, 0.05)
@@ -61,7 +61,7 @@ def bowl(rng: Generator) -> list[Trimesh]:
     r[-1] += min(lip, 0.0)
     profile = [(float(a), float(b)) for a, b in zip(r, z, strict=True)]
     pieces = lathe([(foot, -0.005), (1.02 * foot, thick)])
-    if rng.random() < 0.6:  # what it stands on
+    if rng.random() < 0.6:  # a foot
         pieces += lathe([(u(0.5, 1.0) * foot, -u(0.02, 0.12)), (0.9 * foot, 0.01)])
     pieces += [*wall(profile[:3], thick), *wall(profile[2:], thick)]
     if lip > 0.02:
@@ -73,7 +73,7 @@ def bowl(rng: Generator) -> list[Trimesh]:
 
 
 def mug(rng: Generator) -> list[Trimesh]:
-    """A deep hollow drum: a tumbler, a cup, a stein; a handle of any outline on most."""
+    """Build a tumbler, cup or stein, most with a handle of any outline."""
     u = rng.uniform
     low, thick, high = u(0.22, 0.5), u(0.03, 0.09), u(0.6, 1.1)
     rim, belly = low * u(0.8, 1.4), u(0.95, 1.15)
