@@ -8,9 +8,8 @@ then adds nothing, and a regression without information scores 0 (a correlation 
 the mean of the others lies opposite to the held-out response).
 
 The score is 1 - error / variance over all bins and units, each unit in units of its noise, so that
-units that distinguish stimuli weigh most. The ceiling is the share of the variance that remains
-without the noise of the means, which follows from the spread of trials: a perfect model is expected
-to reach it.
+units that distinguish stimuli weigh most. A perfect model is expected to reach the ceiling, the
+share of the variance that remains without the noise of the means (from the spread of trials).
 """
 
 import numpy as np

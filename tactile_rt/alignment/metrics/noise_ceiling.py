@@ -1,8 +1,7 @@
 """Means over an animal's trials and over random halves of them, and the noise ceiling.
 
-Halves are drawn within every session and stimulus; the agreement of two halves gives the
-reliability of the whole (Spearman-Brown). A bin that some trials do not reach is averaged over
-those that do.
+Halves are drawn within every session and stimulus; their agreement gives the reliability of the
+whole (Spearman-Brown). A bin that some trials do not reach is averaged over those that do.
 """
 
 import numpy as np
