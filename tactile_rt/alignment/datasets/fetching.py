@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import urllib3
 
 UNITS = ("spike_times", "spike_times_index", "depth", "inhibitory")
-BLOCK = 1 << 16  # bytes
-KEPT = 1 << 10  # blocks
+BLOCK = 1 << 16  # bytes of a block
+KEPT = 1 << 10  # blocks in the cache at most
 PATIENCE_S = 60.0  # timeout of a request
 AGAIN = 4  # retries of a request, after 0, 1, 2 and 4 s
 BUSY = (429, 500, 502, 503, 504)  # HTTP status codes that are worth a retry

@@ -35,8 +35,8 @@ class Measure:
     Attributes:
         ceiling: The value that a perfect model is expected to reach on these trials; NaN if the
             animal's trials or units do not suffice.
-        fit: The function that measures a layer, given as responses (stimulus, step, unit) with
-            NaN in the steps that input cannot reach. NaN for a layer that responds to all alike.
+        fit: The function that measures a layer, given as responses (stimulus, step, unit), NaN in
+            the steps that input cannot reach. It returns NaN if all stimuli give one response.
         minimum: The lowest usable ceiling; for a share of variance, the square of the limit for
             a correlation.
     """

@@ -43,7 +43,7 @@ def crossnobis(animal: Animal) -> Measure:
 
 
 def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
-    """Cross-validated squared distances, summed over units.
+    """Compute cross-validated squared distances, summed over units.
 
     Args:
         white: (trial, unit), whitened.

@@ -1,4 +1,4 @@
-"""Share of the units' variance that a linear readout of a layer predicts for a held-out stimulus.
+"""Share of units' variance that a layer's linear readout predicts for a held-out stimulus.
 
 One stimulus is held out at a time. A ridge regression from the layer's steps to the units'
 bins of 45 ms (without a time course: from means to means) is fitted to the others, its penalty
@@ -60,8 +60,7 @@ def linear(animal: Animal) -> Measure:
 def predicted(layer: Floats, goal: Floats) -> Floats:
     """Predict the goal's responses to every stimulus by regressions fitted to the others.
 
-    Takes a layer (stimulus, bin, feature) and a goal (stimulus, bin, unit); returns the goal's
-    shape.
+    The layer is (stimulus, bin, feature), the goal (stimulus, bin, unit), and so is the result.
     """
     out = np.empty_like(goal)
     for i in range(len(goal)):

@@ -38,7 +38,7 @@ def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
 
 
 def values_of(session: NeuralSession, bins: int) -> Floats:
-    """Return rates (trial, bin, unit) in the first bins; without bins, of whole trials."""
+    """Return rates (trial, bin, unit) of the first bins, or one bin of whole trials."""
     if bins and session.course is not None:
         return session.course[:, :bins]
     return session.rates[:, None]
