@@ -128,7 +128,7 @@ def _draw_first_weights(model: TactileClassifier, training: object) -> TactileCl
 
 
 def reach(graph: Graph) -> dict[str, int]:
-    """Compute each node's first step that depends on the frame, by the shortest path to it."""
+    """Compute each node's first step that depends on the frame, by the shortest path."""
     distance = {graph.frame.name: -1}
     nodes = graph.nodes
     for _ in graph.nodes:
@@ -237,7 +237,7 @@ def _tap_decoder(decoder: nn.Module) -> list[Tap]:
 
 @contextmanager
 def _record_taps(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
-    """Record the taps' tensors (6, step, unit) within a `with` block, in the order of `taps`."""
+    """Record the taps' tensors (6, step, unit) within a ``with`` block, in order."""
     shape = frames.shape[:2]
     traces: Traces = {f"{part}.{name}": frames for name, *_ in taps}  # placeholders, in order
 

@@ -1,4 +1,4 @@
-"""The board: models by datasets by metrics, each value as a share of the noise ceiling.
+"""The board of models by datasets by metrics, in shares of the noise ceiling.
 
 In every cell a model's layer is chosen on the other animals (`statistics.held_out`), so that no
 value is a maximum over layers. Controls are rows as well: the sensors' readings, each network
@@ -113,7 +113,7 @@ def with_cells(
     notes: Iterable[str] = (),
     progress: Callable[[float], None] = lambda share: None,
 ) -> Alignments:
-    """Make the board of one dataset from the given rows and a row of another animal.
+    """Make the board of one dataset from given rows and a row of another animal.
 
     Args:
         rows: each with its layers' responses to the dataset's conditions.
@@ -159,7 +159,7 @@ def joined(boards: Sequence[Alignments]) -> Alignments:
 
 
 def _make_cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
-    """Make a model's cell: on each animal, score the layer that is best on the others."""
+    """Make a model's cell: score on each animal the layer best on the others."""
     values = np.array([[m.fit(trace) for m in measures] for trace in traces.values()])
     values = values.reshape(len(traces), len(measures))
     finite = np.flatnonzero(np.isfinite(values).all(axis=1)) if len(measures) else np.empty(0, int)
@@ -175,7 +175,7 @@ def _make_cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
 
 
 def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
-    """Make the cell of animals as models of each other: the mean fit of the others."""
+    """Make the cell of animals as models of each other, from mean fits."""
     scores, raw = [], []
     for target, measure in animals:
         found = [measure.fit(_convert_to_layer(a)) for a, _ in animals if a is not target]

@@ -157,7 +157,7 @@ def checked_sessions(
 def _check_clock(
     readings: list[Reading], clock: str, strict: bool
 ) -> tuple[list[Reading], list[str]]:
-    """Return the readings that contacts show to be on the clock, and notes on the check."""
+    """Return the readings whose contacts do not contradict the clock, and notes on the check."""
     responses = [r.response for r in readings if r.response is not None]
     if not responses:
         return readings, [
@@ -199,7 +199,7 @@ def _keep_complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[
 
 
 def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
-    """Refuse a session that is given twice, even sorted anew, reordered or with fewer units.
+    """Refuse a session given twice, even with another spike sorting, order or fewer units.
 
     Two copies of a session would be split into the same halves and agree with each other perfectly.
     Two sessions are copies if they share, in any order, most of their trials (time of beginning and
@@ -233,7 +233,7 @@ def _count_trials(session: NeuralSession) -> Counter[bytes]:
 
 
 def _count_units(session: NeuralSession) -> Counter[bytes]:
-    """Count units of three or more different rates by these, sorted within stimuli."""
+    """Count units by their rates, sorted within stimuli, if three or more rates differ."""
     found: Counter[bytes] = Counter()
     for rates in session.rates.T:
         if len(np.unique(rates)) >= FEWEST:

@@ -1,4 +1,4 @@
-"""A check of the clock of spikes on the data: rates must rise 3 to 40 ms after contact.
+"""Check of the clock of spikes: rates must rise 3 to 40 ms after contact.
 
 Barrel cortex answers a touch within milliseconds, so the recording itself shows whether its spikes
 and its contacts are on one clock.
@@ -111,7 +111,7 @@ def contact_response(
     before = np.searchsorted(times, first[:, None] + edges_s - 1e-6)  # spikes before each edge
     histogram = np.diff(before.sum(axis=0))
     shifts, rises = _search_shifts(times, first, reach)
-    low, high = np.percentile(rises, (2.5, 97.5))  # so few shifts are in a true rise
+    low, high = np.percentile(rises, (2.5, 97.5))  # a true rise covers too few shifts to matter
     spread = float(high - low) / 3.92
     far = np.abs(shifts) > HERE_S
     best = int(np.argmax(np.where(far, rises, -np.inf)))

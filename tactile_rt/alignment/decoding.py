@@ -2,8 +2,8 @@
 
 Shape is decoded with one distance held out, distance with one shape held out, so that all classes
 have equally many training stimuli: on noise, the nearest class mean is right as often as a guess.
-The paper holds out one stimulus at a time, so that the right class has a training stimulus less: on
-noise in many dimensions that is almost never right, and chance is not 1/2 or 1/3.
+The paper holds out one stimulus at a time, which leaves the right class one training stimulus less:
+on noise in many dimensions the decoder is almost never right, and chance is not 1/2 or 1/3.
 """
 
 import math
@@ -42,16 +42,16 @@ class Decoded:
 
 
 def decode(patterns: ArrayLike) -> Decoded:
-    """Decode responses (6, unit), centred and of length one, by the nearest class mean."""
+    """Decode shape and distance by the nearest class mean of normalised responses (6, unit)."""
     return decode_rdm(rdm(patterns))
 
 
 def decode_rdm(entries: ArrayLike) -> Decoded:
-    """Decode as `decode`, from an RDM (15,), which holds the distances between stimuli.
+    """Decode as `decode` does, but from an RDM (15,), which has the stimuli's distances.
 
     The null distribution is exact: all 720 relabellings, the true labels included.
     """
-    squares = 2 * square(entries)  # of Euclidean distances between vectors of length one
+    squares = 2 * square(entries)  # squared Euclidean distances of vectors of length one
     if not np.isfinite(squares).all():
         return Decoded(*[float("nan")] * 6)
     orders = np.array(list(permutations(range(len(STIMULI)))))
@@ -86,7 +86,7 @@ def decode_paper(patterns: ArrayLike) -> Decoded:
 
 
 def mean_decoded(several: Sequence[Decoded]) -> Decoded:
-    """Average over the animals with accuracies, as a row of the paper's table; p is NaN.
+    """Average over the animals with accuracies, as the paper's table does; p is NaN.
 
     Without such an animal, all values are NaN.
     """

@@ -1,4 +1,4 @@
-"""A made-up brain with known truth, to try and to validate the benchmark.
+"""A made-up brain with known truth, for trying and validating the benchmark.
 
 - *Geometry.* Six stimuli are points in a space of `FEATURES` features, placed by distance, by shape
   and at random. Each mouse has this shared geometry, except for a share `private` of the features'

@@ -1,4 +1,4 @@
-"""Files of the made-up brain: sessions in NWB like the real recordings, and models to score.
+"""Files of the made-up brain: NWB sessions like the real recordings, and models to score.
 
 A trial lasts four seconds. Whiskers touch a few times between its first contact and the choice.
 From `LATENCY_S` after first contact to the choice a unit fires at its rate for the stimulus, mostly
@@ -142,7 +142,7 @@ def _draw_unit(
     choice: Floats,
     end: float,
 ) -> Floats:
-    """Draw a unit's spike times, s: at rate (trial,) from contact to choice, else at `REST`."""
+    """Draw spike times, s, at a unit's rate (trial,) from contact to choice, else `REST`."""
     begin = np.array([times[0] for times in contacts]) + LATENCY_S
     bursts = np.array([len(times) for times in contacts]) * BURST_S
     # Between bursts the rate is lower, so that a trial keeps its mean rate.

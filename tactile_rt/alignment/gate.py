@@ -1,4 +1,4 @@
-"""The release gate of a model: four tests, and the exit code that a pipeline reads.
+"""The release gate of a model: four tests, and the exit code for a pipeline.
 
 1. validity: the benchmark has enough reliable animals.
 2. NeuroAI Turing test: the model is not worse than another mouse, shown to be near one, and better
@@ -41,8 +41,8 @@ MARGIN = 0.65  # share of the noise ceiling
 WORSE, SURE = 10, 8  # one mouse in so many is called worse by chance, one floor in so many too high
 LOST = (0.25, 0.5)  # shares of its geometry that a damaged mouse has lost, for the power
 DRAWS = 20  # random damages for every mouse and share
-# A distance's variance has a part along the present differences, and a part of the deviation alone,
-# which grows with the deviation: the weight of the second. 0.25 to 1 do about as well.
+# Weight of the variance of distances by deviations alone, which grows with these, relative to that
+# along the present differences; 0.25 to 1 do about as well.
 OWN = 0.5
 NO_FIT = -9.0  # for a layer without a fit: lower than any fit
 
@@ -68,7 +68,7 @@ class BesideMice:
     fits: Floats  # (model, mouse) fit to each mouse, of a layer that was chosen on the others
     fit: Floats  # (model,) mean fit of each model; NaN if no layer has an RDM
     error: Floats  # (model,) standard error of fit less ceiling, over animals and stimuli
-    floor: Floats  # (model,) lower confidence bound of each fit, for seven of eight cases
+    floor: Floats  # (model,) lower confidence bound of each fit, one-sided, 7/8
     ceiling: float
     bound: float
 
@@ -138,7 +138,7 @@ class Mice:
         )
 
     def power(self, seed: int = 0) -> Power:
-        """Test each mouse, of four or more, as a model of the others, whole and damaged."""
+        """Test every mouse, of four or more, whole and damaged, against the others."""
         rng = np.random.default_rng(seed)
         number = len(self.rdms)
         passes, fails = 0, np.zeros((len(LOST), DRAWS))
@@ -196,7 +196,7 @@ def _compute_gram(rdm: Floats) -> Floats:
 
 
 def _damage(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
-    """Replace a share of an RDM's geometry by those of strangers (draw, pair): (draw, pair)."""
+    """Return RDMs (draw, pair) whose geometry is partly that of strangers (draw, pair)."""
     made = np.empty_like(strangers)
     own = _compute_features(rdm)
     stimuli = len(own)
@@ -245,7 +245,7 @@ def exit_code(checks: Sequence[Check]) -> int:
 def neural_checks(
     score: Score, benchmark: Benchmark, baseline: ArrayLike | None = None
 ) -> tuple[Check, ...]:
-    """Run tests 1 to 3; if the benchmark is not valid, tests 2 and 3 are inconclusive.
+    """Run tests 1 to 3; the latter two are inconclusive if the benchmark is invalid.
 
     Args:
         baseline: (layer, pair) RDMs of the stored model's layers; None to leave out test 3.
@@ -304,7 +304,7 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
 
 
 def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
-    """Test the drop of a model's fit: pass if surely small, fail if certain and large.
+    """Test a model's drop of fit: pass if certainly small, fail if certain and large.
 
     The drop is that of the fit to single mice, paired; it is small below `LARGEST_DROP` of the
     noise ceiling. Certainty is by one-sided tests over the mice, on these stimuli.

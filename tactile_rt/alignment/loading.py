@@ -98,7 +98,7 @@ def load_layers(
     input_name: str = "",
     names: tuple[str, ...] = STIMULI,
 ) -> tuple[Layers, tuple[float, str] | None]:
-    """Return a model's layers, and its accuracy with the name of that measure.
+    """Return a model's layers and, if known, its accuracy with the name of the metric.
 
     Args:
         names: names of the stimuli; for others than `STIMULI`, only responses can be read.
@@ -156,7 +156,7 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
 
 
 def _find_accuracy(figures: object) -> tuple[float, str] | None:
-    """Return a top-1 accuracy, 0 to 1, and its name from a model's figures, if any."""
+    """Return a model's top-1 accuracy, 0 to 1, and its name, from its figures."""
     if not isinstance(figures, dict):
         return None
     for key in sorted(k for k in figures if isinstance(k, str) and FIGURES.fullmatch(k)):

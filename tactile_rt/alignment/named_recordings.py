@@ -1,4 +1,4 @@
-"""Recordings of any named stimuli: rates in an .npz, or tables of spikes and of events.
+"""Recordings of named stimuli: rates in an .npz, or tables of spikes and events.
 
 An ``.npz`` has for every session ``ANIMAL/SESSION/rates`` (trial, unit) in spikes per second and
 ``ANIMAL/SESSION/stimulus`` (trial,), the name shown in each trial; optional are ``depth`` (unit,)

@@ -54,7 +54,7 @@ class Reading(NamedTuple):
 
 
 def find_nwb(paths: Iterable[Path]) -> list[Path]:
-    """Find NWB files in paths; in a folder, those with ``ecephys`` in their names, if any."""
+    """Find NWB files in paths; in folders, those named with ``ecephys``, if any."""
     found = []
     for path in paths:
         if not (path.is_dir() or path.is_file()):
@@ -143,7 +143,7 @@ def _import_h5py() -> Any:
 def _assemble(
     file: "h5py.File", name: str, window: str, progress: Progress, clock: str, selection: Selection
 ) -> Reading:
-    """Assemble a session from the parts of its file, and leave out bad trials and units."""
+    """Assemble a session from parts of its file, and leave out bad trials and units."""
     notes: list[str] = []
     trials = parts.trial_columns(file)
     shapes, places = parts.text(trials["stimulus"]), parts.text(trials["servo_position"])

@@ -28,13 +28,13 @@ SUBJECT = "general/subject/subject_id"
 EXPERIMENT = "general/experiment_description"  # names the task
 LARGEST = 1 << 30  # bytes of a column; the longest ones, of spike times, have some millions
 NAMED = 5  # trials or units that a note lists at most
-BACK_S = 0.01  # spike sorters may leave times so much out of order; more is another clock
+BACK_S = 0.01  # disorder of spike times that sorters may leave; a larger step is another clock
 FAR_S = 3600.0  # spikes are far if outside the trials by more than this and than their duration
 FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; smaller shares are mistakes or chance
 
 
 def stored(file: Any, name: str) -> NDArray[Any]:
-    """Read a column as it is stored; it must have one dimension and not be too large."""
+    """Read a column as stored; it must have one dimension and not be too large."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
         raise ConfigError(f"{name} is not a column of values")
@@ -193,7 +193,7 @@ def name_rows(rows: Sequence[int]) -> str:
 def unit_column(
     file: "h5py.File", name: str, units: int, notes: list[str], among: Sequence[float] = ()
 ) -> Floats | None:
-    """Read a column (unit,) as numbers, of `among` if given; None if it is unusable."""
+    """Read a column (unit,) as numbers, all in `among` if given; None if unusable."""
     if name not in file.get("units", {}):
         return None
     values = stored(file["units"], name)
@@ -247,7 +247,7 @@ def text(column: NDArray[Any]) -> NDArray[np.str_]:
 
 
 def flags(column: NDArray[Any], what: str) -> NDArray[np.int64]:
-    """Convert a column of truth values, of any type, to 1, 0, or -1 for neither."""
+    """Convert a column of truth values of any type to 1, 0, or -1 (neither)."""
     if column.dtype.kind not in "biu":
         raise ConfigError(f"{TRIALS} column {what} is {column.dtype}, not true or false")
     return np.where(np.isin(column, (0, 1)), column, -1).astype(np.int64)

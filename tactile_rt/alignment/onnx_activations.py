@@ -62,7 +62,7 @@ RULES = tuple(
 
 
 def step_graph(model: onnx.ModelProto) -> tuple[onnx.GraphProto, onnx.NodeProto | None]:
-    """Return the graph of one step, and for a window file the `Scan` that runs it."""
+    """Return the graph of one step, and a window file's `Scan` that runs it."""
     for node in model.graph.node:
         if node.op_type == "Scan":
             return next(a.g for a in node.attribute if a.name == "body"), node
@@ -136,7 +136,7 @@ def _find_tensors(
     node: onnx.NodeProto,
     readers: dict[str, list[onnx.NodeProto]],
 ) -> Iterable[tuple[str, str]]:
-    """Yield the layers of a rule and their tensors, from the node that reads the parameter."""
+    """Yield a rule's layers and their tensors, from the node that reads the parameter."""
     out = node.output[0]
     if where == "input":
         yield f"{name.removesuffix('{-1}')}{int(number) - 1}", node.input[0]
@@ -300,7 +300,7 @@ def _run_stimuli(
 
 
 def _randomise_loads(stimuli: StimuliInput) -> StimuliInput:
-    """Return random loads in the range of the stimuli, which differ from the first step on.
+    """Return random loads in the stimuli's range, which differ from the first step on.
 
     Stimuli may begin alike, but the steps that input can reach depend on the network alone.
     """

@@ -219,7 +219,7 @@ def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
 
 
 def _name_layer(weight: str, node: onnx.NodeProto, taken: Collection[str]) -> str:
-    """Name a layer by its weight, or by its node if that name is a number."""
+    """Name a layer by its weight, or its node if that name is a number."""
     name = weight if weight and not NUMBERED.fullmatch(weight) else node.name.rpartition("/")[0]
     name = re.sub(r"\.?(weight\w*|kernel|W)$", "", name.strip("/").replace("/", "."))
     name = f"encoder.{name or node.op_type.lower()}"
@@ -254,7 +254,7 @@ def _make_layers(
 
 
 def _arrange_by_step(value: NDArray[Any], samples: int) -> NDArray[Any]:
-    """Arrange a layer's output as (step, unit): by its sample axis if any, else one step."""
+    """Arrange a layer's output as (step, unit), by samples if any, else one step."""
     if value.ndim > 2 and value.shape[:2] in ((1, samples), (samples, 1)):
         return value.reshape(samples, -1)
     return value.reshape(1, -1)

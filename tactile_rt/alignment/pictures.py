@@ -35,7 +35,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Level:
-    """A horizontal line, with a band of `half` to both sides if that is above 0."""
+    """A horizontal line, with a band of `half` to both sides if above 0."""
 
     name: str
     value: float
@@ -86,7 +86,7 @@ def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> st
 
 
 def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool = False) -> str:
-    """Draw named models, and for each group a least-squares line if it has three or more."""
+    """Draw named models, and a least-squares line for each group of three or more."""
     figure, axes = _start_figure(7.2, 4.2)
     for group in dict.fromkeys(p.group for p in points):
         of = [p for p in points if p.group == group]
@@ -139,7 +139,7 @@ def draw_profiles(series: Sequence[tuple[str, Floats]], names: Sequence[str]) ->
 
 
 def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
-    """Draw RDMs (pair,), each darkest where it is largest; plain grey if one has a NaN."""
+    """Draw RDMs (pair,), each darkest where it is largest; plain grey with any NaN."""
     rows = ceil(len(maps) / MAPS_A_ROW)
     figure = Figure(figsize=(9.5, 2.2 * rows + 0.9), layout="constrained")
     panels = figure.subplots(rows, MAPS_A_ROW, squeeze=False)

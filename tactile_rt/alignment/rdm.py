@@ -21,8 +21,8 @@ Floats = NDArray[np.float64]
 SYNONYMS = {"near": "close"}
 # Vectors whose centred values are below this share of the values are constant, but for rounding.
 CONSTANT = 1e-13
-EXACT = 7  # stimuli for which all relabellings are used, at most; for more, some are drawn
-DRAWN = 5000  # relabellings
+EXACT = 7  # stimuli for which all relabellings are used, at most
+DRAWN = 5000  # relabellings that are drawn for more stimuli
 
 
 def stimulus_index(shape: str, distance: str) -> int:
@@ -109,7 +109,7 @@ def relabellings(stimuli: int) -> NDArray[np.intp]:
 
 
 def normalised(values: ArrayLike) -> Floats:
-    """Centre vectors (..., n) and scale them to length one, for products that are Pearson's r.
+    """Centre vectors (..., n) and scale them to length one: products are Pearson's r.
 
     Returns:
         (..., n), NaN throughout a vector that is constant or not finite.

@@ -22,7 +22,7 @@ AT_ONCE = 64  # bootstraps per batch: their half-means fit a processor's cache
 
 
 def spearman_brown(r: ArrayLike) -> Floats:
-    """Compute the reliability for twice as many trials, 2r / (1 + r); -inf at r = -1."""
+    """Return the reliability for twice the trials: 2r / (1 + r), -inf for -1."""
     r = np.asarray(r, dtype=np.float64)
     with np.errstate(divide="ignore"):
         return np.asarray(2 * r / (1 + r))
@@ -63,7 +63,7 @@ def first_halves(rows: int, bootstraps: int = BOOTSTRAPS, seed: int = SEED) -> N
 
 
 def trial_mean(rates: ArrayLike) -> Floats:
-    """Average the finite rates of (row, 6, unit) over rows: (6, unit), NaN if there are none."""
+    """Average the finite rates of (row, 6, unit) over rows; NaN without any."""
     rates = np.asarray(rates, dtype=np.float64)
     finite = np.isfinite(rates)
     return _divide_by_count(np.where(finite, rates, 0).sum(axis=0), finite.sum(axis=0))

@@ -252,7 +252,7 @@ def _show_animals(results: Results) -> str:
 
 
 def _levels(results: Results) -> list[pictures.Level]:
-    """Make the lines and bands of a bar plot: the noise limit and animal to animal."""
+    """Make a bar plot's lines and bands: the noise limit and animal to animal."""
     a2a = results.benchmark.a2a
     half = a2a.sem if math.isfinite(a2a.sem) else 0.0
     return [

@@ -95,7 +95,7 @@ def model_result(
 def _note_missing_rdms(
     patterns: Mapping[str, NDArray[np.float64]], names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield notes on layers that have no RDM and so no score, one note per cause."""
+    """Yield notes on layers without an RDM and so without score, one per cause."""
     found: dict[tuple[str, ...], list[str]] = {}
     for layer, responses in patterns.items():
         varies = np.asarray(np.isfinite(normalised(responses)).all(axis=1))

@@ -47,7 +47,7 @@ class Selection:
         depth: str | None = None,
         cells: str | None = None,
     ) -> "Selection":
-        """Make a selection from texts; depth is a layer, ``L4``, or a range in um, ``419-626``.
+        """Make a selection from texts; depth is a layer, ``L4``, or range, ``419-626`` um.
 
         Raises:
             ConfigError: no such task, layer or cell type, or an invalid range.

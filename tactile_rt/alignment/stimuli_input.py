@@ -1,4 +1,4 @@
-"""Loads of an array while it whisks the six stimuli: the input that models are scored on.
+"""Loads of an array that whisks the six stimuli: the input of models to score.
 
 The input of the right mouse array ships, so that scoring needs no simulator; for any other array,
 `tactile-rt whisk --array ...` makes it. A stimulus has 22 steps of 5 sub-steps from the first
@@ -48,7 +48,7 @@ class StimuliInput:
         return np.zeros_like(self.sigma)
 
     def check(self, spec: ArraySpec, steps: int, substeps: int, model: str, period_ns: int) -> None:
-        """Check that the input fits the array and the timing that a model was trained on.
+        """Check that the input fits the array and timing that a model was trained on.
 
         Args:
             period_ns: period of the model's samples, ns.
