@@ -1,4 +1,4 @@
-"""JSON files of structs, arrays as lists and NaN as null, written whole or not at all."""
+"""JSON files of structs, arrays as lists and NaN as null, written whole."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin

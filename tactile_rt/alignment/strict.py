@@ -275,7 +275,7 @@ def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
 
     Returns:
         The session with rates and stimuli alone, its trials sorted by stimulus; and a key below
-        2^64, the same for any order of trials and units and any scale of the rates.
+        2^64 of its data, which no order of trials or units and no scale of the rates changes.
     """
     ranks = _rank_rates(session.rates)
     trial = _mix(session.stimulus.astype(np.uint64) + np.uint64(1))

@@ -33,8 +33,8 @@ class Measure:
     """A metric prepared for one animal.
 
     Attributes:
-        ceiling: The value that a perfect model is expected to reach on these trials; NaN if the
-            animal's trials or units do not suffice.
+        ceiling: The value that a perfect model is expected to reach on these trials; NaN if it
+            cannot be estimated, for example from too few trials.
         fit: The function that measures a layer, given as responses (stimulus, step, unit), NaN in
             the steps that input cannot reach. It returns NaN if all stimuli give one response.
         minimum: The lowest usable ceiling; for a share of variance, the square of the limit for

@@ -25,7 +25,7 @@ def sessions_of(animal: Animal) -> tuple[NeuralSession, ...]:
 
 
 def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
-    """Count the first bins that enough trials per stimulus reach in all sessions."""
+    """Count first bins that enough trials per stimulus reach in all sessions; 0 without courses."""
     reached = [LONGEST]
     for session in sessions:
         if session.course is None:
