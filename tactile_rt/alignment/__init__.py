@@ -7,10 +7,10 @@ strict, paper_code, building   the two protocols: recordings -> a frozen benchma
 benchmark, json_file     the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
 stimuli_input, layers, activations, onnx_activations, loading   a model -> its layers
-example, example_files   a made-up brain of known truth, and its files
-metrics/, datasets/      what compares, and recordings as plug-ins: license, citation, reader
+example, example_files   a made-up brain with known truth, and its files
+metrics/, datasets/      plug-ins: measures of similarity; recordings with license and citation
 board, board_page        models by datasets by metrics
-fidelity, gate, decoding, results, pictures, report   what is done with them
+fidelity, gate, decoding, results, pictures, report   release tests, stored scores, the report
 """
 
 from tactile_rt.alignment.benchmark import (

@@ -1,9 +1,8 @@
 """Activations of every layer of a torch network, for the six stimuli.
 
-A layer is what a reader of the paper would call one: a node of the encoder's graph after its ReLU,
-a residual block's sum, a transformer block's output at the action token, a linear layer after its
-ReLU. Always in evaluation mode: dropout and batch statistics would make a score depend on chance
-and on what else is in the batch.
+Layers are as in the paper: a node of the encoder's graph after its ReLU, a residual block's sum, a
+transformer block's output at the action token, a linear layer after its ReLU. Networks run in
+evaluation mode: with dropout or batch statistics, scores would depend on chance and on the batch.
 """
 
 import hashlib
@@ -37,7 +36,7 @@ Change = Callable[[Tensor], Tensor]
 
 
 def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[str, Any]]:
-    """Layers of a `best.pt`, and what else it holds."""
+    """Return the layers of a checkpoint such as `best.pt`, and its other contents."""
     model, saved = load_checkpoint(path)
     spec, timing = ArraySpec.from_json(saved["spec"]), model.timing
     stimuli.check(spec, timing.steps, timing.substeps, str(path), saved["period_ns"])
@@ -48,18 +47,18 @@ def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[s
 
 
 def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0) -> Layers:
-    """Layers of a checkpoint's network as it might be before training: its random control."""
+    """Return the layers of a checkpoint's network with random weights, as a control."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = _begun(untrained(saved), saved.get("config"))
+        model = _draw_first_weights(untrained(saved), saved.get("config"))
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 
 def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0) -> Layers | None:
-    """Layers of the network that an exported file's card describes, with random weights.
+    """Return the layers of the network that a model card describes, with random weights.
 
-    None for a card that describes no network that can be built here, as one of another program or
-    of a later release might.
+    None if the network cannot be built from the card, which may be of another program or of a later
+    release.
     """
     network = card.provenance.get("network")
     if not isinstance(network, dict):
@@ -78,17 +77,17 @@ def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0)
             return None
         if model.timing != Timing(card.steps, card.substeps):
             return None
-        model = _begun(model, card.provenance.get("training"))
+        model = _draw_first_weights(model, card.provenance.get("training"))
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 
 def network_layers(
     model: TactileClassifier, stimuli: StimuliInput, name: str = "network", sha256: str = ""
 ) -> Layers:
-    """Layers of a network; its mode is left as it was.
+    """Run a network on the six stimuli and return its layers; its mode is restored.
 
     Raises:
-        ConfigError: the network wants more than the frames of one array.
+        ConfigError: the network needs other input than the frames of one array.
     """
     mode = model.training
     model.eval()
@@ -98,12 +97,12 @@ def network_layers(
             loads = (stimuli.samples, stimuli.offset, stimuli.sigma)
             frames = model.inputs(*(torch.from_numpy(a).to(device) for a in loads))
             network = model.network
-            traces, features, first = _encoder(network.encoder, frames)
+            traces, features, first = _trace_encoder(network.encoder, frames)
             after = dict.fromkeys(traces, 0) | first
-            with _recorded(_attender_layers(network.attender), "attender", frames) as recorded:
+            with _record_taps(_tap_attender(network.attender), "attender", frames) as recorded:
                 features = network.attender(features)
             traces |= recorded
-            with _recorded(_decoder_layers(network.decoder), "decoder", frames) as recorded:
+            with _record_taps(_tap_decoder(network.decoder), "decoder", frames) as recorded:
                 network.decoder(features)
             traces |= recorded
             logits = network(frames)
@@ -120,8 +119,8 @@ def network_layers(
     )
 
 
-def _begun(model: TactileClassifier, training: object) -> TactileClassifier:
-    """With the first weights that its training drew, as far as that is known."""
+def _draw_first_weights(model: TactileClassifier, training: object) -> TactileClassifier:
+    """Draw the initial weights as published if the training used such; return the model."""
     paper = table(training).get("first_weights") == "paper"
     if paper and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)
@@ -129,22 +128,22 @@ def _begun(model: TactileClassifier, training: object) -> TactileClassifier:
 
 
 def reach(graph: Graph) -> dict[str, int]:
-    """By node, the first step whose output depends on the frame: the shortest path to it."""
+    """Compute each node's first step that depends on the frame, by the shortest path."""
     distance = {graph.frame.name: -1}
     nodes = graph.nodes
     for _ in graph.nodes:
         for node in nodes:
-            # The frame is read at once, everything else a step late.
+            # The frame is read without delay, all other sources with a delay of one step.
             known = [distance[e.source] for e in node.reads if e.source in distance]
             if known:
                 distance[node.name] = min(min(known) + 1, distance.get(node.name, len(nodes)))
     return {n.name: distance[n.name] for n in nodes if n.name in distance}
 
 
-def _encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, int]]:
-    """Traces, features (6, step, feature), and first steps."""
+def _trace_encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, int]]:
+    """Return an encoder's traces, features (6, step, feature), and first steps by layer."""
     if isinstance(encoder, GraphEncoder):
-        traces, features = _graph(encoder, frames)
+        traces, features = _trace_graph(encoder, frames)
         return traces, features, {f"encoder.{k}": v for k, v in reach(encoder.graph).items()}
     if isinstance(encoder, GRUEncoder):
         state, steps = encoder.initial_state(len(frames)), []
@@ -153,15 +152,16 @@ def _encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, in
             steps.append(state["gru_h"])
         layers = torch.stack(steps, 1).unbind(2)
         return {f"encoder.layer{i}": x for i, x in enumerate(layers)}, layers[-1], {}
-    with _recorded(_encoder_layers(encoder), "encoder", frames) as recorded:
+    with _record_taps(_tap_encoder(encoder), "encoder", frames) as recorded:
         features = encoder(frames)
-    if not recorded:  # of a kind that is not known here
+    if not recorded:  # an unknown kind of encoder
         recorded["encoder.features"] = features
     return recorded, features, {}
 
 
-def _graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
-    """Every node's output, step by step: the window form leaves out what reaches no feature."""
+def _trace_graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
+    """Run a graph encoder step by step; return all nodes' outputs and the features."""
+    # Not in the window form, which leaves out nodes that reach no feature.
     found: dict[str, list[Tensor]] = {node.name: [] for node in encoder.graph.nodes}
     original = encoder._run_cell
 
@@ -181,26 +181,26 @@ def _graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
     return {f"encoder.{k}": torch.stack(v, 1) for k, v in found.items()}, torch.stack(steps, 1)
 
 
-# (name, module, whether its input is meant, what is done to it)
+# (name of the layer, module, True to record its input and not its output, function to apply)
 Tap = tuple[str, nn.Module, bool, Change | None]
 
 
-def _encoder_layers(encoder: Any) -> list[Tap]:
+def _tap_encoder(encoder: Any) -> list[Tap]:
     taps: list[Tap] = []
     for name in ("stem", "embed"):
         if hasattr(encoder, name):
             taps.append((name, getattr(encoder, name), False, F.relu if name == "stem" else None))
-    if hasattr(encoder, "blocks"):  # of ResNet18 and S4: whole, residual included
+    if hasattr(encoder, "blocks"):  # ResNet18 and S4: the whole block, residual included
         taps += [(f"block{i}", block, False, None) for i, block in enumerate(encoder.blocks)]
     if isinstance(stack := getattr(encoder, "stack", None), MambaStack):
-        taps += _mamba(stack)
+        taps += _tap_mamba(stack)
     taps += [(n, getattr(encoder, n), False, None) for n in ("fc", "out") if hasattr(encoder, n)]
     return taps
 
 
-def _attender_layers(attender: nn.Module) -> list[Tap]:
+def _tap_attender(attender: nn.Module) -> list[Tap]:
     if isinstance(attender, MambaStack):
-        return _mamba(attender)
+        return _tap_mamba(attender)
     if isinstance(attender, GPT):
 
         def action(x: Tensor) -> Tensor:
@@ -212,14 +212,14 @@ def _attender_layers(attender: nn.Module) -> list[Tap]:
     return []
 
 
-def _mamba(stack: MambaStack) -> list[Tap]:
-    """The residual sum after each block is what the next norm reads."""
+def _tap_mamba(stack: MambaStack) -> list[Tap]:
+    """Tap the residual sum after each block: the input of the next norm."""
     after = [*list(stack.norms)[1:], stack.norm]
     taps: list[Tap] = [(f"block{i}", norm, True, None) for i, norm in enumerate(after)]
     return [*taps, ("norm", stack.norm, False, None)]
 
 
-def _decoder_layers(decoder: nn.Module) -> list[Tap]:
+def _tap_decoder(decoder: nn.Module) -> list[Tap]:
     if isinstance(decoder, nn.Sequential):
         hidden = [m for m in decoder if isinstance(m, nn.ReLU)]
         taps: list[Tap] = [(f"fc{i + 1}", m, False, None) for i, m in enumerate(hidden)]
@@ -236,10 +236,10 @@ def _decoder_layers(decoder: nn.Module) -> list[Tap]:
 
 
 @contextmanager
-def _recorded(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
-    """Record, in the order of `taps`, what they give within the block, (6, step, unit)."""
+def _record_taps(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
+    """Record the taps' tensors (6, step, unit) within a ``with`` block, in order."""
     shape = frames.shape[:2]
-    traces: Traces = {f"{part}.{name}": frames for name, *_ in taps}  # by which they are in order
+    traces: Traces = {f"{part}.{name}": frames for name, *_ in taps}  # placeholders, in order
 
     def keep(name: str, change: Change | None, x: Tensor) -> None:
         x = change(x) if change else x

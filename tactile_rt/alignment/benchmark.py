@@ -1,8 +1,8 @@
-"""A frozen benchmark: what scoring a model needs, without any animal's raw data.
+"""A frozen benchmark: the data that scoring a model needs, without any animal's raw recordings.
 
 A deterministic model's score against an animal is r_xy times a factor that depends on the animal
-alone, so an RDM (15 numbers of six stimuli) and that factor per animal are enough. Its file is
-JSON with a hash of the content: one of another version, or changed by hand, is refused.
+alone, so an RDM (15 numbers for six stimuli) and that factor per animal are enough. Its file is
+JSON with a hash of the content: a file of another version, or changed by hand, is refused.
 """
 
 import hashlib
@@ -24,14 +24,14 @@ FEWEST, MOST = 3, 50  # stimuli
 
 
 class Frozen(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
-    """An RDM and how far it can be relied on.
+    """An RDM with its reliability and noise correction.
 
     Attributes:
         rdm: (pair,) The dissimilarities of the pairs of stimuli: for paper-code, from the mean
             over trials; for strict, the mean over divisions of the trials.
         reliability: The mean split-half correlation of the RDM, corrected by Spearman-Brown; for
             strict, that of the RDM of one half of a division.
-        factor: The factor K by which a model's r_xy is multiplied to give its score; NaN if the RDM
+        factor: The factor by which a model's r_xy is multiplied to give its score; NaN if the RDM
             is too noisy to score on.
     """
 
@@ -42,11 +42,11 @@ class Frozen(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
 
 
 class Target(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
-    """What models are compared to: an animal, or all of them pooled.
+    """A target that models are compared with: an animal, or all animals pooled.
 
     Attributes:
-        chosen: The RDM that the protocol scores on; for strict, it is made of reliable units only.
-        trials: The number of trials that were used; for paper-code, the rows of the padded array.
+        chosen: The RDM that the protocol scores on; for strict, from reliable units only.
+        trials: The number of trials used; for paper-code, the rows of the padded array.
     """
 
     name: str
@@ -58,14 +58,14 @@ class Target(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
 
 
 class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
-    """How well animals predict each other.
+    """Scores of animals as predictors of each other.
 
     Attributes:
         pooled: (animal,) The score of all other animals' units pooled against each animal; NaN
-            where there is none.
-        pairwise: (animal, animal) The score of a row's animal against a column's; NaN on the
+            without a score.
+        pairwise: (animal, animal) The score between each row's and column's animal; NaN on the
             diagonal.
-        ddof: The degrees of freedom that the standard error leaves to the mean: 1, and 0 in the
+        ddof: The degrees of freedom that the standard error deducts for the mean: 1, or 0 as in the
             published analysis.
     """
 
@@ -76,7 +76,7 @@ class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=T
 
     @property
     def mean(self) -> float:
-        """Mean of the pooled scores; NaN without any."""
+        """Mean of the pooled scores; NaN if none is finite."""
         return self._reduce(np.mean)
 
     @property
@@ -98,7 +98,7 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
     """A frozen benchmark.
 
     Attributes:
-        pooled: All animals as one target, which paper-code scores on as well; None under strict.
+        pooled: All animals as one further target of paper-code; None under strict.
     """
 
     protocol: str
@@ -113,7 +113,7 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
 
     @property
     def all_targets(self) -> tuple[Target, ...]:
-        """Animals, and the pooled target where there is one."""
+        """Animals, followed by the pooled target if there is one."""
         return self.targets + ((self.pooled,) if self.pooled else ())
 
     @property
@@ -122,7 +122,7 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
         return tuple(target for target in self.targets if target.reliable)
 
 
-# 3: the benchmark stands beside its hash.
+# Version 3: the file holds the benchmark and its hash.
 class _File(
     msgspec.Struct, tag_field="kind", tag="tactile_rt benchmark 3", forbid_unknown_fields=True
 ):
@@ -131,7 +131,7 @@ class _File(
 
 
 def benchmark_sha256(benchmark: Benchmark) -> str:
-    """Hash of a benchmark's content, as its file carries it."""
+    """Return the SHA-256 of a benchmark's content, as stored in its file."""
     return hashlib.sha256(encode(benchmark)).hexdigest()
 
 
@@ -144,7 +144,7 @@ def load_benchmark(path: Path) -> Benchmark:
     """Read a benchmark.
 
     Raises:
-        ConfigError: no such file, another version, a field that is wrong, or changed content.
+        ConfigError: no such file, another version, a wrong field, or changed content.
     """
     file = read_json(path, _File, "tactile-rt align build")
     if file.sha256 != benchmark_sha256(file.benchmark):
@@ -154,7 +154,7 @@ def load_benchmark(path: Path) -> Benchmark:
 
 
 def load_strict(path: Path) -> Benchmark:
-    """Read a benchmark of the protocol whose stimuli have names, as gate and decoder need."""
+    """Read a benchmark of protocol strict: gate and decoder need named stimuli."""
     benchmark = load_benchmark(path)
     if benchmark.protocol != "strict":
         raise ConfigError(
@@ -165,10 +165,10 @@ def load_strict(path: Path) -> Benchmark:
 
 
 def check_benchmark(benchmark: Benchmark, path: Path) -> None:
-    """Check what the types of a benchmark's fields cannot.
+    """Check a benchmark beyond the types of its fields.
 
     Raises:
-        ConfigError: no such protocol, other stimuli, or tables that do not fit.
+        ConfigError: an unknown protocol, invalid stimuli, or tables that do not fit.
     """
     if benchmark.protocol not in PROTOCOLS:
         raise ConfigError(f"{path}: no protocol {benchmark.protocol!r}: {', '.join(PROTOCOLS)}")

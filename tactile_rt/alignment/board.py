@@ -1,8 +1,8 @@
-"""The board: models by datasets by metrics, each value as a share of what the noise permits.
+"""The board of models by datasets by metrics, in shares of the noise ceiling.
 
-In every cell a model's layer is chosen on the other animals (`statistics.held_out`), so that the
-board tells no maximum. What it is to be read against stands in rows of the same kind: the sensors
-themselves, each network before its training, and another animal.
+In every cell a model's layer is chosen on the other animals (`statistics.held_out`), so that no
+value is a maximum over layers. Controls are rows as well: the sensors' readings, each network
+before its training, and another animal.
 """
 
 import math
@@ -28,7 +28,7 @@ ANOTHER = "another animal"
 
 
 class BoardRow(msgspec.Struct, frozen=True):
-    """What is compared with the recordings."""
+    """A model or control that is compared with the recordings."""
 
     name: str
     # kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or ``animal``
@@ -39,21 +39,21 @@ class BoardRow(msgspec.Struct, frozen=True):
 
 
 class BoardColumn(msgspec.Struct, frozen=True):
-    """Part of a dataset under a metric."""
+    """One part of a dataset under one metric."""
 
     dataset: str
     part: str
     metric: str
     animals: int
     usable: int  # number of animals whose noise is low enough to be corrected for
-    # mean over these of the value that a perfect model is expected to reach; NaN without any
+    # mean ceiling over these, which a perfect model is expected to reach; NaN without any
     ceiling: Number
 
 
 class BoardCell(msgspec.Struct, frozen=True):
     """A row's value in a column."""
 
-    # mean over animals of the value as a share of the ceiling; NaN without any
+    # mean over animals of the value as a share of the ceiling; NaN without a value
     score: Number = math.nan
     sem: Number = math.nan  # standard error of that mean; NaN with fewer than two animals
     value: Number = math.nan
@@ -61,7 +61,7 @@ class BoardCell(msgspec.Struct, frozen=True):
 
 
 class BoardDataset(msgspec.Struct, frozen=True):
-    """Where a dataset comes from; attributes as in `datasets.NeuralDataset`, and what was read."""
+    """A dataset's origin, as in `datasets.NeuralDataset`, and the animals and units read."""
 
     name: str
     title: str
@@ -76,7 +76,7 @@ class BoardDataset(msgspec.Struct, frozen=True):
 
 
 class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt board 2"):
-    """A whole board."""
+    """All rows, columns and cells of a board."""
 
     rows: tuple[BoardRow, ...]
     columns: tuple[BoardColumn, ...]
@@ -86,9 +86,9 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
 
 
 def traces_of(layers: Layers) -> Traces:
-    """Layers as metrics take them: NaN before the step that input reaches.
+    """Convert layers for metrics: NaN before the step that input reaches.
 
-    What was computed elsewhere for a whole stimulus, one step, holds at every step.
+    Responses of a single step, computed elsewhere for a whole stimulus, are repeated for each step.
     """
     out: dict[str, Floats] = {}
     for name, trace in layers.traces.items():
@@ -99,7 +99,7 @@ def traces_of(layers: Layers) -> Traces:
 
 
 def traces_of_stimuli(stimuli: StimuliInput) -> Traces:
-    """The loads themselves as a layer, mean over a step's samples, SI."""
+    """Return the loads themselves as a layer, averaged over each step's samples, SI."""
     steps = stimuli.samples.astype(np.float64).mean(axis=2)
     return {"raw": steps.reshape(*steps.shape[:2], -1)}
 
@@ -113,16 +113,16 @@ def with_cells(
     notes: Iterable[str] = (),
     progress: Callable[[float], None] = lambda share: None,
 ) -> Alignments:
-    """The board of one dataset; the row of another animal is added to the given ones.
+    """Make the board of one dataset from given rows and a row of another animal.
 
     Args:
-        rows: each with its layers for this dataset's conditions.
+        rows: each with its layers' responses to the dataset's conditions.
     """
     from threadpoolctl import threadpool_limits
 
     columns: list[BoardColumn] = []
     cells: list[list[BoardCell]] = [[] for _ in range(len(rows) + 1)]
-    # Matrices are small: more threads wait for each other, on a busy machine for minutes.
+    # Matrices are small: more threads only wait for each other, on a busy machine for minutes.
     with threadpool_limits(1):
         for done, (part, metric) in enumerate((p, m) for p in parts for m in metrics):
             targets = part_of(animals, part)
@@ -134,8 +134,8 @@ def with_cells(
                 BoardColumn(dataset.name, part, metric, len(targets), len(usable), ceiling)
             )
             for row, (_, traces) in zip(cells, rows, strict=False):
-                row.append(_cell(traces, measures))
-            cells[-1].append(_another(usable))
+                row.append(_make_cell(traces, measures))
+            cells[-1].append(_compare_animals(usable))
             progress((done + 1) / (len(parts) * len(metrics)))
     card = BoardDataset(
         **{key: getattr(dataset, key) for key in BoardDataset.__struct_fields__[:7]},
@@ -143,13 +143,13 @@ def with_cells(
         units=sum(s.rates.shape[1] for a in animals for s in a.sessions),
         notes=tuple(notes),
     )
-    said = {name: METRICS[name][1] if name in METRICS else "of another package" for name in metrics}
-    named = (*(row for row, _ in rows), BoardRow(ANOTHER, "animal"))
-    return Alignments(named, tuple(columns), tuple(map(tuple, cells)), (card,), said)
+    texts = {n: METRICS[n][1] if n in METRICS else "of another package" for n in metrics}
+    every = (*(row for row, _ in rows), BoardRow(ANOTHER, "animal"))
+    return Alignments(every, tuple(columns), tuple(map(tuple, cells)), (card,), texts)
 
 
 def joined(boards: Sequence[Alignments]) -> Alignments:
-    """Boards of the same rows side by side."""
+    """Join boards of the same rows side by side."""
     return msgspec.structs.replace(
         boards[0],
         columns=tuple(column for board in boards for column in board.columns),
@@ -158,38 +158,38 @@ def joined(boards: Sequence[Alignments]) -> Alignments:
     )
 
 
-def _cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
-    """A model's cell: of each animal the layer that is best on the others."""
+def _make_cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
+    """Make a model's cell: score on each animal the layer best on the others."""
     values = np.array([[m.fit(trace) for m in measures] for trace in traces.values()])
     values = values.reshape(len(traces), len(measures))
-    there = np.flatnonzero(np.isfinite(values).all(axis=1)) if len(measures) else np.empty(0, int)
-    shares = values[there] / [m.ceiling for m in measures]
+    finite = np.flatnonzero(np.isfinite(values).all(axis=1)) if len(measures) else np.empty(0, int)
+    shares = values[finite] / [m.ceiling for m in measures]
     scores, best = held_out(shares)
     if not np.isfinite(scores).any():
         return BoardCell()
-    names = [tuple(traces)[k] for k in there]
+    names = [tuple(traces)[k] for k in finite]
     chosen = [names[k] for k in best]
-    raw = values[there][best, np.arange(len(measures))]
+    raw = values[finite][best, np.arange(len(measures))]
     layer = max(set(chosen), key=chosen.count)
     return BoardCell(float(scores.mean()), standard_error(scores), float(raw.mean()), layer)
 
 
-def _another(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
-    """The cell of animals as models of each other: each measured by all others, one at a time."""
+def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
+    """Make the cell of animals as models of each other, from mean fits."""
     scores, raw = [], []
     for target, measure in animals:
-        found = [measure.fit(_as_layer(a)) for a, _ in animals if a is not target]
-        there = np.array([value for value in found if np.isfinite(value)])
-        if there.size:
-            scores.append(float(there.mean()) / measure.ceiling)
-            raw.append(float(there.mean()))
+        found = [measure.fit(_convert_to_layer(a)) for a, _ in animals if a is not target]
+        fits = np.array([value for value in found if np.isfinite(value)])
+        if fits.size:
+            scores.append(float(fits.mean()) / measure.ceiling)
+            raw.append(float(fits.mean()))
     if not scores:
         return BoardCell()
     return BoardCell(float(np.mean(scores)), standard_error(scores), float(np.mean(raw)))
 
 
-def _as_layer(animal: Animal) -> Floats:
-    """An animal's mean responses, (6, bin, unit); without a time course the same in every bin."""
+def _convert_to_layer(animal: Animal) -> Floats:
+    """Return mean responses (stimulus, bin, unit); without a time course, alike in all bins."""
     sessions = sessions_of(animal)
     means = means_of(sessions, bins_of(sessions))
     return np.repeat(means, LONGEST, axis=1) if means.shape[1] == 1 else means

@@ -1,4 +1,4 @@
-"""The board as one page."""
+"""The alignment board as one HTML page."""
 
 from html import escape
 

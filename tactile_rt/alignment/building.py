@@ -1,4 +1,4 @@
-"""From recordings to a frozen benchmark."""
+"""Building of a frozen benchmark from recordings."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -24,11 +24,10 @@ from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
-# Of the time that a build takes; the rest is bootstraps.
-READING = 0.8
-# Of two copies of a session.
-MOST = 0.5  # of the smaller one's trials or units
-FEWEST = 3  # of trials or units that say something
+READING = 0.8  # share of a build's time; the rest is bootstraps
+# Two sessions are copies if they share more than `MOST` of the smaller one's trials or units.
+MOST = 0.5
+FEWEST = 3  # trials or units needed to compare sessions, and different rates to compare units
 
 
 def build(
@@ -46,17 +45,17 @@ def build(
         inputs: NWB files and folders of them; sessions of any named stimuli, an ``.npz`` or two
             tables (`named_recordings`); or, for paper-code, one published ``.npz``.
         progress: called with the share done, 0 to 1.
-        selection: which sessions and units of NWB files are kept; None for all.
-        clock: spike times are on the ``session``'s clock, as NWB has it and strict by default, or
-            on the ``recording``'s, as the published analysis has it and paper-code by default.
+        selection: which sessions and units to keep; None for all.
+        clock: the clock of spike times: the ``session``'s, as in NWB and by default for strict, or
+            the ``recording``'s, as in the published analysis and by default for paper-code.
 
     Returns:
-        A benchmark with a reliable animal at least. Its notes begin with what the clock's check
-        found, and say what was left out.
+        A benchmark with at least one reliable animal. Its notes begin with the result of the check
+        of the clock, and list what was left out.
 
     Raises:
-        ConfigError: recordings that cannot be used, and why: no animal is reliable, a session is
-            there twice, or, under strict, contacts show that spikes are on another clock.
+        ConfigError: recordings that cannot be used: no animal is reliable, a session is given
+            twice, or, under strict, contacts show that spikes are on another clock.
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
@@ -85,7 +84,7 @@ def build(
             "or units applies to it"
         )
 
-    def splitting(share: float) -> None:
+    def report_bootstraps(share: float) -> None:
         progress(READING + (1 - READING) * share)
 
     if named:
@@ -110,12 +109,12 @@ def build(
             names = name_some(sorted(file.name for file in others))
             notes.append(f"passed over, without `ecephys` in their names: {names}")
         if not strict:
-            animals = by_animal(_complete(sessions, notes))
+            animals = by_animal(_keep_complete(sessions, notes))
             rates = {animal.name: published_layout(animal) for animal in animals}
     if strict:
-        made = freeze_strict(by_animal(sessions), bootstraps, seed, splitting)
+        made = freeze_strict(by_animal(sessions), bootstraps, seed, report_bootstraps)
     else:
-        made = freeze_paper_code(rates, bootstraps, seed, splitting)
+        made = freeze_paper_code(rates, bootstraps, seed, report_bootstraps)
     if not made.reliable:
         found = name_some(
             f"{t.name} {t.chosen.reliability:.2f} ({t.chosen.units} of {t.unfiltered.units} units)"
@@ -133,16 +132,16 @@ def checked_sessions(
     clock: str | None = None,
     selection: Selection | None = None,
 ) -> tuple[list[NeuralSession], list[str]]:
-    """Sessions of NWB files whose clock is the one that contacts show, and none of them twice.
+    """Read sessions of NWB files, check their clocks, and refuse copies.
 
     Args:
-        strict: rates count from first contact, and sessions of another clock are left out; else
-            from the start of the trial, and a note warns of them.
+        strict: True to count rates from first contact, and leave out sessions whose contacts show
+            another clock; False to count from the start of the trial, and only note such sessions.
     """
     clock = clock or ("session" if strict else "recording")
     window = "contact" if strict else "start"
     readings, notes = read_nwb(files, window, progress, clock, selection or Selection())
-    readings, said = _clock_checked(readings, clock, strict)
+    readings, warnings = _check_clock(readings, clock, strict)
     tasks = {
         task: len({r.session.animal for r in readings if r.task == task})
         for task in sorted({r.task for r in readings})
@@ -152,22 +151,22 @@ def checked_sessions(
         notes.append(f"animals of two tasks are together, {pooled}: --task keeps one")
     sessions = [reading.session for reading in readings]
     refuse_copies(sessions)
-    return sessions, [*said, *notes]
+    return sessions, [*warnings, *notes]
 
 
-def _clock_checked(
+def _check_clock(
     readings: list[Reading], clock: str, strict: bool
 ) -> tuple[list[Reading], list[str]]:
-    """Readings whose contacts do not speak against their clock, and what the check found."""
+    """Return the readings whose contacts do not contradict the clock, and notes on the check."""
     responses = [r.response for r in readings if r.response is not None]
     if not responses:
         return readings, [
             WARNING + "the clock of the spikes is unchecked: no contacts, or no spikes"
         ]
-    said = [said_of(responses, clock)]
+    found = [said_of(responses, clock)]
     wrong = [response for response in responses if response.elsewhere]
     if not wrong:
-        return readings, said
+        return readings, found
     first = wrong[0]
     why = (
         f"in {len(wrong)} of {len(readings)} sessions another offset fits contacts better: in "
@@ -175,16 +174,16 @@ def _clock_checked(
         f"subtracted from spike times, and not {first.shift_s:.3f} s (z = {first.z:.1f})"
     )
     if strict and 2 * len(wrong) > len(responses):
-        raise ConfigError(f"{said[0].removeprefix(WARNING)}; {why}: see --clock")
+        raise ConfigError(f"{found[0].removeprefix(WARNING)}; {why}: see --clock")
     if not strict:
-        return readings, [*said, WARNING + why]
+        return readings, [*found, WARNING + why]
     names = {response.session for response in wrong}
     kept = [r for r in readings if r.session.name not in names]
-    return kept, [*said, f"{WARNING}{why}: left out: {', '.join(sorted(names))}"]
+    return kept, [*found, f"{WARNING}{why}: left out: {', '.join(sorted(names))}"]
 
 
-def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[NeuralSession]:
-    """Sessions with every stimulus, which paper-code can place; the others are noted."""
+def _keep_complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[NeuralSession]:
+    """Keep the sessions with every stimulus, which paper-code needs, and note the others."""
     kept = []
     for session in sessions:
         missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
@@ -200,11 +199,11 @@ def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[Neura
 
 
 def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
-    """Refuse recordings that hold a session twice, in another sorting or order, or units less.
+    """Refuse a session given twice, even with another spike sorting, order or fewer units.
 
     Two copies of a session would be split into the same halves and agree with each other perfectly.
-    Two sessions are copies if they share most of their trials (when each began, and its stimulus),
-    or most of their units (how often which rate came with which stimulus), whatever the order.
+    Two sessions are copies if they share, in any order, most of their trials (time of beginning and
+    stimulus), or most of their units (the counts of their rates for each stimulus).
     """
     trials = [_count_trials(session) for session in sessions]
     units = [_count_units(session) for session in sessions]
@@ -220,12 +219,13 @@ def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
 
 
 def _share_most(one: Counter[bytes], other: Counter[bytes]) -> bool:
+    """Return whether two counters share most of the smaller one's items."""
     fewer = min(one.total(), other.total())
     return fewer >= FEWEST and (one & other).total() > MOST * fewer
 
 
 def _count_trials(session: NeuralSession) -> Counter[bytes]:
-    """Count trials by when they began, to a ms, and their stimulus."""
+    """Count trials by the time of their beginning, rounded to 1 ms, and their stimulus."""
     if session.begin is None:
         return Counter()
     began = np.round(session.begin * 1e3).astype(np.int64)
@@ -233,7 +233,7 @@ def _count_trials(session: NeuralSession) -> Counter[bytes]:
 
 
 def _count_units(session: NeuralSession) -> Counter[bytes]:
-    """Count units by their rates, sorted within stimuli; three rates at least."""
+    """Count units by their rates, sorted within stimuli, if three or more rates differ."""
     found: Counter[bytes] = Counter()
     for rates in session.rates.T:
         if len(np.unique(rates)) >= FEWEST:
@@ -246,8 +246,8 @@ def animal_means(path: Path) -> tuple[dict[str, NDArray[np.float64]], list[str]]
     """Read the mean responses (6, unit) of animals, and notes on what was left out.
 
     Args:
-        path: rates in the published layout, ``.npz``, as their authors publish them, mistakes
-            included (`neural.published_layout`); or an NWB file, or a folder of them.
+        path: an NWB file, or a folder of them; or ``.npz``, rates in the layout that their authors
+            published, mistakes included (`neural.published_layout`).
     """
     if path.suffix == ".npz":
         return {name: trial_mean(rates) for name, rates in read_published(path).items()}, []

@@ -1,16 +1,16 @@
-"""The clock that spikes are on, checked on the data: rates must rise 3 to 40 ms after contact.
+"""Check of the clock of spikes: rates must rise 3 to 40 ms after contact.
 
-Barrel cortex answers a touch within milliseconds, so a recording tells by itself whether its spikes
+Barrel cortex answers a touch within milliseconds, so the recording itself shows whether its spikes
 and its contacts are on one clock.
 
-- *Contacts* count that begin a bout, none within 250 ms before: the rate before them is a baseline,
-  and the rhythm of whisking makes no other shift look right.
+- *Contacts* count only if they begin a bout, with none in the 250 ms before: the rate before them
+  is then a baseline, and the rhythm of whisking cannot make another shift look right.
 - *The rise* is the number of spikes 3 to 40 ms after contact less that in as long a time before.
-- *What chance does* is seen by shifting spikes against contacts by up to 20 s, or somewhat more
-  than the recording's starting time: the rises at all those shifts have a spread, and z is the rise
-  in units of it. Slow changes of the rate, with the trials say, cancel in the difference.
-- *Another clock* is suspected where some other shift has a rise that no chance explains and that is
-  clearly greater than the rise without a shift.
+- *Chance* is measured by shifting spikes against contacts by up to 20 s, or somewhat more than the
+  recording's starting time: z is the rise in units of the spread of the rises over all shifts. Slow
+  changes of the rate, such as with the trials, cancel in the difference.
+- *Another clock* is suspected if another shift has a rise that is beyond chance and clearly greater
+  than the rise without a shift.
 """
 
 from collections.abc import Sequence
@@ -21,61 +21,61 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.rdm import Floats
 
-CLOCKS = ("session", "recording")  # NWB's; and the published shift by the starting time
+CLOCKS = ("session", "recording")  # as in NWB; shifted by the starting time, as published
 WARNING = "WARNING: "  # begins a note that must not be overlooked
 
-APART_S = 0.25  # between a contact that counts and the one before it
+APART_S = 0.25  # least time between a contact that counts and the previous one
 RISE_MS = (3, 40)
-BEFORE_MS, AFTER_MS = 40, 60  # of the histogram
-BEFORE = slice(BEFORE_MS - RISE_MS[1], BEFORE_MS - RISE_MS[0])  # the parts of it that are compared
+BEFORE_MS, AFTER_MS = 40, 60  # extent of the histogram before and after contact
+BEFORE = slice(BEFORE_MS - RISE_MS[1], BEFORE_MS - RISE_MS[0])  # its parts that are compared
 AFTER = slice(BEFORE_MS + RISE_MS[0], BEFORE_MS + RISE_MS[1])
-BIN_S = 0.002  # of the search for another shift
-HERE_S = 0.03  # a shift below this is none
-SEARCH_S, FURTHER_S = 20.0, 5.0  # as far as that, and so much beyond the starting time
-FURTHEST_S, LONGEST_S = 600.0, 14_400.0  # of a shift, and of a session, that is searched
-RISES_Z = 5.0
-ELSEWHERE_Z, CLEARLY = 7.0, 1.5
+BIN_S = 0.002  # bin width in the search for another shift
+HERE_S = 0.03  # a shift up to this counts as none
+SEARCH_S, FURTHER_S = 20.0, 5.0  # least reach of the search, and reach beyond the starting time
+FURTHEST_S, LONGEST_S = 600.0, 14_400.0  # greatest reach, and longest session that is searched
+RISES_Z = 5.0  # least z of a rise beyond chance
+ELSEWHERE_Z, CLEARLY = 7.0, 1.5  # least z of another clock, also as a multiple of z without shift
 
 
 @dataclass(frozen=True, eq=False)
 class ContactResponse:
-    """How the rates of a session, or of several, change with contact."""
+    """The change of rates with contact, in one session or several."""
 
     session: str
-    shift_s: float  # what was subtracted from the stored spike times, in s
+    shift_s: float  # shift that was subtracted from the stored spike times, in s
     # (100,) number of spikes of all units in each ms from 40 ms before to 60 ms after contact
     histogram: NDArray[np.int64]
     windows: int  # number of contacts times the number of units
     rise: float  # number of spikes 3 to 40 ms after contact less that in as long a time before
-    spread: float  # spread of that number over other shifts, which chance alone makes
-    # shift in s from the stored spike times at which the rise is greatest otherwise
+    spread: float  # spread of that number over other shifts, by chance alone
+    # shift in s to subtract from the stored spike times: the best one other than `shift_s`
     other_s: float = 0.0
     other_z: float = 0.0  # rise at that shift, in units of `spread`
 
     @property
     def z(self) -> float:
-        """The rise in units of what chance makes; 0 where there are no spikes."""
+        """Rise in units of its spread by chance; 0 if there is no spread."""
         return self.rise / self.spread if self.spread > 0 else 0.0
 
     @property
     def rises(self) -> bool:
-        """Whether the rates rise after contact, beyond chance."""
+        """True if the rates rise after contact, beyond chance."""
         return self.z >= RISES_Z
 
     @property
     def elsewhere(self) -> bool:
-        """Whether another shift fits clearly better."""
+        """True if another shift fits clearly better."""
         return self.other_z >= max(ELSEWHERE_Z, CLEARLY * self.z)
 
     @property
     def latency_s(self) -> float:
-        """When the rate is half way from its level before contact to its highest after, in s."""
+        """Time from contact until the rate is half way from baseline to peak, in s."""
         smooth = np.convolve(self.histogram, np.ones(3) / 3, mode="same")
         base, after = smooth[1:BEFORE_MS].mean(), smooth[BEFORE_MS:-1]
         return float(np.argmax(after >= (base + after.max()) / 2) + 0.5) * 1e-3
 
     def rate_hz(self, part: slice) -> float:
-        """Return a unit's mean rate in a part of the histogram, spikes/s."""
+        """Return the mean rate of a unit in a part of the histogram, spikes/s."""
         time_s = self.windows * (part.stop - part.start) * 1e-3
         return float(self.histogram[part].sum() / time_s) if time_s else 0.0
 
@@ -87,16 +87,16 @@ def contact_response(
     shift_s: float = 0.0,
     starting_time_s: float = 0.0,
 ) -> ContactResponse | None:
-    """How a session's rates change with contact.
+    """Measure the change of a session's rates with contact.
 
     Args:
         spikes: (spike,) stored times of each unit in s, finite.
         contacts: (contact,) times when contacts begin in s, finite and sorted.
-        shift_s: is subtracted from the stored times.
-        starting_time_s: of the electrical recording, which the search reaches beyond.
+        shift_s: shift to subtract from the stored times.
+        starting_time_s: starting time of the electrical recording; the search reaches beyond it.
 
     Returns:
-        None without contacts or spikes to tell by.
+        The response; None without contacts or spikes, or if contacts span more than 4 hours.
     """
     first = contacts[np.diff(contacts, prepend=-np.inf) > APART_S]
     times = np.sort(np.concatenate([*spikes, np.empty(0)])) - shift_s
@@ -107,11 +107,11 @@ def contact_response(
     if not times.size:
         return None
     edges_s = np.arange(-BEFORE_MS, AFTER_MS + 1) * 1e-3
-    # A microsecond less: what is stored in seconds lies beside a bin's edge by rounding.
-    reached = np.searchsorted(times, first[:, None] + edges_s - 1e-6)
-    histogram = np.diff(reached.sum(axis=0))
-    shifts, rises = _search(times, first, reach)
-    low, high = np.percentile(rises, (2.5, 97.5))  # few enough shifts lie in a true rise
+    # A microsecond less, since times stored in s may lie beside a bin's edge by rounding.
+    before = np.searchsorted(times, first[:, None] + edges_s - 1e-6)  # spikes before each edge
+    histogram = np.diff(before.sum(axis=0))
+    shifts, rises = _search_shifts(times, first, reach)
+    low, high = np.percentile(rises, (2.5, 97.5))  # a true rise covers too few shifts to matter
     spread = float(high - low) / 3.92
     far = np.abs(shifts) > HERE_S
     best = int(np.argmax(np.where(far, rises, -np.inf)))
@@ -127,17 +127,17 @@ def contact_response(
     )
 
 
-def _search(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floats]:
-    """Shifts in s, and the rise after contact when so much is subtracted from the spike times."""
+def _search_shifts(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floats]:
+    """Return shifts in s and the rise after contact for spike times less each shift."""
     begin = contacts[0] - 2 * reach
     bins = int((contacts[-1] - contacts[0] + 4 * reach) / BIN_S) + 2
 
-    def binned(values: Floats) -> NDArray[np.int64]:
+    def count(values: Floats) -> NDArray[np.int64]:
         return np.bincount(((values - begin) / BIN_S).astype(np.int64), minlength=bins)[:bins]
 
     size = 1 << (bins - 1).bit_length()
-    product = np.conj(np.fft.rfft(binned(contacts), size)) * np.fft.rfft(binned(times), size)
-    together = np.fft.irfft(product, size)  # at k: pairs of a contact and a spike k bins later
+    product = np.conj(np.fft.rfft(count(contacts), size)) * np.fft.rfft(count(times), size)
+    together = np.fft.irfft(product, size)  # at k: number of spikes k bins after a contact
     window = round(RISE_MS[1] * 1e-3 / BIN_S)
     lags = np.arange(-int(reach / BIN_S), int(reach / BIN_S) + 1)
     total = np.concatenate([[0.0], np.cumsum(np.roll(together, size // 2))])
@@ -147,7 +147,7 @@ def _search(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floa
 
 
 def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
-    """One line on a build: the clock, the rates around contact, the latency, the effect."""
+    """Summarise responses in a line: clock, rates around contact, latency, effect."""
     whole = ContactResponse(
         session="all",
         shift_s=0.0,
@@ -159,7 +159,7 @@ def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
     shifts = [r.shift_s for r in responses]
     where = "spikes on the session's clock (offset 0 s)"
     if clock == "recording":
-        where = f"spikes shifted by the starting time ({_span(shifts)} s), as published"
+        where = f"spikes shifted by the starting time ({_format_range(shifts)} s), as published"
     before, after = whole.rate_hz(BEFORE), whole.rate_hz(AFTER)
     figures = f"{before:.2f} spikes/s before contact, {after:.2f} in the 3-40 ms after it"
     if not whole.rises:
@@ -172,6 +172,6 @@ def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
     )
 
 
-def _span(values: Sequence[float]) -> str:
+def _format_range(values: Sequence[float]) -> str:
     low, high = min(values), max(values)
     return f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}"

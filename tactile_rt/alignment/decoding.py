@@ -1,9 +1,9 @@
-"""What can be decoded from the six stimuli, and what would be decoded by chance.
+"""Decoding of shape and distance from responses to the six stimuli, and chance levels.
 
-Shape is decoded with one distance held out, distance with one shape held out, so that every class
-has as many stimuli to learn from as any other: of noise, the nearest class mean is then right as
-often as a guess. The paper holds out one stimulus at a time instead, which leaves the right class
-short of one: of noise in many dimensions that is right almost never, and chance is not 1/2 or 1/3.
+Shape is decoded with one distance held out, distance with one shape held out, so that all classes
+have equally many training stimuli: on noise, the nearest class mean is right as often as a guess.
+The paper holds out one stimulus at a time, which leaves the right class one training stimulus less:
+on noise in many dimensions the decoder is almost never right, and chance is not 1/2 or 1/3.
 """
 
 import math
@@ -27,10 +27,10 @@ TIE = 1e-9
 
 @dataclass(frozen=True)
 class Decoded:
-    """Shares of held-out stimuli that are decoded rightly, NaN where nothing is decoded.
+    """Accuracies on held-out stimuli, 0 to 1; NaN for responses that have no RDM.
 
-    Beside each: the mean over all relabellings of the stimuli, and the share of these that are
-    right at least as often as the true labels.
+    With each accuracy: the mean accuracy over all relabellings of the stimuli (chance), and the
+    share of these that are at least as accurate as the true labels (p).
     """
 
     shape: float
@@ -42,31 +42,31 @@ class Decoded:
 
 
 def decode(patterns: ArrayLike) -> Decoded:
-    """Nearest class mean of responses (6, unit), each centred over units and of length one."""
+    """Decode shape and distance by the nearest class mean of normalised responses (6, unit)."""
     return decode_rdm(rdm(patterns))
 
 
 def decode_rdm(entries: ArrayLike) -> Decoded:
-    """The same from an RDM (15,), which has all that it needs: the distances between stimuli.
+    """Decode as `decode` does, but from an RDM (15,), which has the stimuli's distances.
 
-    The null is exact: all 720 relabellings, the stimuli as they are among them.
+    The null distribution is exact: all 720 relabellings, the true labels included.
     """
-    squares = 2 * square(entries)  # of Euclidean distances between vectors of length one
+    squares = 2 * square(entries)  # squared Euclidean distances of vectors of length one
     if not np.isfinite(squares).all():
         return Decoded(*[float("nan")] * 6)
     orders = np.array(list(permutations(range(len(STIMULI)))))
     relabelled = squares[orders[:, :, None], orders[:, None, :]]  # (720, 6, 6)
     found = []
     for labels, folds in ((SHAPE, DISTANCE), (DISTANCE, SHAPE)):
-        right = _nearest(relabelled, np.array(labels), np.array(folds))
+        right = _score_nearest(relabelled, np.array(labels), np.array(folds))
         found += [float(right[0]), float(right.mean()), float((right >= right[0] - TIE).mean())]
     return Decoded(*found)
 
 
 def decode_paper(patterns: ArrayLike) -> Decoded:
-    """The paper's variant (Table "Stimuli decoding"): logistic regression, one stimulus held out.
+    """Decode as the paper (Table "Stimuli decoding"), by leave-one-out logistic regression.
 
-    Its chance is that of every way to divide the stimuli into classes of the same sizes.
+    Chance is the mean over all divisions of the stimuli into classes of the same sizes.
     """
     values = np.asarray(patterns, dtype=np.float64)
     values = values - values.mean(axis=0)
@@ -77,32 +77,32 @@ def decode_paper(patterns: ArrayLike) -> Decoded:
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
     found = []
-    # Of five points, threads only wait for each other: minutes where others use the processor.
+    # With five points, threads only wait for each other, for minutes on a busy machine.
     with threadpool_limits(1):
         for labels in (SHAPE, DISTANCE):
-            right = np.array([_one_out(reduced, other) for other in _divisions(labels)])
+            right = np.array([_leave_one_out(reduced, other) for other in _list_divisions(labels)])
             found += [float(right[0]), float(right.mean()), float((right >= right[0] - TIE).mean())]
     return Decoded(*found)
 
 
 def mean_decoded(several: Sequence[Decoded]) -> Decoded:
-    """The mean over animals, as the paper's row of them; p is of no mean, and so NaN.
+    """Average over the animals with accuracies, as the paper's table does; p is NaN.
 
-    Animals that nothing can be decoded of are left out; without any other all is NaN.
+    Without such an animal, all values are NaN.
     """
-    there = [one for one in several if math.isfinite(one.shape)]
+    finite = [one for one in several if math.isfinite(one.shape)]
     nan = math.nan
-    if not there:
+    if not finite:
         return Decoded(*[nan] * 6)
     shape, shape_chance, distance, distance_chance = (
-        float(np.mean([getattr(one, name) for one in there]))
+        float(np.mean([getattr(one, name) for one in finite]))
         for name in ("shape", "shape_chance", "distance", "distance_chance")
     )
     return Decoded(shape, shape_chance, nan, distance, distance_chance, nan)
 
 
-def _nearest(squares: Floats, labels: NDArray[np.intp], folds: NDArray[np.intp]) -> Floats:
-    """Accuracies (...) from squared distances (..., 6, 6); equals count as a guess among them."""
+def _score_nearest(squares: Floats, labels: NDArray[np.intp], folds: NDArray[np.intp]) -> Floats:
+    """Compute accuracies (...) from squared distances (..., 6, 6); ties count as guesses."""
     right: Floats = np.zeros(squares.shape[:-2])
     for fold in np.unique(folds):
         tested = np.flatnonzero(folds == fold)
@@ -111,7 +111,7 @@ def _nearest(squares: Floats, labels: NDArray[np.intp], folds: NDArray[np.intp])
             members = np.flatnonzero((folds != fold) & (labels == label))
             within = squares[..., members[:, None], members[None, :]].mean(axis=(-2, -1))
             to = squares[..., tested[:, None], members[None, :]].mean(axis=-1)
-            away.append(to - within[..., None] / 2)  # to the members' mean
+            away.append(to - within[..., None] / 2)  # squared distance to the members' mean
         distances = np.stack(away, axis=-1)  # (..., tested, label)
         least = distances <= distances.min(axis=-1, keepdims=True) + TIE
         hit = np.take_along_axis(
@@ -121,7 +121,8 @@ def _nearest(squares: Floats, labels: NDArray[np.intp], folds: NDArray[np.intp])
     return right / len(labels)
 
 
-def _one_out(values: Floats, labels: Labels) -> float:
+def _leave_one_out(values: Floats, labels: Labels) -> float:
+    """Return the leave-one-out accuracy of logistic regression."""
     from sklearn.linear_model import LogisticRegression
 
     goal = np.array(labels)
@@ -134,13 +135,13 @@ def _one_out(values: Floats, labels: Labels) -> float:
 
 
 @cache
-def _divisions(labels: Labels) -> tuple[Labels, ...]:
-    """Every division into classes of the same sizes, whatever their names; the given first."""
+def _list_divisions(labels: Labels) -> tuple[Labels, ...]:
+    """List all divisions into unnamed classes of the labels' sizes, the given one first."""
 
-    def renamed(order: Labels) -> Labels:
+    def renumber(order: Labels) -> Labels:
         names: dict[int, int] = {}
         return tuple(names.setdefault(label, len(names)) for label in order)
 
-    divisions = {renamed(labels): None}
-    divisions.update(dict.fromkeys(sorted({renamed(p) for p in permutations(labels)})))
+    divisions = {renumber(labels): None}
+    divisions.update(dict.fromkeys(sorted({renumber(p) for p in permutations(labels)})))
     return tuple(divisions)

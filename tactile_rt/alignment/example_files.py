@@ -1,10 +1,9 @@
-"""The made-up brain as files: sessions in NWB as the recordings have them, and models to score.
+"""Files of the made-up brain: NWB sessions like the real recordings, and models to score.
 
 A trial lasts four seconds. Whiskers touch a few times between its first contact and the choice.
-From `LATENCY_S` after first contact to the choice a unit fires at the rate that the stimulus asks
-for, most of it just after each contact; without contact, at a third of its mean rate. Spikes are on
-the session's clock, as NWB has it: the electrical recording begins at `BEGIN_S` on that clock, and
-there are no spikes before.
+From `LATENCY_S` after first contact to the choice a unit fires at its rate for the stimulus, mostly
+just after each contact; outside, at a third of its mean rate. Spikes are on the session's clock, as
+NWB defines: the electrical recording begins at `BEGIN_S` on that clock, without spikes before.
 """
 
 import json
@@ -28,18 +27,18 @@ if TYPE_CHECKING:
     import h5py
 
 TRIAL_S = 4.0
-FIRST_S, BEGIN_S = 5.9, 10.03  # when the first trial and the electrical recording begin
+FIRST_S, BEGIN_S = 5.9, 10.03  # beginning of the first trial and of the electrical recording
 CONTACT_S, CHOICE_S = (0.8, 1.2), (0.8, 1.2)  # first contact after the start; choice after contact
-CONTACTS = 3  # in a trial, on average, after the first
-LATENCY_S, BURST_S = 0.005, 0.035  # from contact to the burst that it causes, and how long that is
-BURST = 3.0  # a burst's rate, beside what a unit fires between bursts
-REST = 1 / 3  # of a unit's mean rate, without contact
-WRONG = 12  # trials that end in error, of every session; they do not count
+CONTACTS = 3  # mean number in a trial, after the first
+LATENCY_S, BURST_S = 0.005, 0.035  # from a contact to its burst, and the length of the burst
+BURST = 3.0  # rate in a burst, as a multiple of the rate between bursts
+REST = 1 / 3  # rate without contact, as a share of a unit's mean rate
+WRONG = 12  # trials of every session that end in error; they do not count
 SAMPLING_HZ, WHISKER_HZ = 30_000.0, 200.0
 WHISKERS = ("C0", "C1", "C2", "C3")
 DATE = "2020-01-01T00:00:00+00:00"
 DEPTHS_UM = (100.0, 1100.0)
-INHIBITORY = 0.2  # of the units
+INHIBITORY = 0.2  # probability of each unit
 
 
 def write_example(
@@ -51,16 +50,16 @@ def write_example(
     """Write recordings of a made-up brain, and models of known truth.
 
     Args:
-        folder: is made; it must not be there yet.
-        seed: of every random number in it, 0 or more.
+        folder: the folder to make; it must not exist.
+        seed: of all random numbers, 0 or more.
 
     Returns:
         The folder of NWB files, one a session, and the folder of models, ``.npz`` of responses
-        (6, unit) by layer. ``truth.json`` beside them says what was made.
+        (6, unit) by layer. ``truth.json`` beside them holds the parameters and the truth.
 
     Raises:
-        ConfigError: the folder is there, or the seed is below 0.
-        OSError: naming `folder`: the medium is full.
+        ConfigError: the folder exists, or the seed is below 0.
+        OSError: the disk is full; the error names `folder`.
     """
     import h5py
 
@@ -84,24 +83,24 @@ def write_example(
             for j in range(brain.sessions):
                 path = home / f"sub-{name}_ses-{j + 1}_behavior+ecephys.nwb"
                 rates = brain.rates(mice, features, brain.units)
-                whole = BytesIO()  # of a full disk HDF5 tells in dozens of lines, and no OSError
+                whole = BytesIO()  # on a full disk, HDF5 raises no OSError and prints many lines
                 with h5py.File(whole, "w") as file:
-                    _session(file, mice, name, rates, brain.trials)
+                    _write_session(file, mice, name, rates, brain.trials)
                 path.write_bytes(whole.getbuffer())
                 progress((k * brain.sessions + j + 1) / (brain.mice * brain.sessions))
-        told = {"brain": asdict(brain), "seed": seed, "lost": MODELS, "shared": shared.tolist()}
-        (made / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
+        facts = {"brain": asdict(brain), "seed": seed, "lost": MODELS, "shared": shared.tolist()}
+        (made / "truth.json").write_text(json.dumps(facts, indent=1) + "\n")
     return folder / "recordings", folder / "models"
 
 
-def _session(
+def _write_session(
     file: "h5py.File", rng: np.random.Generator, animal: str, rates: Floats, trials: int
 ) -> None:
-    """One session of units of given rates (6, unit), spikes per second."""
+    """Write a session of units of given rates (6, unit), in spikes per second."""
     n = len(STIMULI) * trials + WRONG
     stimulus = rng.permutation(np.resize(np.arange(len(STIMULI)), n))
     correct = np.zeros(n, dtype=np.bool_)
-    for k in range(len(STIMULI)):  # as many correct trials of each as were asked for
+    for k in range(len(STIMULI)):  # the requested number of correct trials for each
         correct[rng.permutation(np.flatnonzero(stimulus == k))[:trials]] = True
     start = FIRST_S + TRIAL_S * np.arange(n)
     first = start + rng.uniform(*CONTACT_S, size=n)
@@ -114,7 +113,7 @@ def _session(
     end = float(start[-1] + TRIAL_S)
     shapes, places = zip(*(STIMULI[s].split("-") for s in stimulus), strict=True)
 
-    _head(file, animal)
+    _write_head(file, animal)
     columns: dict[str, ArrayLike] = {
         "start_time": start,
         "stop_time": start + TRIAL_S,
@@ -124,18 +123,18 @@ def _session(
         "servo_position": places,
         "ignore_trial": np.zeros(n, dtype=np.bool_),
     }
-    _table(file, "intervals/trials", columns, "TimeIntervals", "trials")
+    _write_table(file, "intervals/trials", columns, "TimeIntervals", "trials")
     whiskers = rng.integers(len(WHISKERS), size=n)
-    _whiskers(file, contacts, whiskers, end)
+    _write_whiskers(file, contacts, whiskers, end)
     gain = gains(rng, n)
     spikes = [
-        _spikes(rng, rates[stimulus, unit] * gain, rates[:, unit].mean(), contacts, choice, end)
+        _draw_unit(rng, rates[stimulus, unit] * gain, rates[:, unit].mean(), contacts, choice, end)
         for unit in range(rates.shape[1])
     ]
-    _units(file, rng, spikes)
+    _write_units(file, rng, spikes)
 
 
-def _spikes(
+def _draw_unit(
     rng: np.random.Generator,
     rate: Floats,
     mean: float,
@@ -143,20 +142,20 @@ def _spikes(
     choice: Floats,
     end: float,
 ) -> Floats:
-    """A unit's spike times, s: at rate (trial,) from contact to choice, else at `REST`."""
+    """Draw spike times, s, at a unit's rate (trial,) from contact to choice, else `REST`."""
     begin = np.array([times[0] for times in contacts]) + LATENCY_S
     bursts = np.array([len(times) for times in contacts]) * BURST_S
-    # Rates keep their mean: what bursts have more, the time between them has less.
+    # Between bursts the rate is lower, so that a trial keeps its mean rate.
     calm = rate / (1 + (BURST - 1) * bursts / (choice - begin))
     parts = [
-        _drawn(rng, begin, choice - begin, calm),
-        _drawn(
+        _draw_spikes(rng, begin, choice - begin, calm),
+        _draw_spikes(
             rng,
             np.concatenate(contacts) + LATENCY_S,
             np.full(sum(map(len, contacts)), BURST_S),
             np.repeat((BURST - 1) * calm, [len(times) for times in contacts]),
         ),
-        _drawn(
+        _draw_spikes(
             rng,
             np.concatenate([[0], choice]),
             np.diff(np.stack([np.concatenate([[0], choice]), np.append(begin, end)]), axis=0)[0],
@@ -167,53 +166,53 @@ def _spikes(
     return times[times >= BEGIN_S]
 
 
-def _drawn(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
-    """Poisson spikes at given rates in windows, (window,) each."""
+def _draw_spikes(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
+    """Draw Poisson spike times at given rates in windows, (window,) each."""
     number = rng.poisson(rate * length)
     return np.asarray(
         np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
     )
 
 
-# NWB 2, as far as its readers need it.
+# The subset of NWB 2 that its readers need.
 
 
-def _typed(what: Any, kind: str, namespace: str = "core", **attributes: Any) -> Any:
-    what.attrs["neurodata_type"] = kind
-    what.attrs["namespace"] = namespace
-    whose = f"{Path(what.file.filename).name}{what.name}"
-    what.attrs["object_id"] = str(uuid.uuid5(uuid.NAMESPACE_URL, whose))
+def _set_type(item: Any, kind: str, namespace: str = "core", **attributes: Any) -> Any:
+    item.attrs["neurodata_type"] = kind
+    item.attrs["namespace"] = namespace
+    place = f"{Path(item.file.filename).name}{item.name}"
+    item.attrs["object_id"] = str(uuid.uuid5(uuid.NAMESPACE_URL, place))
     for name, value in attributes.items():
-        what.attrs[name] = value
-    return what
+        item.attrs[name] = value
+    return item
 
 
-def _group(file: "h5py.File", name: str, kind: str, **attributes: Any) -> Any:
-    return _typed(file.require_group(name), kind, **attributes)
+def _make_group(file: "h5py.File", name: str, kind: str, **attributes: Any) -> Any:
+    return _set_type(file.require_group(name), kind, **attributes)
 
 
-def _text(values: ArrayLike) -> Any:
+def _make_text(values: ArrayLike) -> Any:
     return np.array(values, dtype=np.object_)
 
 
-def _head(file: "h5py.File", animal: str) -> None:
+def _write_head(file: "h5py.File", animal: str) -> None:
     import h5py
 
-    _typed(file, "NWBFile", nwb_version="2.7.0")
+    _set_type(file, "NWBFile", nwb_version="2.7.0")
     file["identifier"] = Path(file.filename).name
     file["session_description"] = "made up: a synthetic session of known truth"
     file["session_start_time"] = file["timestamps_reference_time"] = DATE
-    file["file_create_date"] = _text([DATE])
+    file["file_create_date"] = _make_text([DATE])
     stimulus = "stimulus/presentation", "stimulus/templates"
     for name in ("acquisition", "analysis", "general", "intervals", "processing", *stimulus):
         file.create_group(name)
-    subject = _group(file, "general/subject", "Subject")
+    subject = _make_group(file, "general/subject", "Subject")
     subject["subject_id"], subject["species"] = animal, "none: synthetic"
-    _group(file, "general/devices/probe", "Device", description="none: synthetic")
-    shank = _group(file, "general/extracellular_ephys/shank", "ElectrodeGroup",
-                   description="none: synthetic", location="barrel cortex")  # fmt: skip
+    _make_group(file, "general/devices/probe", "Device", description="none: synthetic")
+    shank = _make_group(file, "general/extracellular_ephys/shank", "ElectrodeGroup",
+                        description="none: synthetic", location="barrel cortex")  # fmt: skip
     shank["device"] = h5py.SoftLink("/general/devices/probe")
-    electrodes = _table(
+    electrodes = _write_table(
         file,
         "general/extracellular_ephys/electrodes",
         {"location": ["barrel cortex"], "group_name": ["shank"]},
@@ -222,19 +221,19 @@ def _head(file: "h5py.File", animal: str) -> None:
         more=("group",),
     )
     references = np.array([shank.ref], dtype=h5py.ref_dtype)
-    _typed(electrodes.create_dataset("group", data=references, dtype=h5py.ref_dtype),
-           "VectorData", "hdmf-common", description="group")  # fmt: skip
-    series = _group(file, "acquisition/extracellular array recording", "ElectricalSeries",
-                    description="not kept", comments="no comments")  # fmt: skip
+    _set_type(electrodes.create_dataset("group", data=references, dtype=h5py.ref_dtype),
+              "VectorData", "hdmf-common", description="group")  # fmt: skip
+    series = _make_group(file, "acquisition/extracellular array recording", "ElectricalSeries",
+                         description="not kept", comments="no comments")  # fmt: skip
     data = series.create_dataset("data", data=np.zeros((1, 1)))
     data.attrs.update(unit="volts", conversion=1.0, offset=0.0, resolution=-1.0)
     start = series.create_dataset("starting_time", data=BEGIN_S)
     start.attrs.update(rate=SAMPLING_HZ, unit="seconds")
     region = series.create_dataset("electrodes", data=np.zeros(1, dtype=np.int64))
-    _typed(region, "DynamicTableRegion", "hdmf-common", description="all", table=electrodes.ref)
+    _set_type(region, "DynamicTableRegion", "hdmf-common", description="all", table=electrodes.ref)
 
 
-def _table(
+def _write_table(
     file: "h5py.File",
     name: str,
     columns: Mapping[str, ArrayLike],
@@ -242,37 +241,37 @@ def _table(
     description: str,
     more: tuple[str, ...] = (),
 ) -> Any:
-    """A table of columns by name; `more` are added by whoever asks for them."""
+    """Write a table of columns by name; the caller adds the columns named in `more`."""
     namespace = "hdmf-common" if kind == "DynamicTable" else "core"
-    table = _typed(file.require_group(name), kind, namespace, description=description,
-                   colnames=_text([*columns, *more]))  # fmt: skip
+    table = _set_type(file.require_group(name), kind, namespace, description=description,
+                      colnames=_make_text([*columns, *more]))  # fmt: skip
     rows = 0
     for column, values in columns.items():
         array = np.asarray(values)
         rows = len(array)
-        stored = _text(array) if array.dtype.kind == "U" else array
+        stored = _make_text(array) if array.dtype.kind == "U" else array
         data = table.create_dataset(column, data=stored)
-        _typed(data, "VectorData", "hdmf-common", description=column)
+        _set_type(data, "VectorData", "hdmf-common", description=column)
     identity = table.create_dataset("id", data=np.arange(rows))
-    _typed(identity, "ElementIdentifiers", "hdmf-common")
+    _set_type(identity, "ElementIdentifiers", "hdmf-common")
     return table
 
 
-def _whiskers(
+def _write_whiskers(
     file: "h5py.File", contacts: list[Floats], whisker: NDArray[np.int64], end: float
 ) -> None:
-    _group(file, "processing/behavior", "ProcessingModule", description="whiskers")
+    _make_group(file, "processing/behavior", "ProcessingModule", description="whiskers")
     for k, name in enumerate(WHISKERS):
         own = [times for times, w in zip(contacts, whisker, strict=True) if w == k]
         times = np.concatenate([np.empty(0), *own])
         columns = {"start_time": times, "stop_time": times + 0.02}
         where = f"processing/behavior/contacts_by_whisker_{name}"
-        _table(file, where, columns, "TimeIntervals", "contacts")
+        _write_table(file, where, columns, "TimeIntervals", "contacts")
         where = f"processing/behavior/processed_position_whisker_{name}"
-        _group(file, where, "CompassDirection")
-        angle = _group(file, f"{where}/angle", "SpatialSeries",
-                       description="not kept", comments="no comments")  # fmt: skip
-        # Two samples say how long the video lasted.
+        _make_group(file, where, "CompassDirection")
+        angle = _make_group(file, f"{where}/angle", "SpatialSeries",
+                            description="not kept", comments="no comments")  # fmt: skip
+        # Two samples give the length of the video.
         data = angle.create_dataset("data", data=np.zeros(2))
         data.attrs.update(unit="degrees", conversion=1.0, offset=0.0, resolution=-1.0)
         clock = angle.create_dataset("timestamps", data=[0.0, end + 1 / WHISKER_HZ])
@@ -280,16 +279,16 @@ def _whiskers(
         angle["reference_frame"] = "face"
 
 
-def _units(file: "h5py.File", rng: np.random.Generator, spikes: list[Floats]) -> None:
+def _write_units(file: "h5py.File", rng: np.random.Generator, spikes: list[Floats]) -> None:
     number = len(spikes)
     columns = {
         "depth": rng.uniform(*DEPTHS_UM, size=number),
         "inhibitory": rng.random(number) < INHIBITORY,
     }
-    table = _table(file, "units", columns, "Units", "made-up units", more=("spike_times",))
+    table = _write_table(file, "units", columns, "Units", "made-up units", more=("spike_times",))
     times = table.create_dataset(
         "spike_times", data=np.concatenate(spikes), compression="gzip", shuffle=True
     )
-    _typed(times, "VectorData", "hdmf-common", description="spike times, s")
+    _set_type(times, "VectorData", "hdmf-common", description="spike times, s")
     ends = table.create_dataset("spike_times_index", data=np.cumsum([len(s) for s in spikes]))
-    _typed(ends, "VectorIndex", "hdmf-common", description="ends", target=times.ref)
+    _set_type(ends, "VectorIndex", "hdmf-common", description="ends", target=times.ref)

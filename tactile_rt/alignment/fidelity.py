@@ -1,6 +1,6 @@
-"""Whether an exported model represents the stimuli as the model that it was made from.
+"""Fidelity of exports: comparison of an exported model's layers with those of its original.
 
-Needs no neural data: two files of one network, six stimuli, and the RDM of every layer in both.
+It needs no neural data: two files of one network, six stimuli, and the RDM of every layer in both.
 """
 
 from collections.abc import Sequence
@@ -16,39 +16,39 @@ from tactile_rt.alignment.stimuli_input import StimuliInput
 
 OUTPUT = "output"
 LEAST_PEARSON = {"fp32": 0.9999}
-REDUCED_PEARSON = 0.98  # of any other precision
+REDUCED_PEARSON = 0.98  # for any other precision
 LARGEST_DIFFERENCE = 1e-5
-FLAT = 1e-6  # an RDM that spans less says nothing: of two classes the output's may be all zeros
+FLAT = 1e-6  # an RDM of a smaller range is meaningless: with two classes the output's may be zeros
 
 
 @dataclass(frozen=True)
 class LayerFidelity:
-    """One layer in both models."""
+    """The comparison of a layer in both models."""
 
     layer: str
-    # correlation of the two RDMs of the layer; NaN if one has none, or both are flat
+    # correlation of the two RDMs of the layer; NaN if one is missing or both are flat
     pearson: float
     # largest difference between the two (6, unit) responses, as a share of the reference's largest
-    # response where that is above 1; infinite for another number of units
+    # response if that is above 1; infinite if the numbers of units differ
     difference: float
     kept: bool
 
 
 def compare(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
-    """Every layer that both have, and the output."""
+    """Compare every layer that both models have, and the output."""
     ours, theirs = reference.patterns, exported.patterns
     begin = reference.first.get("decoder.logits", 0)
     for layers, patterns in ((reference, ours), (exported, theirs)):
         patterns[OUTPUT] = layers.logits[:, begin:].mean(axis=1, dtype=np.float64)
     return tuple(
-        _compared(name, ours[name], theirs[name], exported.precision)
+        _compare_layer(name, ours[name], theirs[name], exported.precision)
         for name in ours
         if name in theirs
     )
 
 
 def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[LayerFidelity, ...]]:
-    """Test 4 of the gate, and every layer's figures."""
+    """Run test 4 of the gate; return its result and the comparison of every layer."""
     rows = compare(reference, exported)
     layers = [row for row in rows if row.layer != OUTPUT]
     missing = [name for name in reference.traces if name not in exported.traces]
@@ -68,7 +68,7 @@ def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[La
         what += f"; {len(missing)} layers could not be compared ({', '.join(missing[:4])}, ...)"
     if not layers:
         return Check("fidelity", INCONCLUSIVE, f"{what}; no layer but the output"), rows
-    return Check("fidelity", PASS, f"{what}; kept by {len(rows)} taps{_closest(rows)}"), rows
+    return Check("fidelity", PASS, f"{what}; kept by {len(rows)} taps{_describe_worst(rows)}"), rows
 
 
 def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layers:
@@ -76,13 +76,14 @@ def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layer
     from tactile_rt.alignment.onnx_activations import onnx_layers
 
     exported, _ = onnx_layers(path, stimuli)
-    # The reference knows from which step on a layer counts; of a file that is found by what differs
-    # in it, which in a network that hardly responds is less than single precision can tell.
+    # The reference knows the first step at which input reaches a layer. An ONNX file shows it only
+    # by differences, which are below single precision in a network that hardly responds.
     known = {k: step for k, step in reference.first.items() if k in exported.traces}
     return replace(exported, first={**exported.first, **known})
 
 
-def _compared(name: str, a: np.ndarray, b: np.ndarray, precision: str) -> LayerFidelity:
+def _compare_layer(name: str, a: np.ndarray, b: np.ndarray, precision: str) -> LayerFidelity:
+    """Compare a layer's responses (6, unit) in the reference and in the export."""
     if a.shape != b.shape:
         return LayerFidelity(name, float("nan"), float("inf"), False)
     one, other = rdm(a), rdm(b)
@@ -96,11 +97,11 @@ def _compared(name: str, a: np.ndarray, b: np.ndarray, precision: str) -> LayerF
     return LayerFidelity(name, r, difference, bool(same and near and np.isfinite(difference)))
 
 
-def _closest(rows: Sequence[LayerFidelity]) -> str:
-    there = [row for row in rows if np.isfinite(row.pearson)]
-    if not there:
+def _describe_worst(rows: Sequence[LayerFidelity]) -> str:
+    finite = [row for row in rows if np.isfinite(row.pearson)]
+    if not finite:
         return ""
-    least = min(there, key=lambda row: row.pearson)
+    least = min(finite, key=lambda row: row.pearson)
     return (
         f", the least alike {least.layer}: correlation {least.pearson:.6f}, largest difference "
         f"{max(row.difference for row in rows):.1e}"

@@ -1,6 +1,6 @@
-"""Whether a model may be released: four tests, and the exit code that a pipeline reads.
+"""The release gate of a model: four tests, and the exit code for a pipeline.
 
-1. validity: enough reliable animals to say anything.
+1. validity: the benchmark has enough reliable animals.
 2. NeuroAI Turing test: the model is not worse than another mouse, shown to be near one, and better
    than chance, see below.
 3. regression: not worse than a stored model on the same animals.
@@ -8,21 +8,20 @@
 
 The Turing test compares the model's mean fit to single mice with each mouse's mean fit to the
 others, all corrected for the noise of the mice. The mean over pairs of mice is the *noise ceiling*,
-what a perfect model of a mouse can be expected to reach.
+which a perfect model of a mouse is expected to reach.
 
-- A *fit* is a correlation of RDMs in which entries are weighted. Two entries that share a stimulus
-  vary together, and a large one varies more than a small one, in a way that follows from the RDM
-  itself (Diedrichsen et al. 2021, "Comparing representational geometries using whitened
-  unbiased-distance-matrix similarity"); the inverse of that covariance, from the mice's mean RDM,
-  is the weight.
-- *Worse than another mouse*: below the fit that one more mouse would exceed in nine of ten cases,
-  given how much the mice that are there differ: a prediction bound, with Student's t.
+- A *fit* is a correlation of RDMs with weighted entries. Two entries that share a stimulus covary,
+  and a large entry varies more than a small one; both follow from the RDM itself (Diedrichsen et
+  al. 2021, "Comparing representational geometries using whitened unbiased-distance-matrix
+  similarity"). The weight is the inverse of that covariance, computed from the mice's mean RDM.
+- *Worse than another mouse*: below the fit that a further mouse would exceed in nine of ten cases,
+  given the spread of the present mice: a prediction bound, with Student's t.
 - *Within the margin*: above the ceiling less `MARGIN` of it, in seven of eight cases: a one-sided
-  test whose error is of both animals and stimuli (jackknives).
+  test whose error includes both animals and stimuli (jackknives).
 
-What the two find in a benchmark is in `Mice.power`: each mouse is taken for a model of the others,
-whole or with a share of its geometry replaced by one that has nothing to do with it: that of
-another mouse, the stimuli relabelled and the features turned at random.
+`Mice.power` tries both criteria on a benchmark: it takes each mouse as a model of the others, whole
+or with a share of its geometry replaced by an unrelated one: that of another mouse, the stimuli
+relabelled and the features rotated at random.
 """
 
 import math
@@ -38,94 +37,94 @@ from tactile_rt.alignment.rdm import Floats, count_stimuli, relabellings, square
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
 
-MARGIN = 0.65  # of the noise ceiling
-WORSE, SURE = 10, 8  # a mouse is called worse in one of so many cases, a floor is too high in one
+MARGIN = 0.65  # share of the noise ceiling
+WORSE, SURE = 10, 8  # one mouse in so many is called worse by chance, one floor in so many too high
 LOST = (0.25, 0.5)  # shares of its geometry that a damaged mouse has lost, for the power
-DRAWS = 20  # of damage, for every mouse and share
-# Beside its change along the differences that are there, how much a distance varies by what is
-# added to it, as a share. It grows with the deviation; 0.25 to 1 do about as well.
+DRAWS = 20  # random damages for every mouse and share
+# Weight of the variance of distances by deviations alone, which grows with these, relative to that
+# along the present differences; 0.25 to 1 do about as well.
 OWN = 0.5
-NO_FIT = -9.0  # of a layer that has none, lower than any
+NO_FIT = -9.0  # for a layer without a fit: lower than any fit
 
 
 @cache
-def _contrasts(stimuli: int) -> Floats:
-    """(pair, stimulus): each pair's first stimulus less its second."""
+def _make_contrasts(stimuli: int) -> Floats:
+    """Return contrasts (pair, stimulus): 1 for a pair's first stimulus, -1 for its second."""
     i, j = upper(stimuli)
     return np.eye(stimuli)[i] - np.eye(stimuli)[j]
 
 
 @cache
-def _parts(stimuli: int) -> NDArray[np.bool_]:
-    """(part, pair): entries that take part: all, and those without each of the stimuli."""
-    there = _contrasts(stimuli).T == 0
-    return np.concatenate([np.ones((1, there.shape[1]), np.bool_), there])
+def _select_parts(stimuli: int) -> NDArray[np.bool_]:
+    """Return masks (part, pair) of RDM entries: all, then those without each stimulus."""
+    without = _make_contrasts(stimuli).T == 0
+    return np.concatenate([np.ones((1, without.shape[1]), np.bool_), without])
 
 
 @dataclass(frozen=True, eq=False)
 class BesideMice:
-    """Models beside mice. Fits are mean correlations with mice, corrected for their noise."""
+    """Fits of models to mice: correlations of RDMs, corrected for the noise of the mice."""
 
     fits: Floats  # (model, mouse) fit to each mouse, of a layer that was chosen on the others
-    fit: Floats  # (model,) mean fit of each model; NaN where no layer has an RDM
-    error: Floats  # (model,) standard error of that less the ceiling, over animals and stimuli
-    floor: Floats  # (model,) what each fit exceeds in seven of eight cases, given that error
+    fit: Floats  # (model,) mean fit of each model; NaN if no layer has an RDM
+    error: Floats  # (model,) standard error of fit less ceiling, over animals and stimuli
+    floor: Floats  # (model,) lower confidence bound of each fit, one-sided, 7/8
     ceiling: float
     bound: float
 
     @property
     def worse(self) -> NDArray[np.bool_]:
-        """(model,) Whether each is worse than another mouse."""
+        """(model,) True for models that are worse than another mouse."""
         return np.asarray(self.fit < self.bound)
 
     @property
     def within(self) -> NDArray[np.bool_]:
-        """(model,) Whether each is shown to be within the margin."""
+        """(model,) True for models that are shown to be within the margin."""
         return np.asarray(self.floor > (1 - MARGIN) * self.ceiling)
 
 
 @dataclass(frozen=True)
 class Power:
-    """What the two tests find in a benchmark, by trial on its own mice."""
+    """Power of the Turing test in a benchmark, tried on its own mice."""
 
-    passes: float
-    fails: dict[float, float]
+    passes: float  # share of whole mice that pass
+    fails: dict[float, float]  # share of damaged mice that fail, by the share of geometry lost
 
 
 class Mice:
-    """The mice that models are compared to.
+    """The mice that models are compared with.
 
     Args:
         rdms: (mouse, pair), finite, of three mice or more.
-        factors: (mouse,) that correct a mouse's correlations for its noise.
+        factors: (mouse,) factors that correct a mouse's correlations for its noise.
     """
 
     def __init__(self, rdms: Floats, factors: Floats) -> None:
         self.rdms, self.factors = rdms, factors
-        self._maps = _weights(rdms.mean(axis=0))
-        self._targets = self._vectors(rdms) * factors[:, None]  # (part, mouse, pair)
+        self._maps = _compute_maps(rdms.mean(axis=0))
+        self._targets = self._normalise(rdms) * factors[:, None]  # (part, mouse, pair)
         number = len(rdms)
         pairs = self._targets @ self._targets.swapaxes(-1, -2)
         pairs[:, np.arange(number), np.arange(number)] = 0
         ordered = number * (number - 1)
         sums = pairs[0].sum(axis=1)
         self._ceilings = pairs.sum(axis=(1, 2)) / ordered  # of each part
-        self._without = (pairs[0].sum() - 2 * sums) / (ordered - 2 * (number - 1))  # each mouse
+        self._loo_ceilings = (pairs[0].sum() - 2 * sums) / (ordered - 2 * (number - 1))
         spread = float((sums / (number - 1)).std(ddof=1))
         self.ceiling = float(self._ceilings[0])
         self.bound = self.ceiling - student(number - 1, WORSE) * math.sqrt(1 + 1 / number) * spread
 
     def compare(self, models: ArrayLike) -> BesideMice:
-        """Compare models, given as RDMs (model, layer, pair); a layer with a NaN takes no part."""
-        vectors = self._vectors(np.asarray(models, dtype=np.float64))
+        """Compare models, given as RDMs (model, layer, pair); layers with NaN are left out."""
+        vectors = self._normalise(np.asarray(models, dtype=np.float64))
         fits = np.einsum("pmlk,pnk->pmln", vectors, self._targets)
-        there = np.isfinite(fits).all(axis=(0, 3))[..., None]
-        _, chosen = held_out(np.where(there, fits[0], NO_FIT))
+        finite = np.isfinite(fits).all(axis=(0, 3))[..., None]
+        _, chosen = held_out(np.where(finite, fits[0], NO_FIT))
         fits = np.take_along_axis(fits, chosen[None, :, None, :], axis=2)[:, :, 0]
         number = fits.shape[-1]
         fit = fits[0].mean(axis=-1)
-        # Jackknives: the difference from the ceiling, without each mouse and without each stimulus.
-        less = (fits[0].sum(axis=-1, keepdims=True) - fits[0]) / (number - 1) - self._without
+        # Jackknives: differences from the ceiling without each mouse, and without each stimulus.
+        less = (fits[0].sum(axis=-1, keepdims=True) - fits[0]) / (number - 1) - self._loo_ceilings
         parts = fits[1:].mean(axis=-1) - self._ceilings[1:, None]
         stimuli = len(parts)
         error = np.sqrt((number - 1) * less.var(axis=-1) + (stimuli - 1) * parts.var(axis=0))
@@ -139,7 +138,7 @@ class Mice:
         )
 
     def power(self, seed: int = 0) -> Power:
-        """Take each mouse for a model of the others, whole and damaged; needs four mice or more."""
+        """Test every mouse, of four or more, whole and damaged, against the others."""
         rng = np.random.default_rng(seed)
         number = len(self.rdms)
         passes, fails = 0, np.zeros((len(LOST), DRAWS))
@@ -150,13 +149,13 @@ class Mice:
             passes += int((whole.within & ~whole.worse)[0])
             strangers = self.rdms[others][rng.integers(number - 1, size=DRAWS)]
             for k, lost in enumerate(LOST):
-                damaged = _damaged(self.rdms[i], strangers, lost, rng)
+                damaged = _damage(self.rdms[i], strangers, lost, rng)
                 fails[k] += rest.compare(damaged[:, None]).worse
         shares = fails.mean(axis=1) / number
         return Power(passes / number, dict(zip(LOST, shares.tolist(), strict=True)))
 
-    def _vectors(self, rdms: Floats) -> Floats:
-        """Weighted, centred, of length one, for each part: (part, ..., pair); NaN if constant."""
+    def _normalise(self, rdms: Floats) -> Floats:
+        """Weight, centre and normalise RDMs for each part: (part, ..., pair); NaN if constant."""
         values = np.tensordot(rdms, self._maps, axes=(-1, 1))  # (..., part, pair)
         length = np.sqrt((values**2).sum(axis=-1, keepdims=True))
         size = np.sqrt((rdms**2).sum(axis=-1))[..., None, None]
@@ -164,11 +163,11 @@ class Mice:
         return np.asarray(np.moveaxis(unit, -2, 0))
 
 
-def _weights(rdm: Floats) -> Floats:
-    """Maps (part, pair, pair) of RDMs to vectors whose product is the weighted covariance."""
+def _compute_maps(rdm: Floats) -> Floats:
+    """Compute maps (part, pair, pair) of RDMs to vectors with weighted covariances as products."""
     stimuli = count_stimuli(len(rdm))
-    contrasts, parts = _contrasts(stimuli), _parts(stimuli)
-    shared = contrasts @ _gram(rdm) @ contrasts.T
+    contrasts, parts = _make_contrasts(stimuli), _select_parts(stimuli)
+    shared = contrasts @ _compute_gram(rdm) @ contrasts.T
     own = contrasts @ contrasts.T
     covariance = shared * own / np.trace(shared * own) + OWN * own**2 / np.trace(own**2)
     maps = np.zeros((len(parts), len(rdm), len(rdm)))
@@ -181,38 +180,38 @@ def _weights(rdm: Floats) -> Floats:
     return maps
 
 
-def _gram(rdm: Floats) -> Floats:
-    """Products of the centred features, (stimulus, stimulus), of an RDM of squared distances.
+def _compute_gram(rdm: Floats) -> Floats:
+    """Compute products (stimulus, stimulus) of centred features from an RDM's squared distances.
 
-    What all distances have in common, the noise of the units included, is taken away as far as the
-    others allow: no weighted correlation sees it.
+    The part common to all distances, such as units' noise, is subtracted as far as eigenvalues stay
+    non-negative: no weighted correlation depends on it.
     """
     stimuli = count_stimuli(len(rdm))
     centre = np.eye(stimuli) - 1 / stimuli
     products = -0.5 * centre @ square(rdm) @ centre
     values, vectors = np.linalg.eigh(products)
-    order = np.argsort(np.abs(vectors.sum(axis=0)))  # the constant one is last
+    order = np.argsort(np.abs(vectors.sum(axis=0)))  # the constant vector is last
     values, vectors = values[order[:-1]], vectors[:, order[:-1]]
     return np.asarray((vectors * (values - values.min())) @ vectors.T)
 
 
-def _damaged(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
-    """RDMs (draw, pair) of a geometry that lost a share to strangers (draw, pair)."""
+def _damage(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
+    """Return RDMs (draw, pair) whose geometry is partly that of strangers (draw, pair)."""
     made = np.empty_like(strangers)
-    own = _features(rdm)
+    own = _compute_features(rdm)
     stimuli = len(own)
     ways = relabellings(stimuli)
     for k, other in enumerate(strangers):
-        other = _features(other[ways[rng.integers(len(ways))]])
-        turned, _ = np.linalg.qr(rng.normal(size=(stimuli, stimuli)))
-        features = math.sqrt(1 - lost) * own + math.sqrt(lost) * other @ turned
-        made[k] = ((_contrasts(stimuli) @ features) ** 2).sum(axis=-1)
+        other = _compute_features(other[ways[rng.integers(len(ways))]])
+        rotation, _ = np.linalg.qr(rng.normal(size=(stimuli, stimuli)))
+        features = math.sqrt(1 - lost) * own + math.sqrt(lost) * other @ rotation
+        made[k] = ((_make_contrasts(stimuli) @ features) ** 2).sum(axis=-1)
     return made
 
 
-def _features(rdm: Floats) -> Floats:
-    """Features (stimulus, feature) of an RDM, of mean square one."""
-    values, vectors = np.linalg.eigh(_gram(rdm))
+def _compute_features(rdm: Floats) -> Floats:
+    """Compute features (stimulus, feature) of mean square one from an RDM."""
+    values, vectors = np.linalg.eigh(_compute_gram(rdm))
     features = vectors * np.sqrt(np.maximum(values, 0))
     return np.asarray(features / np.sqrt((features**2).mean()))
 
@@ -220,12 +219,12 @@ def _features(rdm: Floats) -> Floats:
 PASS, FAIL, INCONCLUSIVE, INPUT_ERROR = 0, 1, 2, 3  # exit codes
 LEAST_ANIMALS = 5
 LARGEST_P = 0.05
-LARGEST_DROP = 0.05  # of the noise ceiling
+LARGEST_DROP = 0.05  # share of the noise ceiling
 
 
 @dataclass(frozen=True)
 class Check:
-    """One test and how it went."""
+    """The result of one test: an exit code and the reason."""
 
     name: str
     code: int
@@ -233,12 +232,12 @@ class Check:
 
     @property
     def verdict(self) -> str:
-        """In a word."""
+        """The result as a word: pass, fail or inconclusive."""
         return ("pass", "fail", "inconclusive")[self.code]
 
 
 def exit_code(checks: Sequence[Check]) -> int:
-    """Any failure fails; otherwise anything inconclusive is inconclusive."""
+    """Combine tests: fail if any fails, else inconclusive if any is inconclusive."""
     codes = {check.code for check in checks}
     return FAIL if FAIL in codes else INCONCLUSIVE if INCONCLUSIVE in codes else PASS
 
@@ -246,10 +245,10 @@ def exit_code(checks: Sequence[Check]) -> int:
 def neural_checks(
     score: Score, benchmark: Benchmark, baseline: ArrayLike | None = None
 ) -> tuple[Check, ...]:
-    """Tests 1 to 3. Without a valid benchmark the others are inconclusive.
+    """Run tests 1 to 3; the latter two are inconclusive if the benchmark is invalid.
 
     Args:
-        baseline: (layer, pair) RDMs of the stored model's layers.
+        baseline: (layer, pair) RDMs of the stored model's layers; None to leave out test 3.
     """
     valid = validity(benchmark)
     if valid.code != PASS:
@@ -263,13 +262,13 @@ def neural_checks(
 
 
 def mice_of(benchmark: Benchmark) -> Mice:
-    """The reliable animals of a benchmark; there must be three."""
-    there = benchmark.reliable
-    return Mice(np.array([t.chosen.rdm for t in there]), np.array([t.chosen.factor for t in there]))
+    """Return the reliable animals of a benchmark, which needs at least three."""
+    mice = benchmark.reliable
+    return Mice(np.array([t.chosen.rdm for t in mice]), np.array([t.chosen.factor for t in mice]))
 
 
 def validity(benchmark: Benchmark) -> Check:
-    """At least `LEAST_ANIMALS` reliable animals."""
+    """Test that a benchmark has at least `LEAST_ANIMALS` reliable animals."""
     number = len(benchmark.reliable)
     return Check(
         "validity",
@@ -279,10 +278,10 @@ def validity(benchmark: Benchmark) -> Check:
 
 
 def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
-    """Fails a model that is worse than another mouse; passes one that is shown to be like one.
+    """Test a model against mice: fail if worse than another mouse, pass if near one.
 
-    That takes a fit within the margin of the noise ceiling, and a p of the maximum below
-    `LARGEST_P`. What is neither worse nor shown to be like one is inconclusive.
+    To pass, its fit must be within the margin of the noise ceiling, and the p of its score below
+    `LARGEST_P`. A model that neither fails nor passes is inconclusive.
     """
     found = mice.compare(score.rdms[None])
     fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling
@@ -305,10 +304,10 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
 
 
 def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
-    """Passes a drop that is surely small; fails one that is surely there, and not small.
+    """Test a model's drop of fit: pass if certainly small, fail if certain and large.
 
-    The drop is that of the fit to single mice, paired; small is below `LARGEST_DROP` of the noise
-    ceiling. Sure is by one-sided tests over the mice, on these stimuli.
+    The drop is that of the fit to single mice, paired; it is small below `LARGEST_DROP` of the
+    noise ceiling. Certainty is by one-sided tests over the mice, on these stimuli.
 
     Args:
         baseline: (layer, pair) RDMs of the stored model's layers.

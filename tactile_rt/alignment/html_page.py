@@ -1,4 +1,4 @@
-"""Pages that stand alone, without scripts or a network, in the reader's light or dark."""
+"""Self-contained HTML pages without scripts or network access, in light or dark colours."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -28,7 +28,7 @@ svg{max-width:100%;height:auto;display:block}summary{cursor:pointer}
 
 
 def make_page(title: str, body: str, style: str = "") -> str:
-    """Wrap the body of a page, with style beyond that of all pages."""
+    """Return a page with the given body, its style added to that of all pages."""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
@@ -38,22 +38,22 @@ def make_page(title: str, body: str, style: str = "") -> str:
 
 
 def make_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Make a table of cells that are HTML already."""
+    """Make an HTML table; titles and cells must already be HTML."""
     lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
     titles = "".join(f"<th>{title}</th>" for title in head)
     return f'<div class="scroll"><table><tr>{titles}</tr>{lines}</table></div>'
 
 
 def join_notes(notes: Iterable[str]) -> str:
-    """Set each remark in a paragraph of its own."""
+    """Format each note as an HTML paragraph."""
     return "".join(f'<p class="soft">{escape(note)}</p>' for note in notes)
 
 
 def format_number(value: float, digits: int = 2) -> str:
-    """Round a number for reading; a dash for NaN."""
+    """Format a number with the given decimal places; a dash if it is not finite."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "-"
 
 
 def write_page(text: str, path: Path) -> None:
-    """Write a page whole or not at all."""
+    """Write a page, whole or not at all."""
     write_whole(path, lambda file: file.write(text.encode()))

@@ -1,4 +1,4 @@
-"""Files of the alignment: JSON of structs, arrays as lists and NaN as null, written whole."""
+"""JSON files of structs, arrays as lists and NaN as null, written whole."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin
@@ -10,18 +10,18 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer, write_whole
 
 T = TypeVar("T")
-LARGEST = 1e12  # beyond it nothing can be drawn
+LARGEST = 1e12  # largest number in a file: greater ones cannot be drawn
 
 if TYPE_CHECKING:
     Number = float
 else:
 
     class Number(np.float64):
-        """A field that is NaN where its file has null."""
+        """A number that is null in the file if it is NaN."""
 
 
 def encode(value: Any) -> bytes:
-    """Encode structs as JSON: arrays as lists, null for what is not finite."""
+    """Encode structs as JSON: arrays as lists, null for numbers that are not finite."""
     return msgspec.json.encode(value, enc_hook=lambda array: array.tolist())
 
 
@@ -32,10 +32,10 @@ def write_json(value: Any, path: Path) -> None:
 
 
 def read_json(path: Path, kind: type[T], made_by: str) -> T:
-    """Read what `write_json` wrote of a struct whose tag names its kind and version."""
+    """Read a struct, whose tag names its kind and version, from a file of `write_json`."""
     check_no_pointer(path)
     try:
-        return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_from_plain)
+        return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_decode_numbers)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -44,7 +44,7 @@ def read_json(path: Path, kind: type[T], made_by: str) -> T:
         ) from None
 
 
-def _from_plain(kind: Any, value: Any) -> Any:
+def _decode_numbers(kind: Any, value: Any) -> Any:
     numbers = np.array(value, dtype=np.float64)
     if (np.abs(numbers) > LARGEST).any():
         raise ValueError(f"numbers are at most {LARGEST:g}")

@@ -1,4 +1,4 @@
-"""A model's layers for the six stimuli, wherever they were computed."""
+"""Responses of a model's layers to the stimuli, independent of where they were computed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,19 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 PARTS = ("encoder", "attender", "decoder")  # every layer's name begins with one of them and a dot
-# Lanes of one batch that compute the same may differ by rounding.
-SAME = 1e-6
+SAME = 1e-6  # relative difference that rounding may cause between equal inputs of a batch
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What a model's layers do while an array whisks the six stimuli."""
+    """The responses of a model's layers to the stimuli, with facts about the model."""
 
     name: str
     # responses of each layer, by name: (6, step, unit) float32
     traces: Mapping[str, NDArray[np.float32]]
     first: Mapping[str, int]  # first step that input can reach, by the name of the layer
-    logits: NDArray[np.float32]  # (6, step, class) model's output, float32
+    logits: NDArray[np.float32]  # (6, step, class) output of the model, float32
     parameters: int
     precision: str = "fp32"
     sha256: str = ""  # SHA-256 sum of the model's file, hex; empty for a network in memory
@@ -29,7 +28,7 @@ class Layers:
 
     @property
     def patterns(self) -> dict[str, NDArray[np.float64]]:
-        """By layer, mean over the steps that input can reach, (6, unit)."""
+        """Mean responses (6, unit) by layer, over the steps that input can reach."""
         return {
             name: trace[:, self.first[name] :].mean(axis=1, dtype=np.float64)
             for name, trace in self.traces.items()
@@ -37,7 +36,7 @@ class Layers:
 
 
 def table(value: object) -> Mapping[str, object]:
-    """What a file says under a name, where that is a table; else an empty one."""
+    """Return a value if it is a table, else an empty table."""
     return value if isinstance(value, dict) else {}
 
 

@@ -1,4 +1,4 @@
-"""Layers of any model file: a checkpoint, an ONNX file, or responses computed elsewhere."""
+"""Loading of layers from a checkpoint, an ONNX file, or responses computed elsewhere."""
 
 import hashlib
 import re
@@ -20,17 +20,16 @@ from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoints import describe_checkpoint
 
 CHECKPOINT, BEST = ".pt", "best.pt"
-OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
+OF_GRID = "point.json"  # marks a run of a grid; the run's folder is named by its learning rate
 FIGURES = re.compile(r"(test_|validation_)?top1")
 
 
 def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Refuse what is no model file before the first is scored, and before torch is loaded.
+    """Check that all paths are models, before any is scored or torch is loaded.
 
     Returns:
-        What to call each: what a file calls itself; a training run by its folder, one of a grid by
-        its task, and where runs are alike in that, by as many folders as tell them apart. What is
-        called alike all the same is told apart as `told_apart` has it.
+        A name for each: that in the file; for a training run its folder's, in a grid its task's,
+        with parent folders as needed to distinguish runs. `told_apart` makes equal names distinct.
     """
     names: list[str] = []
     runs = {path: path.resolve().parent for path in paths if path.name == BEST}
@@ -43,15 +42,15 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
         depth += 1
         called = {folder: "/".join(folder.parts[-depth:]) for folder in called}
     for path in paths:
-        own = _own_name(path)
+        own = _read_name(path)
         names.append(called[runs[path]] if path in runs else own)
     return told_apart(names, paths)
 
 
 def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of which no two are alike: what is called as one before has its file beside its name.
+    """Make names distinct: a repeated name gets its file's path added.
 
-    The file has as many folders as it takes, and one that is named again a number.
+    The path has as many parent folders as it takes; a file that is given again gets a number.
     """
     found: list[str] = []
     for k, (name, path) in enumerate(zip(names, paths, strict=True)):
@@ -67,7 +66,7 @@ def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _own_name(path: Path) -> str:
+def _read_name(path: Path) -> str:
     if path.suffix == RESPONSES:
         return path.stem
     if path.suffix == ".npy":
@@ -81,16 +80,16 @@ def _own_name(path: Path) -> str:
 
 
 def _is_module(path: Path) -> bool:
-    """Return whether a path is the name of a torch module, ``module:function``."""
+    """Return whether a path names a torch module as ``module:function``, not a file."""
     return ":" in path.name and not path.exists()
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return whether a file is ONNX, without the card of a model of ours."""
+    """Return whether a file is ONNX, without the model card of this project."""
     try:
         return METADATA_KEY not in read_onnx(path.read_bytes()).metadata
     except (BadModel, OSError):
-        return False  # `read_model` says why
+        return False  # `read_model` reports the error
 
 
 def load_layers(
@@ -99,11 +98,11 @@ def load_layers(
     input_name: str = "",
     names: tuple[str, ...] = STIMULI,
 ) -> tuple[Layers, tuple[float, str] | None]:
-    """Return a model's layers, and its accuracy on its task with what that was measured on.
+    """Return a model's layers and, if known, its accuracy with the name of the metric.
 
     Args:
-        names: those of the stimuli. Of others than `STIMULI` responses alone can be read.
-        input_name: input of a foreign ONNX file that takes the loads, if it has several.
+        names: names of the stimuli; for others than `STIMULI`, only responses can be read.
+        input_name: the input of a foreign ONNX file that takes the loads, if it has several.
 
     Raises:
         ConfigError: the stimuli are of another array, or do not fit a foreign model's input.
@@ -119,7 +118,7 @@ def load_layers(
         from tactile_rt.alignment.activations import checkpoint_layers
 
         layers, saved = checkpoint_layers(path, stimuli)
-        return layers, _accuracy(saved.get("metrics", {}))
+        return layers, _find_accuracy(saved.get("metrics", {}))
     if _is_module(path):
         from tactile_rt.alignment.other_models import module_layers
 
@@ -131,14 +130,14 @@ def load_layers(
     from tactile_rt.alignment.onnx_activations import onnx_layers
 
     layers, card = onnx_layers(path, stimuli)
-    return layers, _accuracy(card.figures) if card else None
+    return layers, _find_accuracy(card.figures) if card else None
 
 
 def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
-    """Layers of a model's network before training: of the same architecture, with random weights.
+    """Return the layers of a model's architecture with random weights, as before training.
 
-    An ONNX file knows its architecture by the card in its metadata. None for responses, for models
-    made elsewhere, and for a card that does not name its network.
+    The card in an ONNX file's metadata names its architecture. None for responses, for models made
+    elsewhere, and for a card that does not name its network.
 
     Raises:
         ConfigError: a seed below 0.
@@ -156,7 +155,8 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
     return untrained_card_layers(read_model(path, None)[0], stimuli, seed)
 
 
-def _accuracy(figures: object) -> tuple[float, str] | None:
+def _find_accuracy(figures: object) -> tuple[float, str] | None:
+    """Return a model's top-1 accuracy, 0 to 1, and its name, from its figures."""
     if not isinstance(figures, dict):
         return None
     for key in sorted(k for k in figures if isinstance(k, str) and FIGURES.fullmatch(k)):
@@ -167,21 +167,21 @@ def _accuracy(figures: object) -> tuple[float, str] | None:
 
 
 RESPONSES = ".npz"
-ORDER = "stimuli"  # array that names the stimuli of the others
+ORDER = "stimuli"  # array of the names of stimuli in the other arrays
 NUMBERS = "fiu"
 LARGEST = np.finfo(np.float32).max
 
 
 def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
-    """Layers of a file of responses.
+    """Read a model's layers from a file of responses.
 
     Args:
         path: ``.npz``; each array is a layer, (stimulus, unit) or (stimulus, step, unit), in the
-            order of `names`, or of an array ``stimuli`` of names beside them. A layer whose name
-            does not begin with ``encoder.``, ``attender.`` or ``decoder.`` is one of the encoder's.
+            order of `names`, or of a further array ``stimuli`` of names. A layer whose name does
+            not begin with ``encoder.``, ``attender.`` or ``decoder.`` belongs to the encoder.
 
     Raises:
-        ConfigError: no such file, an array that is no layer, by name, or two that are one layer.
+        ConfigError: no such file, an array that is no layer, or two arrays for one layer.
     """
     check_no_pointer(path)
     try:
@@ -191,7 +191,7 @@ def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
     traces = {}
     with explain_errors(ConfigError, f"{path}: no archive of arrays ("):
         with np.load(path, allow_pickle=False) as archive:
-            order = _order_of(path, archive, names)
+            order = _find_order(path, archive, names)
             for name in archive.files:
                 if name == ORDER:
                     continue
@@ -228,10 +228,10 @@ def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
     )
 
 
-def _order_of(
+def _find_order(
     path: Path, archive: Mapping[str, NDArray[Any]], names: tuple[str, ...]
 ) -> NDArray[np.intp]:
-    """Return where each of the named stimuli stands in a file."""
+    """Return the index of each named stimulus in a file."""
     if ORDER not in archive:
         return np.arange(len(names))
     own = archive[ORDER].astype(str).ravel().tolist()

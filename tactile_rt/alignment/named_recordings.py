@@ -1,11 +1,11 @@
-"""Recordings of any named stimuli: rates in an .npz, or tables of spikes and of events.
+"""Recordings of named stimuli: rates in an .npz, or tables of spikes and events.
 
 An ``.npz`` has for every session ``ANIMAL/SESSION/rates`` (trial, unit) in spikes per second and
-``ANIMAL/SESSION/stimulus`` (trial,), the name shown in each trial; if they are known, ``depth``
-(unit,) in um below the pia and ``type`` (unit,), ``excitatory`` or ``inhibitory``.
+``ANIMAL/SESSION/stimulus`` (trial,), the name shown in each trial; optional are ``depth`` (unit,)
+in um below the pia and ``type`` (unit,), ``excitatory`` or ``inhibitory``.
 
-Of the tables, ``.csv``, one has the columns animal, session, unit, time_s (a row for every spike),
-the other animal, session, stimulus, start_s, stop_s (a row for every trial), on one clock.
+The two ``.csv`` tables are on one clock. One has the columns animal, session, unit, time_s (a row
+for every spike), the other animal, session, stimulus, start_s, stop_s (a row for every trial).
 """
 
 import csv
@@ -37,14 +37,14 @@ def has_named_stimuli(path: Path) -> bool:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith("/rates.npy") for name in archive.namelist())
     except (OSError, zipfile.BadZipFile):
-        return False  # whoever reads it says why
+        return False  # reading it reports the error
 
 
 def read_named_npz(path: Path, selection: Selection | None = None) -> list[NeuralSession]:
-    """Read the sessions of an archive, as the head of this module describes it.
+    """Read the sessions of an archive; its format is described in the module's docstring.
 
     Raises:
-        ConfigError: an array that is missing or does not fit, by name, or too few stimuli.
+        ConfigError: an array is missing or does not fit, or there are not 3 to 50 stimuli.
     """
     check_no_pointer(path)
     with explain_errors(ConfigError, f"{path}: not an npz file of arrays (", most=80):
@@ -84,24 +84,24 @@ def read_named_npz(path: Path, selection: Selection | None = None) -> list[Neura
 def read_spike_tables(
     paths: Sequence[Path], selection: Selection | None = None
 ) -> list[NeuralSession]:
-    """Read sessions of a table of spikes and a table of events.
+    """Read sessions from a table of spikes and a table of events.
 
     Rates count from an event's start to its stop.
 
     Raises:
-        ConfigError: a column or a value that cannot be, by its row; sessions without any spike
-            within their events.
+        ConfigError: a missing column or an invalid value, named by its row; a session without any
+            spike within its events.
     """
-    tables = {columns: path for path in paths if (columns := _columns_of(path))}
+    tables = {columns: path for path in paths if (columns := _identify_table(path))}
     if len(paths) != 2 or set(tables) != {SPIKES, EVENTS}:
         raise ConfigError(f"name two tables, of {', '.join(SPIKES)} and of {', '.join(EVENTS)}")
     spikes: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for number, row in _rows(tables[SPIKES], SPIKES):
-        time = _number(tables[SPIKES], number, row, "time_s")
+    for number, row in _read_rows(tables[SPIKES], SPIKES):
+        time = _read_time(tables[SPIKES], number, row, "time_s")
         spikes[row["animal"], row["session"]][row["unit"]].append(time)
     shown: dict[tuple[str, str], list[tuple[str, float, float]]] = defaultdict(list)
-    for number, row in _rows(tables[EVENTS], EVENTS):
-        start, stop = (_number(tables[EVENTS], number, row, name) for name in ("start_s", "stop_s"))
+    for number, row in _read_rows(tables[EVENTS], EVENTS):
+        start, stop = (_read_time(tables[EVENTS], number, row, n) for n in ("start_s", "stop_s"))
         if stop <= start:
             raise ConfigError(f"{tables[EVENTS]}:{number}: stop_s {stop:g} is not after start_s")
         shown[row["animal"], row["session"]].append((row["stimulus"], start, stop))
@@ -125,7 +125,7 @@ def read_spike_tables(
 def _make_sessions(
     path: Path, sessions: Mapping[tuple[str, str], Arrays], selection: Selection
 ) -> list[NeuralSession]:
-    """Put sessions on one axis of stimuli, that of `STIMULI` if these are shown."""
+    """Make sessions with one common order of stimuli, that of `STIMULI` if it fits."""
     if selection.task:
         raise ConfigError(f"{path}: has no tasks to select by")
     shown = {key: found["stimulus"].astype(str) for key, found in sessions.items()}
@@ -155,8 +155,8 @@ def _make_sessions(
     return made
 
 
-def _columns_of(path: Path) -> tuple[str, ...]:
-    """Return which of the two tables a file is; nothing for neither."""
+def _identify_table(path: Path) -> tuple[str, ...]:
+    """Return the columns of the table that a file holds, `SPIKES` or `EVENTS`; else ()."""
     check_no_pointer(path)
     with explain_errors(ConfigError, f"{path}: cannot be read (", most=80):
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -164,7 +164,7 @@ def _columns_of(path: Path) -> tuple[str, ...]:
     return next((columns for columns in (SPIKES, EVENTS) if set(columns) <= head), ())
 
 
-def _rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[int, dict[str, str]]]:
+def _read_rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[int, dict[str, str]]]:
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.DictReader(file)
         for row in rows:
@@ -173,7 +173,7 @@ def _rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[int, dict[str, s
             yield rows.line_num, row
 
 
-def _number(path: Path, line: int, row: Mapping[str, str], column: str) -> float:
+def _read_time(path: Path, line: int, row: Mapping[str, str], column: str) -> float:
     try:
         value = float(row[column])
     except ValueError:

@@ -1,4 +1,4 @@
-"""Recordings as both protocols take them: animals, their sessions, rates and stimuli per trial."""
+"""Neural recordings, the input of both protocols: animals, sessions, rates and stimuli by trial."""
 
 import hashlib
 import zipfile
@@ -22,15 +22,14 @@ class NeuralSession:
     Attributes:
         rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
         stimulus: (trial,) The stimulus of each trial, as an index into `stimuli`.
-        course: (trial, bin, unit) Firing rates in spikes per second in bins of 45 ms from the
-            beginning of the window on, NaN from the choice on; None if it is not known. A bin that
-            the choice falls into is NaN, and there are as many bins as a model has steps, 22.
-        depth: (unit,) The depth of each unit below the pia in um, NaN where it is not known; None
-            if it is known of no unit.
-        inhibitory: (unit,) Whether each unit is a putative inhibitory neuron; None if it is not
-            known.
-        begin: (trial,) The time when each trial began on the session's clock in s, by which two
-            sortings of one recording are recognised; None if it is not known.
+        course: (trial, bin, unit) Firing rates in spikes per second in 22 bins of 45 ms, as many as
+            a model has steps, from the beginning of the window; NaN from the bin on that the choice
+            falls into. None if unknown.
+        depth: (unit,) The depth of each unit below the pia in um, NaN where unknown; None if
+            unknown for all units.
+        inhibitory: (unit,) Whether each unit is a putative inhibitory neuron; None if unknown.
+        begin: (trial,) The time when each trial began on the session's clock in s, which serves to
+            recognise two sortings of one recording; None if unknown.
         stimuli: The names of the stimuli.
     """
 
@@ -74,25 +73,25 @@ class NeuralSession:
 
 @dataclass(frozen=True)
 class Animal:
-    """An animal and its sessions; every session recorded units of its own."""
+    """An animal and its sessions, each with other units."""
 
     name: str
     sessions: tuple[NeuralSession, ...]
 
 
 def by_animal(sessions: Sequence[NeuralSession]) -> tuple[Animal, ...]:
-    """Sessions gathered by animal, animals in the order of their names."""
+    """Group sessions by animal, animals in the order of their names."""
     names = sorted({session.animal for session in sessions})
     return tuple(Animal(n, tuple(s for s in sessions if s.animal == n)) for n in names)
 
 
 def published_layout(animal: Animal) -> Floats:
-    """An animal's rates as the published analysis arranges them, two mistakes included.
+    """Arrange an animal's rates as the published analysis does, two mistakes included.
 
     - The stimulus axis follows the order in which stimuli first appear in each session, so that
       the same index means different stimuli in different sessions.
     - A trial is zero, not missing, for the five stimuli that it did not show: means over trials
-      are rates times how often a stimulus was shown.
+      are rates times the share of trials that showed the stimulus.
 
     Returns:
         (row, 6, unit): row k holds the k-th trial of every session, NaN after a session's last.
@@ -118,7 +117,7 @@ def published_layout(animal: Animal) -> Floats:
 
 
 def pad(blocks: Sequence[Floats]) -> Floats:
-    """Arrays (row, 6, unit) side by side along units, NaN below the shorter ones."""
+    """Join arrays (row, 6, unit) along units, the shorter ones padded with NaN."""
     rows = max(block.shape[0] for block in blocks)
     return np.concatenate(
         [np.pad(b, ((0, rows - len(b)), (0, 0), (0, 0)), constant_values=np.nan) for b in blocks],
@@ -127,7 +126,7 @@ def pad(blocks: Sequence[Floats]) -> Floats:
 
 
 def rates_sha256(arrays: Mapping[str, NDArray[np.generic]]) -> str:
-    """Hash of named arrays: names, shapes, types and values."""
+    """Return the SHA-256 of named arrays: names, shapes, types and values."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -138,16 +137,17 @@ def rates_sha256(arrays: Mapping[str, NDArray[np.generic]]) -> str:
 
 # The published code saved this option of `numpy.savez` as if it were an animal.
 NOT_AN_ANIMAL = "allow_pickle"
-LARGEST = 1 << 30  # bytes; the published ones have some tens of millions
+LARGEST = 1 << 30  # bytes of an archive; the published ones have some tens of millions
 
 
 def read_published(path: Path) -> dict[str, Floats]:
-    """Rates of every animal, (row, 6, unit), NaN-padded; see `neural.published_layout`.
+    """Read every animal's rates (row, 6, unit), NaN-padded, in the published layout.
 
     The published file has an entry ``allow_pickle``, an option that was saved as if it were an
-    animal: it is passed over, and nothing is ever unpickled.
+    animal: it is ignored, and nothing is ever unpickled.
 
-    The stimulus axis has no names in such a file, so only protocol paper-code can use it.
+    The stimulus axis has no names in such a file, so only protocol paper-code can use it; see
+    `neural.published_layout`.
     """
     check_no_pointer(path)
     try:

@@ -1,4 +1,4 @@
-"""NWB files of the barrel-cortex recordings (Rodgers 2022, DANDI 000231), read with h5py alone.
+"""Reader of NWB files of barrel-cortex recordings (Rodgers 2022, DANDI 000231), with h5py alone.
 
     general/subject/subject_id                            animal
     general/experiment_description                        task
@@ -7,12 +7,12 @@
     units/depth, units/inhibitory                         um, putative cell type
     acquisition/<electrical series>/starting_time         see below
     processing/*/contacts_by_whisker_*/start_time         touches
-    processing/*/processed_position_whisker_*/angle/...   the clock that touches are read on
+    processing/*/processed_position_whisker_*/angle/...   the clock of the touches
 
-NWB defines spike times on the session's clock, as it does all times. The published analysis takes
-them to be on the recording's, and subtracts its starting time; `clock` says which, and the module
-of that name checks it.
-A rate is a number of spikes over the bins of 45 ms that cover the window, as published.
+NWB defines all times, also of spikes, on the session's clock. The published analysis assumes spike
+times on the recording's clock, and subtracts its starting time. `clock` selects one of the two, and
+the module of that name checks it. Rates are spike counts over the bins of 45 ms that cover the
+window, as published.
 """
 
 from collections.abc import Callable, Iterable
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 Progress = Callable[[float], None]
 
 BIN_S = 0.045
-COURSE_BINS = 22  # as many as the steps of a model that is compared
-WINDOWS = ("contact", "start")  # where a trial's window begins; it ends with the choice
+COURSE_BINS = 22  # as many as the steps of the compared models
+WINDOWS = ("contact", "start")  # events that begin a trial's window; it ends with the choice
 LONGEST_TRIAL_S, LONGEST_SESSION_S = 600.0, 1e6
-SILENT_S = 60.0  # without a spike of any unit: not recorded
+SILENT_S = 60.0  # trials with no spike of any unit within this time were not recorded
 
 
 class Reading(NamedTuple):
-    """A session of neurons from a file; `response` is None without contacts."""
+    """A session read from a file; `response` is None without contacts or spikes."""
 
     session: NeuralSession
     notes: list[str]
@@ -54,7 +54,7 @@ class Reading(NamedTuple):
 
 
 def find_nwb(paths: Iterable[Path]) -> list[Path]:
-    """Find files, and those in folders: with ``ecephys`` in their names, if any has that."""
+    """Find NWB files in paths; in folders, those named with ``ecephys``, if any."""
     found = []
     for path in paths:
         if not (path.is_dir() or path.is_file()):
@@ -73,19 +73,19 @@ def read_nwb(
     clock: str = "session",
     selection: Selection | None = None,
 ) -> tuple[list[Reading], list[str]]:
-    """Sessions of NWB files.
+    """Read the selected sessions of NWB files.
 
     Args:
         window: rates count from first ``contact`` or from the ``start`` of the trial, to choice.
 
     Returns:
-        What was read of the sessions that are selected, and notes on what was left out, sessions
-        that cannot be read among these.
+        Readings of the selected sessions, and notes on what was left out, including sessions that
+        cannot be read.
     """
     _import_h5py()
-    wanted = selection or Selection()
-    named = list(files)
-    files = [path for path in named if wanted.takes(path.stem)]
+    chosen = selection or Selection()
+    every = list(files)
+    files = [path for path in every if chosen.takes(path.stem)]
     readings: list[Reading] = []
     spoilt: list[str] = []
     for i, path in enumerate(files):
@@ -94,21 +94,21 @@ def read_nwb(
             progress((i + share) / len(files))
 
         try:
-            reading = read_session(path, window, read, clock, wanted)
+            reading = read_session(path, window, read, clock, chosen)
         except ConfigError as error:
             why = str(error).replace(str(path), path.name)
             spoilt.append(f"session {path.stem} left out: {why}")
         else:
-            if wanted.task in (None, reading.task) and reading.session.rates.shape[1]:
+            if chosen.task in (None, reading.task) and reading.session.rates.shape[1]:
                 readings.append(reading)
         read(1.0)
     if not readings:
-        raise ConfigError(name_some(spoilt, 1) or f"no session of {len(named)} is of {wanted}")
+        raise ConfigError(name_some(spoilt, 1) or f"no session of {len(every)} is of {chosen}")
     notes = [*spoilt, *(note for reading in readings for note in reading.notes)]
-    if str(wanted):
+    if str(chosen):
         units = sum(r.session.rates.shape[1] for r in readings)
         notes.insert(
-            0, f"selected: {wanted}: {len(readings)} of {len(named)} sessions, {units} units"
+            0, f"selected: {chosen}: {len(readings)} of {len(every)} sessions, {units} units"
         )
     return readings, notes
 
@@ -120,7 +120,7 @@ def read_session(
     clock: str = "session",
     selection: Selection | None = None,
 ) -> Reading:
-    """One NWB file; see `read_nwb`."""
+    """Read the session of an NWB file; see `read_nwb`."""
     for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
@@ -129,7 +129,7 @@ def read_session(
     with explain_errors(ConfigError, f"{path}: cannot be read as NWB ("):
         try:
             with h5py.File(path, "r") as file:
-                return _session(file, path.stem, window, progress, clock, selection or Selection())
+                return _assemble(file, path.stem, window, progress, clock, selection or Selection())
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from None
 
@@ -140,9 +140,10 @@ def _import_h5py() -> Any:
     return h5py
 
 
-def _session(
+def _assemble(
     file: "h5py.File", name: str, window: str, progress: Progress, clock: str, selection: Selection
 ) -> Reading:
+    """Assemble a session from parts of its file, and leave out bad trials and units."""
     notes: list[str] = []
     trials = parts.trial_columns(file)
     shapes, places = parts.text(trials["stimulus"]), parts.text(trials["servo_position"])
@@ -152,7 +153,6 @@ def _session(
     task = parts.task_of(file, shapes[ignored == 0])
 
     def drop(bad: NDArray[np.bool_], why: str) -> None:
-        """Leave bad trials out, and say which."""
         nonlocal kept
         rows = np.flatnonzero(bad & kept)
         if rows.size:
@@ -193,19 +193,19 @@ def _session(
         drop(~np.isfinite(start), "no contact before the choice")
     first, last = begin[kept].min(), stop[kept].max()
     units, usable = parts.usable_units(units, first, last, notes)
-    heard = [times for times, good in zip(units, usable, strict=True) if good]
-    if not heard:
+    trains = [times for times, good in zip(units, usable, strict=True) if good]
+    if not trains:
         raise ConfigError(name_some(["no unit can be used", *notes[::-1]], 2, "; "))
     near = [start - SILENT_S, stop + SILENT_S]
-    before = np.searchsorted(np.sort(np.concatenate(heard)), near)
+    before = np.searchsorted(np.sort(np.concatenate(trains)), near)
     drop(before[0] == before[1], f"no unit has a spike within {SILENT_S:g} s")
     rows = np.flatnonzero(kept)
-    response = contact_response(name, heard, contacts, shift, origin or 0.0)
+    response = contact_response(name, trains, contacts, shift, origin or 0.0)
     depth = parts.unit_column(file, "depth", len(units), notes)
     inhibitory = parts.unit_column(file, "inhibitory", len(units), notes, (0, 1))
     chosen = selection.units(depth, inhibitory, len(units)) & usable
-    spikes = [times - shift for times, wanted in zip(units, chosen, strict=True) if wanted]
-    rates, course = _rates(spikes, start[rows], stop[rows], progress)
+    spikes = [times - shift for times, keep in zip(units, chosen, strict=True) if keep]
+    rates, course = _compute_rates(spikes, start[rows], stop[rows], progress)
     if rates.size and not rates.any():
         raise ConfigError(f"none of {len(spikes)} units has a spike in one of {len(rows)} trials")
     session = NeuralSession(
@@ -221,10 +221,10 @@ def _session(
     return Reading(session, [f"session {name}: {note}" for note in notes], task, response)
 
 
-def _rates(
+def _compute_rates(
     spikes: list[Floats], start: Floats, stop: Floats, progress: Progress
 ) -> tuple[Floats, Floats]:
-    """Spikes per second in [start, stop), (trial, unit), and by bin, (trial, bin, unit)."""
+    """Compute rates in spikes/s in [start, stop), (trial, unit), and by bin, (trial, bin, unit)."""
     bins = np.array(
         [len(np.arange(a, b + BIN_S, BIN_S)) - 1 for a, b in zip(start, stop, strict=True)]
     )

@@ -1,7 +1,7 @@
 """Parts of an NWB file of the barrel-cortex recordings, each checked as it is read.
 
-What spoils a session raises a `ConfigError` that names the place in the file; the file is named by
-who reads it. What spoils a trial, a contact or a spike alone is left out, and a note says so.
+An error that makes a session useless raises a `ConfigError` that names the place in the file; the
+caller adds the file. A faulty trial, contact, spike or unit is left out, with a note.
 """
 
 from collections import defaultdict
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
 COLUMNS = ("start_time", "choice_time", "outcome", "stimulus", "servo_position", "ignore_trial")
 TRIALS = "intervals/trials"
-RECORDING = "extracellular array recording"  # of the published files; else the only one there is
+RECORDING = "extracellular array recording"  # in published files; else the only electrical series
 CONTACTS = "contacts_by_whisker_"
 WHISKER = "processed_position_whisker_"
 SUBJECT = "general/subject/subject_id"
-EXPERIMENT = "general/experiment_description"  # says which task it was
+EXPERIMENT = "general/experiment_description"  # names the task
 LARGEST = 1 << 30  # bytes of a column; the longest ones, of spike times, have some millions
-NAMED = 5  # trials or units that a note names
-BACK_S = 0.01  # of spike times that sorters leave out of order; further back is another clock
-FAR_S = 3600.0  # before and after the trials, or as long as they last together
-FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; fewer are single mistakes, or chance
+NAMED = 5  # trials or units that a note lists at most
+BACK_S = 0.01  # disorder of spike times that sorters may leave; a larger step is another clock
+FAR_S = 3600.0  # spikes are far if outside the trials by more than this and than their duration
+FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; smaller shares are mistakes or chance
 
 
 def stored(file: Any, name: str) -> NDArray[Any]:
-    """Read a column as it is stored: of one dimension, and not too large."""
+    """Read a column as stored; it must have one dimension and not be too large."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
         raise ConfigError(f"{name} is not a column of values")
@@ -44,7 +44,7 @@ def stored(file: Any, name: str) -> NDArray[Any]:
 
 
 def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
-    """The columns of the trials that are needed, as stored, of one length."""
+    """Read the needed columns of the trials as stored; they must have one length."""
     if TRIALS not in file:
         raise ConfigError(f"has no {TRIALS}")
     table = file[TRIALS]
@@ -60,7 +60,7 @@ def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
 
 
 def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
-    """Start times of all contacts, sorted, s; what was left out is said in `notes`."""
+    """Read the sorted start times of all contacts, s; `notes` receives what is left out."""
     found = {k: v for module in file.get("processing", {}).values() for k, v in module.items()}
     clocks = {name: last_time(found[name]) for name in found if name.startswith(WHISKER)}
     last = {name: end for name, end in clocks.items() if end is not None}
@@ -88,7 +88,7 @@ def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
 
 
 def last_time(clock: Any) -> float | None:
-    """Last timestamp of a whisker's angle, s; None where it has no clock."""
+    """Return the last timestamp of a whisker's angle, s; None without a clock."""
     angle = clock.get("angle", {}) if hasattr(clock, "get") else {}
     if "timestamps" in angle and len(angle["timestamps"]):
         return float(angle["timestamps"][-1])
@@ -99,7 +99,7 @@ def last_time(clock: Any) -> float | None:
 
 
 def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
-    """Read the finite spike times of every unit, s, in the order stored; `notes` name others."""
+    """Read each unit's finite spike times, s, in stored order; `notes` receives the others."""
     for name in ("units/spike_times", "units/spike_times_index"):
         if name not in file:
             raise ConfigError(f"has no {name}: is this a session with spikes?")
@@ -127,9 +127,9 @@ def usable_units(
     """Sort the spike times of units, and mark units that can be averaged.
 
     Args:
-        units: Times in s, in the order stored.
-        begin, end: When the first trial begins and the last one ends, in s.
-        notes: Receives what is left out, and why.
+        units: times in s, in the order stored.
+        begin, end: beginning of the first trial and end of the last one, in s.
+        notes: receives what is left out, and why.
     """
     far, usable = max(FAR_S, end - begin), np.ones(len(units), dtype=np.bool_)
     kept, seen, faults = [], dict[bytes, int](), defaultdict[str, list[int]](list)
@@ -158,15 +158,15 @@ def usable_units(
                 doubled += [k] * int(again.sum())
                 times = times[~again]
         kept.append(times)
-    told = {"counted once, stored twice": doubled, "far from the trials, or before 0 s": strange}
-    notes += [f"{len(r)} spikes {what} (unit {name_rows(r)})" for what, r in told.items() if r]
+    odd = {"counted once, stored twice": doubled, "far from the trials, or before 0 s": strange}
+    notes += [f"{len(r)} spikes {what} (unit {name_rows(r)})" for what, r in odd.items() if r]
     for fault, rows in faults.items():
         notes.append(f"{len(rows)} of {len(units)} units left out ({name_rows(rows)}): {fault}")
     return kept, usable
 
 
 def mark_overlaps(start: Floats, stop: Floats) -> NDArray[np.bool_]:
-    """Mark trials of another clock, stored twice, or running into the next one."""
+    """Mark trials on another clock, stored twice, or overlapping the next one."""
     bad = np.zeros(len(start), dtype=np.bool_)
     for again in range(2):
         order = np.lexsort((stop, start, bad))[: (~bad).sum()]
@@ -185,7 +185,7 @@ def mark_overlaps(start: Floats, stop: Floats) -> NDArray[np.bool_]:
 
 
 def name_rows(rows: Sequence[int]) -> str:
-    """Name some rows of a table in a note, each once."""
+    """Format some rows of a table for a note, each once."""
     rows = sorted(set(rows))
     return ", ".join(map(str, rows[:NAMED])) + (", ..." if len(rows) > NAMED else "")
 
@@ -193,7 +193,7 @@ def name_rows(rows: Sequence[int]) -> str:
 def unit_column(
     file: "h5py.File", name: str, units: int, notes: list[str], among: Sequence[float] = ()
 ) -> Floats | None:
-    """Read a column of the units as numbers, (unit,), of `among` if any; None if it is unusable."""
+    """Read a column (unit,) as numbers, all in `among` if given; None if unusable."""
     if name not in file.get("units", {}):
         return None
     values = stored(file["units"], name)
@@ -209,7 +209,7 @@ def unit_column(
 
 
 def starting_time(file: "h5py.File") -> float | None:
-    """When the electrical recording began on the session's clock, s; None if it is not said."""
+    """Read the start of the electrical recording on the session's clock, s; None if missing."""
     series = file.get("acquisition", {})
     timed = [name for name in series if "starting_time" in series[name]]
     electrical = [n for n in timed if series[n].attrs.get("neurodata_type") == "ElectricalSeries"]
@@ -221,40 +221,40 @@ def starting_time(file: "h5py.File") -> float | None:
 
 
 def animal_name(file: "h5py.File", stem: str) -> str:
-    """The subject; without one, the first part of the file's name, as published."""
+    """Return the subject; if missing, the first part of the file's name, as published."""
     if SUBJECT in file:
-        return _text_of(file, SUBJECT)
+        return _read_text(file, SUBJECT)
     return stem.partition("_")[0].removeprefix("sub-")
 
 
 def task_of(file: "h5py.File", shown: NDArray[np.str_]) -> str:
-    """The mouse's task: what the file says, or whether trials without a shape were part of it."""
+    """Return the mouse's task as the file names it, else by trials without a shape."""
     if EXPERIMENT in file:
-        named = [task for task in TASKS if task in _text_of(file, EXPERIMENT)]
+        named = [task for task in TASKS if task in _read_text(file, EXPERIMENT)]
         if len(named) == 1:
             return named[0]
     return TASKS[1] if (shown == "nothing").any() else TASKS[0]
 
 
-def _text_of(file: "h5py.File", name: str) -> str:
+def _read_text(file: "h5py.File", name: str) -> str:
     return str(text(np.atleast_1d(file[name][()]))[0])
 
 
 def text(column: NDArray[Any]) -> NDArray[np.str_]:
-    """Text, whether it was stored as text or as bytes."""
+    """Convert a column of text or bytes to text."""
     decoded = [v.decode(errors="replace") if isinstance(v, bytes) else str(v) for v in column]
     return np.array(decoded, dtype=np.str_)
 
 
 def flags(column: NDArray[Any], what: str) -> NDArray[np.int64]:
-    """A column of trials that is true or false, of any type: 1, 0, or -1 for neither."""
+    """Convert a column of truth values of any type to 1, 0, or -1 (neither)."""
     if column.dtype.kind not in "biu":
         raise ConfigError(f"{TRIALS} column {what} is {column.dtype}, not true or false")
     return np.where(np.isin(column, (0, 1)), column, -1).astype(np.int64)
 
 
 def numbers(values: NDArray[Any], what: str) -> Floats:
-    """Times in seconds; `what` names them if they are something else."""
+    """Convert times in seconds to floats; `what` names them in an error."""
     if values.dtype.kind not in "fiu":
         raise ConfigError(f"{what} is {values.dtype}, not times in seconds")
     return values.astype(np.float64)

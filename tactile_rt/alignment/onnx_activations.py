@@ -1,12 +1,12 @@
 """Activations of every layer of an ONNX file, for the six stimuli.
 
-Layers become further outputs of a copy of the graph in memory; the file stays as it is, and so,
-bitwise, does what it decides: `onnx_layers` runs both and says if not. A step is run for the 22
-steps of a stimulus, a window, which is a `Scan` over the same step, once.
+Layers become further outputs of a copy of the graph in memory. The file does not change, and its
+logits should stay the same bitwise: `onnx_layers` runs both and notes a difference. A step file is
+run for each of the 22 steps of a stimulus; a window, which is a `Scan` over the same step, once.
 
-Which tensors are layers, the names of the parameters that made them tell. The exporter keeps those
-of biases and norms (``model.network.attender.norm.bias``) where it folds weights, and quantisation
-keeps both these and every tensor's name. A graph encoder's maps are its recurrent states.
+Layers are found by the names of their parameters. Where the exporter folds weights, it keeps the
+names of biases and norms (``model.network.attender.norm.bias``), and quantisation keeps these and
+the names of tensors. A graph encoder's maps are its recurrent states.
 """
 
 import hashlib
@@ -30,10 +30,10 @@ from tactile_rt.core.errors import ModelError, explain_errors
 QUANTISED = {"MatMulInteger", "ConvInteger", "DynamicQuantizeLinear", "QLinearMatMul",
              "QLinearConv", "DequantizeLinear", "MatMulNBits", "MatMulIntegerToFloat"}  # fmt: skip
 GRAPH_NODE = re.compile(r"encoder\.(convs\.|dense\.|drives\.|)(\w+)")
-GRU_LAYERS = "encoder.layer*"  # all in one tensor (..., layer, feature)
+GRU_LAYERS = "encoder.layer*"  # all layers of a GRU are in one tensor (..., layer, feature)
 PARAMETER = re.compile(r"(?:model\.)?(?:network\.)?((?:encoder|attender|decoder)(?:\..+)?)\.\w+$")
-# (path of a parameter's module, name of the layer, where the layer is from the node that reads the
-# parameter: its output, behind the ReLU or sum that follows, or its input)
+# (path of a parameter's module, name of the layer, position of the layer relative to the node that
+# reads the parameter: its output, the output of the following ReLU or sum, or its input)
 RULES = tuple(
     (re.compile(pattern), name, where)
     for pattern, name, where in (
@@ -62,7 +62,7 @@ RULES = tuple(
 
 
 def step_graph(model: onnx.ModelProto) -> tuple[onnx.GraphProto, onnx.NodeProto | None]:
-    """The graph of one step, and the `Scan` that runs it if the file is a window of steps."""
+    """Return the graph of one step, and a window file's `Scan` that runs it."""
     for node in model.graph.node:
         if node.op_type == "Scan":
             return next(a.g for a in node.attribute if a.name == "body"), node
@@ -70,7 +70,7 @@ def step_graph(model: onnx.ModelProto) -> tuple[onnx.GraphProto, onnx.NodeProto 
 
 
 def named_taps(model: onnx.ModelProto) -> dict[str, str]:
-    """Tensors by layer, in the order of computation; layers whose names are lost are missing."""
+    """Find tensors by layer, in order of computation; layers without names are missing."""
     graph, _ = step_graph(model)
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
@@ -78,13 +78,13 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
             readers.setdefault(source, []).append(node)
     place = {o: i for i, node in enumerate(graph.node) for o in node.output}
     # The node of a module is the last that reads one of its parameters: a sum after a product.
-    # Parameters that are equal, as an untrained network's are, are one to the exporter, under the
-    # name of any of them: what several nodes read tells nothing.
+    # The exporter merges equal parameters, as of an untrained network, under the name of any of
+    # them: a parameter that several nodes read identifies no module.
     modules: dict[str, onnx.NodeProto] = {}
     for initializer in (*model.graph.initializer, *graph.initializer):
         match = PARAMETER.match(initializer.name)
         reading = readers.get(initializer.name, [])
-        while len(reading) == 1 and reading[0].op_type == "Cast":  # of weights stored in 16 bits
+        while len(reading) == 1 and reading[0].op_type == "Cast":  # for weights in 16 bits
             reading = readers.get(reading[0].output[0], [])
         if match and len(reading) == 1:
             node = reading[0]
@@ -106,11 +106,11 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
                 number = next((g for g in match.groups() if g), "")
                 if mamba and path == "attender.norm":
                     name, where = "attender.block3 attender.norm", "both"
-                for layer, tensor in _found(name, number, where, node, readers):
+                for layer, tensor in _find_tensors(name, number, where, node, readers):
                     taps.setdefault(layer, tensor)
     if "attender.norm" in taps and "attender.block7" in taps:
-        # Of a GPT, whose last layer has no bias to keep a name.
-        if product := _next(taps["attender.norm"], readers, "MatMul"):
+        # The last layer of a GPT has no bias that would keep its name.
+        if product := _find_reader(taps["attender.norm"], readers, "MatMul"):
             taps.setdefault("attender.project_out", product.output[0])
     part = PARTS.index
     return dict(
@@ -119,7 +119,7 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
 
 
 def precision_of(model: onnx.ModelProto) -> str:
-    """``int8``, ``fp16``, ``bf16`` or ``fp32``, by what the graph computes and stores."""
+    """Return ``int8``, ``fp16``, ``bf16`` or ``fp32``, by the graph's operators and weights."""
     graph, _ = step_graph(model)
     if QUANTISED.intersection(node.op_type for node in graph.node):
         return "int8"
@@ -129,13 +129,14 @@ def precision_of(model: onnx.ModelProto) -> str:
     return "bf16" if onnx.TensorProto.BFLOAT16 in types else "fp32"
 
 
-def _found(
+def _find_tensors(
     name: str,
     number: str,
     where: str,
     node: onnx.NodeProto,
     readers: dict[str, list[onnx.NodeProto]],
 ) -> Iterable[tuple[str, str]]:
+    """Yield a rule's layers and their tensors, from the node that reads the parameter."""
     out = node.output[0]
     if where == "input":
         yield f"{name.removesuffix('{-1}')}{int(number) - 1}", node.input[0]
@@ -143,33 +144,33 @@ def _found(
         before, after = name.split()
         yield from ((before, node.input[0]), (after, out))
     elif where == "sum":
-        # Behind a product whose bias is lost comes that bias, not the sum.
-        total = None if node.op_type == "MatMul" else _next(out, readers, "Add")
+        # After a product whose bias has lost its name, the next sum adds that bias.
+        total = None if node.op_type == "MatMul" else _find_reader(out, readers, "Add")
         if total is not None:
-            yield name.format(number), _activated(total.output[0], readers)
+            yield name.format(number), _follow_activation(total.output[0], readers)
     elif where == "activation":
-        yield name.format(number), _activated(out, readers)
+        yield name.format(number), _follow_activation(out, readers)
     elif where == "either":  # the first layer of a decoder over all steps, or the only one
         hidden, last = name.split()
-        behind = _activated(out, readers)
+        behind = _follow_activation(out, readers)
         yield (hidden, behind) if behind != out else (last, out)
     else:
         yield name.format(number), out
 
 
-def _next(
+def _find_reader(
     tensor: str, readers: dict[str, list[onnx.NodeProto]], kind: str
 ) -> onnx.NodeProto | None:
     return next((n for n in readers.get(tensor, []) if n.op_type == kind), None)
 
 
-def _activated(tensor: str, readers: dict[str, list[onnx.NodeProto]]) -> str:
-    """Behind the activation function that follows, at once or after a cell's few sums."""
+def _follow_activation(tensor: str, readers: dict[str, list[onnx.NodeProto]]) -> str:
+    """Return the output of the ReLU that follows, directly or after a cell's few sums."""
     at = tensor
     for _ in range(4):
-        if (node := _next(at, readers, "Relu")) is not None:
+        if (node := _find_reader(at, readers, "Relu")) is not None:
             return str(node.output[0])
-        if (node := _next(at, readers, "Add")) is None:
+        if (node := _find_reader(at, readers, "Add")) is None:
             break
         at = node.output[0]
     return tensor
@@ -177,28 +178,28 @@ def _activated(tensor: str, readers: dict[str, list[onnx.NodeProto]]) -> str:
 
 Floats = NDArray[np.float32]
 TOKENS = 2  # of a GPT attender's step, the action token last
-REASON = 120  # characters of what onnxruntime says
-TAP = "tap:"  # prefix of the outputs that are added
+REASON = 120  # characters of an onnxruntime message
+TAP = "tap:"  # prefix of the added outputs
 
 
 def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
     """Read the layers of a step or window file, and its card."""
     with explain_errors(ModelError, f"{path}: its layers cannot be read (", most=REASON):
-        plain, card, model = _opened(path, stimuli)
+        plain, card, model = _open_model(path, stimuli)
         taps = named_taps(model)
         tensors = list(dict.fromkeys(taps.values()))
-        logits, _ = _run(plain, stimuli, card, ())
-        session = _session(with_outputs(model, tensors))
-        tapped, found = _run(session, stimuli, card, tensors)
-        traces = _traces(taps, found)
-        unlike, found = _run(session, _unlike(stimuli), card, tensors)
-        others = _traces(taps, found)
+        logits, _ = _run_stimuli(plain, stimuli, card, ())
+        session = _make_session(with_outputs(model, tensors))
+        tapped, found = _run_stimuli(session, stimuli, card, tensors)
+        traces = _collect_traces(taps, found)
+        other, found = _run_stimuli(session, _randomise_loads(stimuli), card, tensors)
+        others = _collect_traces(taps, found)
     notes = []
     if not np.array_equal(logits, tapped):
         worst = float(np.abs(logits - tapped).max())
         notes.append(f"taps changed the logits by up to {worst:.1e}: the runtime fuses otherwise")
     if not traces:
-        traces["decoder.logits"], others["decoder.logits"] = logits, unlike
+        traces["decoder.logits"], others["decoder.logits"] = logits, other
         notes.append("no layer but the logits: the graph's parameters have lost their names")
     return Layers(
         name=card.name,
@@ -215,25 +216,25 @@ def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
 
 
 def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelProto:
-    """A copy whose tensors are outputs too, ``tap:`` and their name; of a window for every step."""
+    """Return a copy with tensors as further outputs ``tap:NAME``; of a window for every step."""
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
     graph, scan = step_graph(copy)
     known = {v.name: v.type for v in (*graph.value_info, *graph.output)}
     for name in tensors:
-        # By a node of its own: a tensor that is an output already may not be one again.
+        # Through an extra node, since a tensor that is an output already may not be one again.
         graph.node.append(onnx.helper.make_node("Identity", [name], [f"{TAP}{name}"]))
-        # Without a type the runtime infers it, as it must for tensors of a quantised graph.
+        # The runtime infers a missing type, as for the tensors of a quantised graph.
         graph.output.append(onnx.ValueInfoProto(name=f"{TAP}{name}", type=known.get(name)))
         if scan is not None:
             scan.output.append(f"{TAP}{name}_steps")
             copy.graph.output.append(onnx.ValueInfoProto(name=f"{TAP}{name}_steps"))
             for axes in (a for a in scan.attribute if a.name == "scan_output_axes"):
-                axes.ints.append(0)  # as it is unless told
+                axes.ints.append(0)  # the default
     return copy
 
 
-def _opened(
+def _open_model(
     path: Path, stimuli: StimuliInput
 ) -> tuple[ort.InferenceSession, ModelCard, onnx.ModelProto]:
     session, card = load_model(path, kind=None)
@@ -244,8 +245,8 @@ def _opened(
     return session, card, model
 
 
-def _session(model: onnx.ModelProto) -> ort.InferenceSession:
-    """With the options of `load_model`, so that it computes the same."""
+def _make_session(model: onnx.ModelProto) -> ort.InferenceSession:
+    """Make a session with the options of `load_model`, so that it computes the same."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
@@ -256,19 +257,19 @@ def _session(model: onnx.ModelProto) -> ort.InferenceSession:
         )
 
 
-def _run(
+def _run_stimuli(
     session: ort.InferenceSession,
     loads: StimuliInput,
     card: ModelCard,
     tensors: Sequence[str],
 ) -> tuple[Floats, dict[str, Floats]]:
-    """Logits (stimulus, step, class) and tensors (stimulus, step, ...).
+    """Run all stimuli; return logits (stimulus, step, class) and tensors (stimulus, step, ...).
 
-    One stimulus at a time, so that no axis is taken for the batch's.
+    Stimuli run separately, so that no other axis can be mistaken for the batch's.
     """
     window = card.kind == "window"
     end = "_steps" if window else ""
-    wanted = [f"{TAP}{name}{end}" for name in tensors]
+    outputs = [f"{TAP}{name}{end}" for name in tensors]
     states = [f"{s.name}_next" for s in card.state]
     logits: list[Floats] = []
     found: dict[str, list[Floats]] = {name: [] for name in tensors}
@@ -280,7 +281,7 @@ def _run(
         }
         if window:
             feed["samples"] = loads.samples[i : i + 1]
-            first, *rest = session.run(["logits", *wanted], feed)
+            first, *rest = session.run(["logits", *outputs], feed)
             logits.append(first[0])
             for name, values in zip(tensors, rest, strict=True):
                 found[name].append(values)
@@ -288,9 +289,9 @@ def _run(
         steps: list[list[Floats]] = []
         for t in range(STEPS):
             feed["samples"] = loads.samples[i : i + 1, t]
-            out = session.run(["logits", *wanted, *states], feed)
-            steps.append(out[: 1 + len(wanted)])
-            following = out[1 + len(wanted) :]
+            out = session.run(["logits", *outputs, *states], feed)
+            steps.append(out[: 1 + len(outputs)])
+            following = out[1 + len(outputs) :]
             feed |= {s.name: v for s, v in zip(card.state, following, strict=True)}
         logits.append(np.concatenate([step[0] for step in steps]))
         for k, name in enumerate(tensors):
@@ -298,32 +299,32 @@ def _run(
     return np.stack(logits), {name: np.stack(values) for name, values in found.items()}
 
 
-def _unlike(stimuli: StimuliInput) -> StimuliInput:
-    """Input that differs from the first step on: loads at random, as high as those of the stimuli.
+def _randomise_loads(stimuli: StimuliInput) -> StimuliInput:
+    """Return random loads in the stimuli's range, which differ from the first step on.
 
-    Stimuli may begin alike, and which steps input can reach is a matter of the network alone.
+    Stimuli may begin alike, but the steps that input can reach depend on the network alone.
     """
     highest = np.abs(stimuli.samples).max(axis=(0, 1, 2))
     drawn = np.random.default_rng(0).uniform(-1, 1, stimuli.samples.shape)
     return replace(stimuli, samples=(drawn * highest).astype(np.float32))
 
 
-def _traces(taps: Mapping[str, str], found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """By layer, (stimulus, step, unit)."""
+def _collect_traces(taps: Mapping[str, str], found: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Collect the responses (stimulus, step, unit) of each layer from the tensors."""
     traces: dict[str, Floats] = {}
     for layer, tensor in taps.items():
         values = found[tensor]
         if layer == GRU_LAYERS:
             traces |= {f"encoder.layer{i}": values[:, :, 0, i] for i in range(values.shape[3])}
         else:
-            traces[layer] = _trace(layer, values)
+            traces[layer] = _reshape_trace(layer, values)
     return traces
 
 
-def _trace(layer: str, values: Floats) -> Floats:
-    """(stimulus, step, 1, ...) -> (stimulus, step, unit); of a GPT's tokens the action token.
+def _reshape_trace(layer: str, values: Floats) -> Floats:
+    """Reshape a tensor (stimulus, step, 1, ...) to (stimulus, step, unit).
 
-    The exporter may have made one axis of batch and token.
+    Of a GPT's tokens it keeps the action token; the exporter may have merged batch and token axes.
     """
     if layer.startswith("attender."):
         rows = values.reshape(*values.shape[:2], -1, values.shape[-1])

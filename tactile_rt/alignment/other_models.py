@@ -1,7 +1,7 @@
-"""Layers of models made elsewhere: an ONNX file of one input, or a torch module by its name.
+"""Layers of foreign models: an ONNX file, or a torch module by its name.
 
-A layer is the output of a node with weights, behind the bias and the activation that follow. The
-loads of the six stimuli are given in SI units, resampled in time where an input has another length.
+A layer is the output of a node with weights, after the bias and the activation that follow. The
+loads of the six stimuli are given in SI units, resampled in time if an input has another length.
 """
 
 import hashlib
@@ -30,25 +30,25 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
-# Nodes that hand weights on, and those whose output is a layer without any of its own.
+# Operators that pass weights on; that are layers without weights of their own; that end a layer.
 PASSING = {"Cast", "DequantizeLinear", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
 WHOLE = {"If", "Loop", "Scan"}
 BEHIND = {"Add", "BatchNormalization", "Clip", "Elu", "Gelu", "HardSigmoid", "HardSwish",
           "LeakyRelu", "Mish", "PRelu", "Relu", "Selu", "Sigmoid", "Softplus", "Tanh"}  # fmt: skip
-NUMBERED = re.compile(r"onnx::.*|val_\d+|\d+")  # names that an exporter made up
+NUMBERED = re.compile(r"onnx::.*|val_\d+|\d+")  # names that an exporter generates
 OTHERWISE = "compute its responses yourself, an .npz of (6, unit) by layer"
-REASON = 80  # characters of what other software says
+REASON = 80  # characters of other software's messages
 
 
 def other_onnx_layers(path: Path, stimuli: StimuliInput, input_name: str = "") -> Layers:
     """Run a foreign ONNX file on the six stimuli and return its layers.
 
     Args:
-        input_name: the input that takes the loads; empty where the file has one input only.
+        input_name: the input that takes the loads; empty if the file has only one.
 
     Raises:
-        ConfigError: the file has no input of this name, or several; the loads do not fit it.
-        ModelError: it cannot be read or run.
+        ConfigError: no such input, several inputs and none named, or loads that do not fit.
+        ModelError: the file cannot be read or run.
     """
     data = path.read_bytes()
     try:
@@ -75,7 +75,7 @@ def other_onnx_layers(path: Path, stimuli: StimuliInput, input_name: str = "") -
     given = inputs.pop(input_name)
     if given.type not in TYPES:
         raise ConfigError(f"{path}: input {input_name} is {given.type}, not of reals: {OTHERWISE}")
-    feed = {other.name: _zeros(path, other) for other in inputs.values()}
+    feed = {other.name: _make_zeros(path, other) for other in inputs.values()}
     loads = fit_loads(stimuli, given.shape, f"{path}: input {input_name}")
     found: dict[str, list[NDArray[Any]]] = {layer: [] for layer in taps}
     with explain_errors(ModelError, f"{path}: does not run on the stimuli (", most=REASON):
@@ -86,7 +86,7 @@ def other_onnx_layers(path: Path, stimuli: StimuliInput, input_name: str = "") -
                 found[layer].append(np.asarray(value))
     samples = stimuli.samples.shape[1] * stimuli.samples.shape[2]
     weights = sum(int(np.prod(i.dims)) for i in model.graph.initializer if len(i.dims) > 1)
-    layers = _layers(path.stem, found, samples, weights, hashlib.sha256(data).hexdigest())
+    layers = _make_layers(path.stem, found, samples, weights, hashlib.sha256(data).hexdigest())
     zeros = (f"zeros for its input {name}" for name in sorted(inputs))
     return replace(layers, notes=(*layers.notes, *zeros))
 
@@ -97,11 +97,11 @@ def module_layers(reference: str, stimuli: StimuliInput) -> Layers:
     A layer is the output of a module with weights of its own.
 
     Args:
-        reference: ``module:function``; the function, without arguments, makes a module that takes
-            loads (1, sample, element, channel) float32, N and N m, every 9 ms.
+        reference: ``module:function``; the function, without arguments, returns a torch module that
+            takes loads (1, sample, element, channel) float32, N and N m, every 9 ms.
 
     Raises:
-        ConfigError: no such function, or it makes no module.
+        ConfigError: no such function, or it returns no torch module.
         ModelError: the module cannot be made or run.
     """
     import torch
@@ -117,7 +117,7 @@ def module_layers(reference: str, stimuli: StimuliInput) -> Layers:
     if not isinstance(network, nn.Module):
         raise ConfigError(f"{reference} makes a {type(network).__name__}, not a torch module")
     found: dict[str, list[NDArray[Any]]] = {}
-    for layer, module in _modules_with_weights(network):
+    for layer, module in _find_weighted_modules(network):
         found[layer] = []
 
         def keep(_module: object, _given: object, out: Any, layer: str = layer) -> None:
@@ -135,36 +135,36 @@ def module_layers(reference: str, stimuli: StimuliInput) -> Layers:
             network(torch.from_numpy(one[None].copy()))
     once = {layer: values for layer, values in found.items() if len(values) == len(samples)}
     weights = sum(p.numel() for p in network.parameters())
-    return _layers(name, once, samples.shape[1], weights, "")
+    return _make_layers(name, once, samples.shape[1], weights, "")
 
 
 def fit_loads(stimuli: StimuliInput, shape: Sequence[int | str | None], what: str) -> Floats:
-    """Arrange the loads as an input takes them, resampled in time where its length differs.
+    """Arrange the loads for an input, resampled in time if its length differs.
 
     Args:
-        shape: of the input, batch first; axes of any length are no numbers. Beside the batch it
-            has a time axis, and elements and channels as two axes or as one, in any order.
+        shape: of the input, batch first; axes of any length are no numbers. The others are time,
+            elements and channels in any order, or time and one of both, or one of all three.
         what: the file and the input, for the message.
 
     Returns:
         (6, ...) float32.
 
     Raises:
-        ConfigError: it has no such axes, or a batch of its own.
+        ConfigError: the shape has other axes, or a batch larger than 1.
     """
     loads = stimuli.samples.reshape(len(stimuli.samples), -1, *stimuli.samples.shape[3:])
     _, samples, elements, channels = loads.shape
     batch, *axes = [n if isinstance(n, int) and n > 0 else None for n in shape] or [0]
     both = loads.reshape(len(loads), samples, -1)
-    forms = [  # axes of the stimuli, and how they are put
+    forms = [  # arrays of the loads, and the orders of their axes
         *((loads, order) for order in permutations(range(3))), (both, (0, 1)), (both, (1, 0))
     ]  # fmt: skip
     for values, order in forms if batch in (None, 1) else []:
         if len(order) != len(axes):
             continue
         length = axes[order.index(0)] or samples
-        wanted = [(length, *values.shape[2:])[k] for k in order]
-        if all(n in (None, m) for n, m in zip(axes, wanted, strict=True)):
+        lengths = [(length, *values.shape[2:])[k] for k in order]
+        if all(n in (None, m) for n, m in zip(axes, lengths, strict=True)):
             resampled = _resample(values, length)
             return np.ascontiguousarray(resampled.transpose(0, *(1 + k for k in order)))
     if len(axes) == 1 and axes[0] and axes[0] % both.shape[2] == 0 and batch in (None, 1):
@@ -175,8 +175,8 @@ def fit_loads(stimuli: StimuliInput, shape: Sequence[int | str | None], what: st
     )
 
 
-def _zeros(path: Path, given: ort.NodeArg) -> NDArray[Any]:
-    """Zeros for an input beside the loads, as of a state before the first sample."""
+def _make_zeros(path: Path, given: ort.NodeArg) -> NDArray[Any]:
+    """Return zeros for an input other than the loads, such as an initial state."""
     kind = re.sub(r"tensor\((\w+)\)", r"\1", given.type).replace("float16", "half")
     try:
         dtype = np.dtype({"float": "f4", "half": "f2", "double": "f8"}.get(kind, kind))
@@ -196,7 +196,7 @@ def _resample(values: Floats, length: int) -> Floats:
 
 
 def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
-    """Find the tensors that are layers, by name, in the order of computation."""
+    """Find the tensors that are layers, by layer name, in the order of computation."""
     weights = {i.name: i.name for i in graph.initializer if len(i.dims) > 1}
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
@@ -219,7 +219,7 @@ def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
 
 
 def _name_layer(weight: str, node: onnx.NodeProto, taken: Collection[str]) -> str:
-    """Name a layer by its weight, or by its node if that name is a number."""
+    """Name a layer by its weight, or its node if that name is a number."""
     name = weight if weight and not NUMBERED.fullmatch(weight) else node.name.rpartition("/")[0]
     name = re.sub(r"\.?(weight\w*|kernel|W)$", "", name.strip("/").replace("/", "."))
     name = f"encoder.{name or node.op_type.lower()}"
@@ -227,19 +227,19 @@ def _name_layer(weight: str, node: onnx.NodeProto, taken: Collection[str]) -> st
     return f"{name} {before + 1}" if before else name
 
 
-def _modules_with_weights(network: "nn.Module") -> Iterator[tuple[str, "nn.Module"]]:
+def _find_weighted_modules(network: "nn.Module") -> Iterator[tuple[str, "nn.Module"]]:
     for name, module in network.named_modules():
         if any(True for _ in module.parameters(recurse=False)):
             yield f"encoder.{name or type(module).__name__.lower()}", module
 
 
-def _layers(
+def _make_layers(
     name: str, found: dict[str, list[NDArray[Any]]], samples: int, parameters: int, sha256: str
 ) -> Layers:
-    """Layers of what was computed for one stimulus after the other, by layer."""
+    """Make layers from the outputs of each layer, one array per stimulus."""
     traces = {}
     for layer, values in found.items():
-        trace = np.stack([_by_step(value, samples) for value in values]).astype(np.float32)
+        trace = np.stack([_arrange_by_step(value, samples) for value in values]).astype(np.float32)
         if trace.shape[-1] > 1:
             traces[layer] = trace
     if not traces:
@@ -253,8 +253,8 @@ def _layers(
     )  # fmt: skip
 
 
-def _by_step(value: NDArray[Any], samples: int) -> NDArray[Any]:
-    """Arrange a layer's output as (step, unit): by its axis of samples, else one step."""
+def _arrange_by_step(value: NDArray[Any], samples: int) -> NDArray[Any]:
+    """Arrange a layer's output as (step, unit), by samples if any, else one step."""
     if value.ndim > 2 and value.shape[:2] in ((1, samples), (samples, 1)):
         return value.reshape(samples, -1)
     return value.reshape(1, -1)

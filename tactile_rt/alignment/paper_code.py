@@ -1,22 +1,22 @@
-"""Protocol `paper-code`: the published analysis as its code does it, mistakes included.
+"""Protocol `paper-code`: the analysis of the published code, mistakes included.
 
-It exists so that published numbers can be checked. What it does otherwise than the paper says:
+It exists so that published numbers can be checked. It differs from the paper's text as follows:
 
 - rates count from the start of a trial, not from first contact (`nwb.read_nwb`);
-- the recording's starting time is subtracted from spike times, which NWB has on the session's clock
-  already: the published shift (clock ``recording`` of `nwb.read_nwb`);
+- the recording's starting time is subtracted from spike times, though NWB has them on the session's
+  clock already: the published shift (clock ``recording`` of `nwb.read_nwb`);
 - the stimulus axis is the order of first appearance in each session (`neural.published_layout`);
 - a stimulus that a trial did not show counts as a rate of zero (same place);
 - no neuron is filtered; bootstraps are, by raw r_yy and r_xx >= 0.5 (`reliability.filtered_mean`);
 - the numerator is the RSA of full trial means, not of half 1 against half 2;
 - two negative reliabilities pass for a positive product (`reliability.noise_corrected`);
-- a model's score is its highest over all layers and all targets, the pooled animals among these,
-  not a mean over mice (`scoring.score`);
+- a model's score is its highest over all layers and all targets, including the pooled animals, not
+  a mean over mice (`scoring.score`);
 - raw sensor input is scored by the median without the filter (`Target.unfiltered`), models by the
   mean with it;
-- standard errors divide by the number of values without a degree of freedom for the mean.
+- standard errors use the standard deviation with division by the number of values, not by one less.
 
-Where the published code stops with an assertion (a stimulus without a trial), this one says why.
+Where the published code fails an assertion (a stimulus without a trial), this one names the cause.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ from tactile_rt.alignment.rdm import Floats, pearson, rdm
 from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
-POOLED = "concatenated"  # the published name of all animals as one
+POOLED = "concatenated"  # the published name of the pooled animals
 
 
 def freeze_paper_code(
@@ -39,13 +39,13 @@ def freeze_paper_code(
     seed: int = reliability.SEED,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Benchmark:
-    """Reliabilities and RDMs of animals, and their consistency.
+    """Compute reliabilities and RDMs of animals, and their consistency.
 
     Args:
         rates: (row, 6, unit) per animal, in the published layout.
 
     Raises:
-        ConfigError: no animal has a mean response that makes an RDM; one of several is left out.
+        ConfigError: no animal has an RDM; if only some have none, they are left out with a note.
     """
     steps = 2 * len(rates) + 1
     targets: list[Target] = []
@@ -54,7 +54,7 @@ def freeze_paper_code(
     done = 0
     for name in rates:
         try:
-            targets.append(_target(name, rates[name], bootstraps, seed, halves))
+            targets.append(_freeze_target(name, rates[name], bootstraps, seed, halves))
         except ConfigError as error:
             notes.append(f"{error}: left out")
         progress((done := done + 1) / steps)
@@ -64,7 +64,7 @@ def freeze_paper_code(
     rates = {name: rates[name] for name in names}
     pooled = None
     if len(names) > 1:
-        pooled = _target(POOLED, pad(list(rates.values())), bootstraps, seed, halves)
+        pooled = _freeze_target(POOLED, pad(list(rates.values())), bootstraps, seed, halves)
     progress((done := done + 1) / steps)
 
     held_out = np.full(len(names), np.nan)
@@ -72,14 +72,14 @@ def freeze_paper_code(
         others = [rates[other] for other in names if other != name]
         if others:
             source = pad(others)
-            r_xx = _split_half(source, bootstraps, seed)
+            r_xx = _correlate_halves(source, bootstraps, seed)
             r_xy = pearson(rdm(reliability.trial_mean(source)), targets[i].chosen.rdm)
-            held_out[i] = _score(r_xy, r_xx, halves[name])
+            held_out[i] = _compute_score(r_xy, r_xx, halves[name])
         progress((done := done + 1) / steps)
     pairwise = np.full((len(names), len(names)), np.nan)
     for i, j in zip(*np.nonzero(~np.eye(len(names), dtype=bool)), strict=True):
         r_xy = pearson(targets[i].chosen.rdm, targets[j].chosen.rdm)
-        pairwise[i, j] = _score(r_xy, halves[names[i]], halves[names[j]])
+        pairwise[i, j] = _compute_score(r_xy, halves[names[i]], halves[names[j]])
     return Benchmark(
         protocol="paper-code",
         targets=tuple(targets),
@@ -91,10 +91,10 @@ def freeze_paper_code(
     )
 
 
-def _target(
+def _freeze_target(
     name: str, rates: Floats, bootstraps: int, seed: int, halves: dict[str, Floats]
 ) -> Target:
-    """Freeze one target; its split-half correlations go into `halves`."""
+    """Freeze one target, and store its split-half correlations in `halves`."""
     mean = reliability.trial_mean(rates)
     dissimilarities = rdm(mean)
     if not np.isfinite(dissimilarities).all():
@@ -103,10 +103,10 @@ def _target(
             f"animal {name}: no RDM, since the mean response to stimulus "
             f"{', '.join(str(STIMULI.index(s)) for s in where)} is missing or the same in all units"
         )
-    r_yy = halves[name] = _split_half(rates, bootstraps, seed)
+    r_yy = halves[name] = _correlate_halves(rates, bootstraps, seed)
     factor = reliability.noise_corrected(1.0, 1.0, r_yy)
-    there = r_yy[np.isfinite(r_yy)]
-    corrected = float(reliability.spearman_brown(there.mean())) if there.size else np.nan
+    finite = r_yy[np.isfinite(r_yy)]
+    corrected = float(reliability.spearman_brown(finite.mean())) if finite.size else np.nan
     usable = factor[np.isfinite(factor)]
     filtered = reliability.filtered_mean(factor, r_yy)
     units = rates.shape[2]
@@ -125,9 +125,9 @@ def _target(
     )
 
 
-def _split_half(rates: Floats, bootstraps: int, seed: int) -> Floats:
+def _correlate_halves(rates: Floats, bootstraps: int, seed: int) -> Floats:
     return reliability.split_half(rates, reliability.first_halves(len(rates), bootstraps, seed))
 
 
-def _score(r_xy: Floats, r_xx: Floats, r_yy: Floats) -> float:
+def _compute_score(r_xy: Floats, r_xx: Floats, r_yy: Floats) -> float:
     return reliability.filtered_mean(reliability.noise_corrected(r_xy, r_xx, r_yy), r_yy, r_xx)

@@ -1,4 +1,4 @@
-"""Figures of the report, drawn by matplotlib as SVG for the page."""
+"""Figures of the report, drawn by matplotlib as SVG."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ MAPS_A_ROW = 4
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar, hatched where its value is NaN."""
+    """A bar with dots, a mark and a frame; hatched if its value is NaN."""
 
     name: str
     value: float
@@ -35,7 +35,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Level:
-    """A horizontal line, or a band where `half` is above 0."""
+    """A horizontal line, with a band of `half` to both sides if above 0."""
 
     name: str
     value: float
@@ -46,7 +46,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Point:
-    """One model in a scatter plot; models of one `group` share a colour and a line."""
+    """A model in a scatter plot; those of one `group` share a colour and line."""
 
     name: str
     x: float
@@ -56,8 +56,8 @@ class Point:
 
 
 def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> str:
-    """Draw bars side by side, with lines and bands that the legend names."""
-    figure, axes = _start(9.5, 4.6)
+    """Draw bars side by side, with lines and bands that are named in the legend."""
+    figure, axes = _start_figure(9.5, 4.6)
     for level in levels:
         if not isfinite(level.value):
             continue
@@ -71,7 +71,7 @@ def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> st
             axes.bar(k, bar.value, 0.7, color=colour, edgecolor=INK, linewidth=2 * bar.ring)
         else:
             axes.axvspan(k - 0.35, k + 0.35, facecolor=MISSING, hatch="//", edgecolor="white")
-        # Always alike: an animal keeps its place from bar to bar.
+        # Without random jitter, so that an animal keeps its place from bar to bar.
         places = k + 0.5 * ((np.arange(len(bar.dots)) + 0.5) / max(len(bar.dots), 1) - 0.5)
         axes.plot(places, bar.dots, "o", color="white", markeredgecolor=INK, markersize=4)
         if isfinite(bar.mark):
@@ -82,15 +82,12 @@ def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> st
     axes.axhline(0, color="0.5", linewidth=0.8)
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside upper right", ncols=3, fontsize=8)
-    return _finish(figure)
+    return _finish_figure(figure)
 
 
 def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool = False) -> str:
-    """Draw named models, and the least-squares line through three or more.
-
-    Each of several groups has a line of its own.
-    """
-    figure, axes = _start(7.2, 4.2)
+    """Draw named models, and a least-squares line for each group of three or more."""
+    figure, axes = _start_figure(7.2, 4.2)
     for group in dict.fromkeys(p.group for p in points):
         of = [p for p in points if p.group == group]
         xs, ys = np.array([p.x for p in of]), np.array([p.y for p in of])
@@ -108,7 +105,7 @@ def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool 
         )
     for point in points:
         axes.annotate(
-            _plain(point.name), (point.x, point.y), (6, 5), textcoords="offset points", fontsize=8
+            _escape(point.name), (point.x, point.y), (6, 5), textcoords="offset points", fontsize=8
         )
     if log:
         axes.set_xscale("log")
@@ -118,31 +115,31 @@ def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool 
     axes.set_xlabel(x_title)
     axes.set_ylabel(y_title)
     axes.legend(fontsize=8)
-    return _finish(figure)
+    return _finish_figure(figure)
 
 
 def draw_profiles(series: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
     """Draw RDMs (pair,) as lines over the pairs of stimuli, scaled to spread 1.
 
-    Their correlation, which is what is compared, is that of the lines as they are drawn. An RDM
-    with a NaN, or of equals, has none. The first is what the others are compared with.
+    The correlation of two RDMs is that of their lines as drawn. An RDM that is constant or has a
+    NaN gets no line. The first series is the one that the others are compared with.
     """
-    figure, axes = _start(9.5, 5.2)
+    figure, axes = _start_figure(9.5, 5.2)
     for k, (name, values) in enumerate(series):
         spread = float(np.std(values))
         if isfinite(spread) and spread > 0:
             line = (values - np.mean(values)) / spread
             colour, width = (INK, 3) if k == 0 else (f"C{k - 1}", 1.5)
-            axes.plot(line, "o-", label=_plain(name), color=colour, linewidth=width)
+            axes.plot(line, "o-", label=_escape(name), color=colour, linewidth=width)
     pairs = [f"{a} and {b}" for a, b in combinations(names, 2)]
     axes.set_xticks(range(len(pairs)), pairs, rotation=70, ha="right", fontsize=8)
     axes.set_ylabel("dissimilarity, scaled")
     axes.legend(fontsize=8)
-    return _finish(figure)
+    return _finish_figure(figure)
 
 
 def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
-    """Draw RDMs (pair,), each darkest where it is largest; grey with a NaN."""
+    """Draw RDMs (pair,), each darkest where it is largest; plain grey with any NaN."""
     rows = ceil(len(maps) / MAPS_A_ROW)
     figure = Figure(figsize=(9.5, 2.2 * rows + 0.9), layout="constrained")
     panels = figure.subplots(rows, MAPS_A_ROW, squeeze=False)
@@ -152,7 +149,7 @@ def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> 
         panel = panels.flat[k]
         panel.set_axis_on()
         panel.set_facecolor(MISSING)
-        panel.set_title(_plain(title), fontsize=8)
+        panel.set_title(_escape(title), fontsize=8)
         if np.isfinite(entries).all():
             panel.pcolormesh(square(entries), cmap="Blues", vmin=0)
         panel.set(aspect="equal", xlim=(0, len(names)), ylim=(len(names), 0))
@@ -162,23 +159,23 @@ def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> 
         panel.set_xticks(
             at, names if below else [""] * len(names), fontsize=6, rotation=45, ha="right"
         )
-    return _finish(figure)
+    return _finish_figure(figure)
 
 
-def _start(width: float, height: float) -> tuple[Figure, Axes]:
+def _start_figure(width: float, height: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots()
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
 
 
-def _plain(text: str) -> str:
-    """Text without the signs that matplotlib takes for mathematics."""
+def _escape(text: str) -> str:
+    """Escape the dollar signs of a text, which matplotlib takes for mathematics."""
     return text.replace("$", r"\$")
 
 
-def _finish(figure: Figure) -> str:
-    """The figure as an element of a page, alike whenever it is drawn."""
+def _finish_figure(figure: Figure) -> str:
+    """Return a figure as an SVG element, the same bytes for the same figure."""
     out = StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "tactile_rt"}):
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})

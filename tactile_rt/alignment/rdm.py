@@ -1,8 +1,8 @@
 """Representational dissimilarity matrices (RDMs) of stimuli, and their comparison.
 
-An RDM of n stimuli is its n (n - 1) / 2 entries above the diagonal, row by row, 15 of the six
-stimuli: 1 - Pearson's r over units between the mean responses to two stimuli. RSA is Pearson's r
-between two RDMs (Chung et al. 2025, section Neural Evaluation; Kriegeskorte 2008).
+An RDM of n stimuli is stored as its n (n - 1) / 2 entries above the diagonal, row by row, 15 for
+six stimuli: 1 - Pearson's r over units between the mean responses to two stimuli. RSA is Pearson's
+r between two RDMs (Chung et al. 2025, section Neural Evaluation; Kriegeskorte 2008).
 """
 
 import math
@@ -17,16 +17,16 @@ from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
 Floats = NDArray[np.float64]
 
-# The paper says near where the recordings say close.
+# The paper's name of a distance, and that of the recordings.
 SYNONYMS = {"near": "close"}
-# Centred values below this share of the values themselves are rounding: the vector is constant.
+# Vectors whose centred values are below this share of the values are constant, but for rounding.
 CONSTANT = 1e-13
-EXACT = 7  # stimuli: of so many all relabellings are taken, of more so many are drawn
-DRAWN = 5000
+EXACT = 7  # stimuli for which all relabellings are used, at most
+DRAWN = 5000  # relabellings that are drawn for more stimuli
 
 
 def stimulus_index(shape: str, distance: str) -> int:
-    """Place of a stimulus on the named axis; ``near`` is ``close``."""
+    """Return the index of a stimulus in `STIMULI`; ``near`` is ``close``."""
     distance = SYNONYMS.get(distance, distance)
     if shape not in SHAPES:
         raise ConfigError(f"no shape {shape!r}: there are {', '.join(SHAPES)}")
@@ -42,12 +42,12 @@ def upper(stimuli: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def count_stimuli(entries: int) -> int:
-    """Return of how many stimuli an RDM of so many entries is."""
+    """Return the number of stimuli of an RDM with the given number of entries."""
     return (1 + math.isqrt(1 + 8 * entries)) // 2
 
 
 def rdm(patterns: ArrayLike) -> Floats:
-    """RDM of responses.
+    """Compute the RDM of responses.
 
     Args:
         patterns: (..., stimulus, unit), any finite scale; at least two units.
@@ -62,7 +62,7 @@ def rdm(patterns: ArrayLike) -> Floats:
 
 
 def pearson(a: ArrayLike, b: ArrayLike) -> Floats:
-    """Pearson's r along the last axis of (..., n) and (..., n), which broadcast.
+    """Compute Pearson's r along the last axis of (..., n) and (..., n), which broadcast.
 
     Returns:
         (...), NaN where a vector is constant or not finite.
@@ -71,7 +71,7 @@ def pearson(a: ArrayLike, b: ArrayLike) -> Floats:
 
 
 def rsa(a: ArrayLike, b: ArrayLike) -> float:
-    """RSA of two sets of responses (stimulus, unit), with numbers of units of their own."""
+    """Compute the RSA of two sets of responses (stimulus, unit), which may differ in units."""
     return float(pearson(rdm(a), rdm(b)))
 
 
@@ -87,13 +87,13 @@ def square(rdms: ArrayLike) -> Floats:
 
 @cache
 def relabellings(stimuli: int) -> NDArray[np.intp]:
-    """Relabel stimuli in every way, as reorderings of an RDM's entries.
+    """Return all relabellings of stimuli, as reorderings of an RDM's entries.
 
-    Of more than `EXACT` stimuli, `DRAWN` ways are drawn, always the same ones.
+    For more than `EXACT` stimuli, it returns a fixed random sample of `DRAWN`.
 
     Returns:
-        (way, pair), 720 ways of six stimuli: ``rdms[..., relabellings(6)[k]]`` are the RDMs after
-        the k-th; the first changes nothing.
+        (way, pair), 720 ways for six stimuli: ``rdms[..., relabellings(6)[k]]`` are the RDMs after
+        relabelling k; the first is the identity.
     """
     i, j = upper(stimuli)
     place = square(np.arange(len(i), dtype=np.float64)).astype(np.intp)
@@ -109,7 +109,7 @@ def relabellings(stimuli: int) -> NDArray[np.intp]:
 
 
 def normalised(values: ArrayLike) -> Floats:
-    """Vectors (..., n) centred and of length one: their products are Pearson's r.
+    """Centre vectors (..., n) and scale them to length one: products are Pearson's r.
 
     Returns:
         (..., n), NaN throughout a vector that is constant or not finite.

@@ -1,8 +1,8 @@
 """Split-half reliability of RDMs, vectorised over bootstraps, and the correction for noise.
 
-A bootstrap assigns half of the rows (trials) at random to each half; the RDMs of the two half-means
-correlate by r. Spearman-Brown, 2r / (1 + r), is the reliability of the mean of all rows. The score
-of a source x against a target y is r_xy / sqrt(SB(r_xx) SB(r_yy)) (Chung et al. 2025, equation in
+A bootstrap divides the rows (trials) at random into two halves; r is the correlation of the RDMs of
+the two half-means. Spearman-Brown, 2r / (1 + r), is the reliability of the mean of all rows. A
+source x scores r_xy / sqrt(SB(r_xx) SB(r_yy)) against a target y (Chung et al. 2025, equation in
 section Neural Evaluation, with the numerator of the published code: RSA of full trial means).
 """
 
@@ -17,26 +17,25 @@ from tactile_rt.core.errors import ConfigError
 BOOTSTRAPS = 1000
 SEED = 1234  # of the first bootstrap in the published analysis
 CUTOFF = 0.5
-NOUGHT = 1e-8  # a product of reliabilities below this is zero: the score would be rounding
-# Bootstraps at a time: half-means of this many stay in a processor's cache.
-AT_ONCE = 64
+NOUGHT = 1e-8  # a product of reliabilities up to this is zero: the score would be rounding error
+AT_ONCE = 64  # bootstraps per batch: their half-means fit a processor's cache
 
 
 def spearman_brown(r: ArrayLike) -> Floats:
-    """Reliability of twice as many trials: 2r / (1 + r); -inf at r = -1."""
+    """Return the reliability for twice the trials: 2r / (1 + r), -inf for -1."""
     r = np.asarray(r, dtype=np.float64)
     with np.errstate(divide="ignore"):
         return np.asarray(2 * r / (1 + r))
 
 
 def noise_corrected(r_xy: ArrayLike, r_xx: ArrayLike, r_yy: ArrayLike) -> Floats:
-    """Score r_xy / sqrt(SB(r_xx) SB(r_yy)); arrays broadcast.
+    """Compute the score r_xy / sqrt(SB(r_xx) SB(r_yy)); arrays broadcast.
 
-    Two negative reliabilities make a positive product, and a finite score that means nothing:
-    whoever cannot rule them out checks the signs.
+    Two negative reliabilities make a positive product, and a finite score without meaning: check
+    the signs if that can happen.
 
     Returns:
-        NaN where the product under the root is negative, nearly zero or not finite.
+        The score; NaN where the product under the root is negative, nearly zero or not finite.
     """
     with np.errstate(invalid="ignore"):
         product = spearman_brown(r_xx) * spearman_brown(r_yy)
@@ -46,13 +45,13 @@ def noise_corrected(r_xy: ArrayLike, r_xx: ArrayLike, r_yy: ArrayLike) -> Floats
 
 @lru_cache(maxsize=32)
 def first_halves(rows: int, bootstraps: int = BOOTSTRAPS, seed: int = SEED) -> NDArray[np.bool_]:
-    """Which rows are in the first half, as in the published analysis.
+    """Draw the rows of the first half for every bootstrap, as in the published analysis.
 
     Bootstrap b shuffles the rows with the Mersenne twister of seed ``seed + b``; the first
-    ``rows // 2`` make the first half. Rows of padding count.
+    ``rows // 2`` make the first half. Padding rows count too.
 
     Returns:
-        (bootstrap, row), read-only.
+        (bootstrap, row), True for rows in the first half; read-only.
     """
     first = np.zeros((bootstraps, rows), dtype=np.bool_)
     generator = np.random.RandomState()
@@ -64,37 +63,37 @@ def first_halves(rows: int, bootstraps: int = BOOTSTRAPS, seed: int = SEED) -> N
 
 
 def trial_mean(rates: ArrayLike) -> Floats:
-    """Mean over rows of (row, 6, unit), NaN left out: (6, unit), NaN where there is no value."""
+    """Average the finite rates of (row, 6, unit) over rows; NaN without any."""
     rates = np.asarray(rates, dtype=np.float64)
-    there = np.isfinite(rates)
-    return _ratio(np.where(there, rates, 0).sum(axis=0), there.sum(axis=0))
+    finite = np.isfinite(rates)
+    return _divide_by_count(np.where(finite, rates, 0).sum(axis=0), finite.sum(axis=0))
 
 
 def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
-    """RDMs of the two half-means of every bootstrap.
+    """Compute the RDMs of the two half-means of every bootstrap.
 
     Args:
-        rates: (row, 6, unit), NaN where there is no value.
-        first: (bootstrap, row), whether a row is in the first half.
+        rates: (row, 6, unit), NaN for missing values.
+        first: (bootstrap, row), True for rows in the first half.
 
     Returns:
-        (bootstrap, 2, pair). A bootstrap with a half-mean that is not finite is NaN throughout.
+        (bootstrap, 2, pair). A bootstrap is all NaN if any of its half-means is not finite.
     """
     rates = np.asarray(rates, dtype=np.float64)
     if rates.ndim != 3 or first.ndim != 2 or rates.shape[0] != first.shape[1]:
         raise ConfigError(f"rates {rates.shape} and halves {first.shape} do not fit")
     rows = rates.shape[0]
     flat = rates.reshape(rows, -1)
-    there = np.isfinite(flat)
-    values = np.where(there, flat, 0)
-    # Sessions are padded to one length, so few columns differ in where they have values.
-    patterns, column = _distinct_columns(there)
+    finite = np.isfinite(flat)
+    values = np.where(finite, flat, 0)
+    # Sessions are padded to one length, so there are few patterns of missing values.
+    patterns, column = _find_distinct_columns(finite)
     result = np.empty((first.shape[0], 2, len(upper(rates.shape[1])[0])))
     for begin in range(0, first.shape[0], AT_ONCE):
         part = first[begin : begin + AT_ONCE]
-        # Both halves are summed: a difference from the total would turn zeros into rounding.
+        # Both halves are summed, since differences from the total would make zeros inexact.
         weights = np.stack([part, ~part], axis=1).reshape(-1, rows).astype(np.float64)
-        means = _ratio(weights @ values, (weights @ patterns)[:, column])
+        means = _divide_by_count(weights @ values, (weights @ patterns)[:, column])
         means = means.reshape(-1, 2, *rates.shape[1:])
         kept = np.isfinite(means).all(axis=(1, 2, 3))
         result[begin : begin + AT_ONCE] = np.nan
@@ -104,23 +103,23 @@ def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
 
 
 def split_half(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
-    """Pearson's r between the RDMs of the halves, (bootstrap,); NaN where it was dropped."""
+    """Correlate the RDMs of the halves: (bootstrap,); NaN where a half-mean is not finite."""
     halves = half_rdms(rates, first)
     return pearson(halves[:, 0], halves[:, 1])
 
 
 def filtered_mean(score: ArrayLike, r_yy: ArrayLike, r_xx: ArrayLike = 1.0) -> float:
-    """The published aggregate: mean of a score over the bootstraps that pass the filter.
+    """Average a score over the bootstraps that pass the published filter.
 
-    The filter, at `CUTOFF`, is on raw split-half correlations of whole bootstraps. No neuron is
-    ever filtered, and no Spearman-Brown correction is made, though the paper's text says both.
+    The filter keeps bootstraps by their raw split-half correlations, at `CUTOFF`. It filters no
+    neurons and makes no Spearman-Brown correction, though the paper's text states both.
 
     Args:
-        score: (bootstrap,), NaN where there is none.
+        score: (bootstrap,), NaN if missing.
         r_yy, r_xx: (bootstrap,) of target and source; a model's own is 1.
 
     Returns:
-        NaN if no bootstrap is left.
+        The mean; NaN if no bootstrap is left.
     """
     score, r_yy, r_xx = np.broadcast_arrays(score, r_yy, r_xx)
     # As published, NaN is not below the cutoff; its score is NaN as well.
@@ -128,14 +127,14 @@ def filtered_mean(score: ArrayLike, r_yy: ArrayLike, r_xx: ArrayLike = 1.0) -> f
     return float(kept.mean()) if kept.size else float("nan")
 
 
-def _ratio(total: Floats, number: NDArray[np.generic]) -> Floats:
+def _divide_by_count(total: Floats, number: NDArray[np.generic]) -> Floats:
     count = np.asarray(number, dtype=np.float64)
     return np.asarray(total / np.where(count > 0, count, np.nan))
 
 
-def _distinct_columns(there: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.intp]]:
-    """The different columns of (row, column) and which of them each column is."""
-    packed = np.ascontiguousarray(np.packbits(there, axis=0).T)
+def _find_distinct_columns(mask: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.intp]]:
+    """Return the distinct columns of a mask (row, column) and their index for each column."""
+    packed = np.ascontiguousarray(np.packbits(mask, axis=0).T)
     keys = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
     _, index, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    return there[:, index].astype(np.float64), np.asarray(inverse.ravel(), dtype=np.intp)
+    return mask[:, index].astype(np.float64), np.asarray(inverse.ravel(), dtype=np.intp)

@@ -1,4 +1,4 @@
-"""The report: scores of models on one page."""
+"""The report of models' scores as one HTML page."""
 
 import math
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ def _introduce(results: Results) -> str:
 def _summarise(results: Results) -> str:
     rows = [
         [
-            escape(model.name), f"<b>{_with_error(model)}</b>", format_number(model.p, 4),
+            escape(model.name), f"<b>{_format_score(model)}</b>", format_number(model.p, 4),
             format_number(model.null_95),
             format_number(model.untrained.score) if model.untrained else "",
             f"{model.parameters:,}" if model.parameters else "", VERDICTS.get(model.turing, ""),
@@ -100,7 +100,7 @@ def _summarise(results: Results) -> str:
         f"<br><small>highest {format_number(a2a.highest)}</small>"
     )
     if results.raw:
-        rows.append([RAW, _with_error(results.raw), format_number(results.raw.p, 4), *[""] * 4])
+        rows.append([RAW, _format_score(results.raw), format_number(results.raw.p, 4), *[""] * 4])
     rows.append(["an animal, from the others", between, *[""] * 5])
     head = ["model", SCORE, "p", "chance, 95th percentile", "untrained", SIZE]
     why = [f"{model.name}: {model.turing_why}" for model in results.models if model.turing_why]
@@ -128,7 +128,7 @@ def _show_layers(results: Results, model: ModelResult) -> str:
     chance = pictures.Level("chance, 95th percentile", model.null_95, "#9a5bb5", dash="--")
     drawn = pictures.draw_bars(columns, [*_levels(results), chance], "fit (noise-corrected r)")
     return (
-        f"<h3>{escape(model.name)} <small>score {_with_error(model)}, "
+        f"<h3>{escape(model.name)} <small>score {_format_score(model)}, "
         f"p {format_number(model.p, 4)}</small></h3>{drawn}{join_notes(model.notes)}"
     )
 
@@ -145,14 +145,14 @@ def _compare(results: Results) -> str:
     title = f"{PERFORMANCE} ({what})" if what else PERFORMANCE
     for by, word in (("", ""), ("objective", ", by loss"), ("augmentation", ", by augmentation")):
         if len(fits) > 1 and (not by or _differ(fits, by)):
-            points = [_point(m, m.performance, by) for m in fits]
+            points = [_make_point(m, m.performance, by) for m in fits]
             out.append(f"<h3>Neural fit against task performance{word}</h3>")
             out.append(pictures.draw_scatter(points, title, SCORE))
     sized = [m for m in results.models if m.parameters > 0 and math.isfinite(m.score)]
     if len(sized) > 1:
         by = "encoder" if _differ(sized, "encoder") else ""
         out.append(f"<h3>Neural fit against size{', by encoder' * bool(by)}</h3>")
-        points = [_point(m, m.parameters, by) for m in sized]
+        points = [_make_point(m, m.parameters, by) for m in sized]
         out.append(pictures.draw_scatter(points, SIZE, SCORE, log=True))
     both = [m for m in known if m.parameters > 0]
     if len(both) > 1:
@@ -168,13 +168,13 @@ def _differ(models: Sequence[ModelResult], by: str) -> bool:
     return len({m.groups.get(by) for m in models}) > 1
 
 
-def _point(model: ModelResult, x: float, by: str) -> pictures.Point:
+def _make_point(model: ModelResult, x: float, by: str) -> pictures.Point:
     error = model.sem if math.isfinite(model.sem) else 0.0
     return pictures.Point(model.name, x, model.score, error, model.groups.get(by, ""))
 
 
 def _compare_masking(results: Results) -> str:
-    """Models that differ in the masking of steps alone, beside each other."""
+    """Show a table of models that differ only in the masking of steps."""
     families: dict[tuple[tuple[str, str], ...], list[tuple[float, ModelResult]]] = {}
     for model in results.models:
         try:
@@ -184,7 +184,7 @@ def _compare_masking(results: Results) -> str:
         rest = tuple(sorted((k, v) for k, v in model.groups.items() if k != "masking"))
         families.setdefault(rest, []).append((share, model))
     rows = [
-        [escape(m.name), f"{100 * share:g} %", format_number(m.performance), _with_error(m)]
+        [escape(m.name), f"{100 * share:g} %", format_number(m.performance), _format_score(m)]
         for models in families.values()
         if len({share for share, _ in models}) > 1
         for share, m in sorted(models, key=lambda pair: pair[0])
@@ -252,6 +252,7 @@ def _show_animals(results: Results) -> str:
 
 
 def _levels(results: Results) -> list[pictures.Level]:
+    """Make a bar plot's lines and bands: the noise limit and animal to animal."""
     a2a = results.benchmark.a2a
     half = a2a.sem if math.isfinite(a2a.sem) else 0.0
     return [
@@ -261,7 +262,7 @@ def _levels(results: Results) -> list[pictures.Level]:
 
 
 def _raw_bars(results: Results) -> list[pictures.Bar]:
-    """The bar of the loads themselves, where there are any."""
+    """Make the bar of the raw sensor input, if the results have it."""
     if (raw := results.raw) is None:
         return []
     fits = raw.corrected[0][list(raw.reliable)]
@@ -269,10 +270,10 @@ def _raw_bars(results: Results) -> list[pictures.Bar]:
 
 
 def _mean_fits(made: Score) -> list[float]:
-    """Mean over the reliable targets of each layer's fit; NaN without any."""
+    """Average each layer's fit over the reliable targets; NaN without a fit."""
     rows = made.corrected[:, list(made.reliable)]
     return [float(row.mean()) if (row := r[np.isfinite(r)]).size else math.nan for r in rows]
 
 
-def _with_error(made: Score) -> str:
+def _format_score(made: Score) -> str:
     return f"{format_number(made.score)} ± {format_number(made.sem)}"

@@ -1,4 +1,4 @@
-"""Scores at rest: one JSON file that a report is drawn from and a gate compares with."""
+"""Stored scores: a JSON file for the report, and a baseline for the gate."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from tactile_rt.core.stream.stimuli import STIMULI
 
 
 class ModelResult(Score, frozen=True, eq=False, kw_only=True):
-    """Everything that is shown of a model: its score, and fields as in `layers.Layers`."""
+    """All results that are shown for a model: its score, and fields as in `layers.Layers`."""
 
     name: str
     sha256: str
@@ -32,8 +32,8 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
     performance_of: str = ""
     untrained: Score | None = None
     notes: tuple[str, ...] = ()
-    # groups that the model belongs to, by what they divide models by: encoder, attender, objective,
-    # augmentation, masking; without those that are not known
+    # groups of the model by their criterion: encoder, attender, objective, augmentation, masking;
+    # without unknown ones
     groups: dict[str, str] = msgspec.field(default_factory=dict)
     # verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty under paper-code
     turing: str = ""
@@ -43,18 +43,18 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
 class Results(
     msgspec.Struct, frozen=True, eq=False, tag_field="kind", tag="tactile_rt alignment scores 2"
 ):
-    """One file of scores."""
+    """The content of a file of scores."""
 
     benchmark: Benchmark
     models: tuple[ModelResult, ...]
-    raw: Score | None  # of the loads; None where the stimuli are not the six that are whisked
+    raw: Score | None  # score of the loads; None if the stimuli are not the six whisked ones
     input: dict[str, str]
 
 
 def results_of(
     benchmark: Benchmark, stimuli: StimuliInput, models: Sequence[ModelResult]
 ) -> Results:
-    """Scores of models on one benchmark, the sensors themselves beside them."""
+    """Collect models' scores on a benchmark, with the score of the raw sensor input."""
     if benchmark.stimuli != STIMULI:
         return Results(benchmark, tuple(models), None, {})
     raw = score(benchmark, {"raw": stimuli.raw()})
@@ -67,10 +67,10 @@ def model_result(
     untrained: Layers | None = None,
     performance: tuple[float, str] | None = None,
 ) -> ModelResult:
-    """Score a model."""
+    """Score a model's layers, and run the Turing test if the protocol is strict."""
     patterns = layers.patterns
     made = score(benchmark, patterns)
-    # The test takes stimuli by their names, which paper-code has lost.
+    # The test needs the stimuli's names, which paper-code does not have.
     checks = neural_checks(made, benchmark) if benchmark.protocol == "strict" else ()
     test = next((check for check in checks if check.name == "turing"), None)
     accuracy, measured_on = performance or (math.nan, "")
@@ -85,22 +85,22 @@ def model_result(
         performance=accuracy,
         performance_of=measured_on,
         untrained=score(benchmark, untrained.patterns) if untrained else None,
-        notes=(*layers.notes, *_without_rdm(patterns, benchmark.stimuli)),
-        groups=_groups(layers),
+        notes=(*layers.notes, *_note_missing_rdms(patterns, benchmark.stimuli)),
+        groups=_read_groups(layers),
         turing=test.verdict if test else "",
         turing_why=test.why if test else "",
     )
 
 
-def _without_rdm(
+def _note_missing_rdms(
     patterns: Mapping[str, NDArray[np.float64]], names: Sequence[str]
 ) -> Iterator[str]:
-    """What takes no part in a score, and why: a line for all layers of one reason."""
+    """Yield notes on layers without an RDM and so without score, one per cause."""
     found: dict[tuple[str, ...], list[str]] = {}
     for layer, responses in patterns.items():
-        there = np.asarray(np.isfinite(normalised(responses)).all(axis=1))
-        if not there.all():
-            alike = tuple(s for s, one in zip(names, there, strict=True) if not one)
+        varies = np.asarray(np.isfinite(normalised(responses)).all(axis=1))
+        if not varies.all():
+            alike = tuple(s for s, good in zip(names, varies, strict=True) if not good)
             found.setdefault(alike, []).append(layer)
     for alike, layers in found.items():
         stimuli = "every stimulus" if len(alike) == len(names) else ", ".join(alike)
@@ -111,7 +111,7 @@ def _without_rdm(
 
 
 def read_results(path: Path) -> Results:
-    """Read scores from the JSON that `tactile-rt align score` writes."""
+    """Read scores from the JSON file of `tactile-rt align score`."""
     results = read_json(path, Results, "tactile-rt align score --json")
     check_benchmark(results.benchmark, path)
     targets = tuple(t.name for t in results.benchmark.all_targets)
@@ -144,10 +144,10 @@ def _check_score(
 
 
 def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floats:
-    """RDMs (layer, pair) of the one model in a file of scores on this benchmark and these stimuli.
+    """Read the RDMs (layer, pair) of the only model in a file of scores.
 
     Raises:
-        ConfigError: unreadable, of several models, or of another benchmark or other stimuli.
+        ConfigError: the file is unreadable, has several models, or another benchmark or stimuli.
     """
     results = read_results(path)
     if len(results.models) != 1:
@@ -162,11 +162,11 @@ def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floa
     return results.models[0].rdms
 
 
-def _groups(layers: Layers) -> dict[str, str]:
-    told = {key: layers.network.get(key) for key in ("encoder", "attender")}
-    told |= {key: layers.training.get(key) for key in ("objective", "augmentation", "masking")}
+def _read_groups(layers: Layers) -> dict[str, str]:
+    known = {key: layers.network.get(key) for key in ("encoder", "attender")}
+    known |= {key: layers.training.get(key) for key in ("objective", "augmentation", "masking")}
     return {
         key: f"{value:g}" if isinstance(value, float) else str(value)
-        for key, value in told.items()
+        for key, value in known.items()
         if value is not None
     }

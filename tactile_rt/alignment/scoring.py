@@ -15,7 +15,7 @@ from tactile_rt.core.stream.stimuli import STIMULI
 
 
 class Score(msgspec.Struct, frozen=True, eq=False):
-    """How well a model's layers fit a benchmark's targets.
+    """Fits of a model's layers to a benchmark's targets, and the score.
 
     Attributes:
         targets: The names of the targets; for paper-code the pooled animals are the last.
@@ -26,12 +26,12 @@ class Score(msgspec.Struct, frozen=True, eq=False):
         unfiltered: (layer, target) Corrected correlations without the protocol's filter of units.
         reliable: (target,) Whether each target counts in the score.
         chosen: The names of the chosen layers: for strict, per target the layer that is best on all
-            other animals, "" where there is none; for paper-code, the one layer of the score.
+            other animals, "" if none can be chosen; for paper-code, the layer of the score.
         per_target: (target,) The chosen layer's corrected correlation; NaN for unreliable targets.
         score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
             `corrected`.
-        p: The share of relabellings of the stimuli, layers chosen anew, that reach the score: of
-            six stimuli at least 1/720.
+        p: The share of relabellings of the stimuli, with layers chosen anew for each, that reach
+            the score; for six stimuli at least 1/720.
     """
 
     protocol: str
@@ -51,7 +51,7 @@ class Score(msgspec.Struct, frozen=True, eq=False):
 
 
 def layer_rdms(layers: Mapping[str, ArrayLike], stimuli: int = len(STIMULI)) -> Floats:
-    """Compute RDMs (layer, pair) of responses (stimulus, unit); NaN of a single unit's."""
+    """Compute RDMs (layer, pair) of responses (stimulus, unit); NaN if there is one unit."""
     rdms = np.empty((len(layers), len(upper(stimuli)[0])))
     for i, (name, values) in enumerate(layers.items()):
         patterns = np.asarray(values, dtype=np.float64)
@@ -91,9 +91,9 @@ def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> S
         chosen[reliable] = np.where(best >= 0, finite[best] if finite.size else -1, -1)
     elif values.size:
         chosen[:] = finite[np.unravel_index(np.argmax(values), values.shape)[0]]
-    there = (chosen >= 0) & reliable
+    scored = (chosen >= 0) & reliable
     per_target = np.full(len(targets), np.nan)
-    per_target[there] = corrected[chosen[there], np.flatnonzero(there)]
+    per_target[scored] = corrected[chosen[scored], np.flatnonzero(scored)]
     measure = statistics.mean_held_out if strict else statistics.highest
     test = statistics.max_statistic(rdms, goal[reliable], factor[reliable], measure)
     return Score(

@@ -1,4 +1,4 @@
-"""Which recordings and which of their units a benchmark is made of."""
+"""Selection of the recordings and units that a benchmark is made of."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +14,8 @@ from tactile_rt.core.settings import no_such
 
 TASKS = ("discrimination", "detection")
 CELLS = ("excitatory", "inhibitory")
-# Depth below the pia in um, as the recordings' author draws them (github.com/cxrodgers/my,
-# plot.py); he calls what is below 1366 um L6b.
+# Depth below the pia in um, as drawn by the recordings' author (github.com/cxrodgers/my,
+# plot.py), who calls the depths below 1366 um L6b.
 LAYERS_UM = {
     "L1": (0.0, 128.0),
     "L2/3": (128.0, 419.0),
@@ -27,14 +27,14 @@ LAYERS_UM = {
 
 @dataclass(frozen=True)
 class Selection:
-    """What is kept of some recordings; by default everything."""
+    """Criteria for the sessions and units to keep; by default all are kept."""
 
     # task of the sessions, ``discrimination`` or ``detection``; None for both
     task: str | None = None
-    # patterns of session names with ``*`` and ``?``, of which one must fit a part of the name;
-    # empty for all
+    # patterns with ``*`` and ``?``, one of which must match a part of a session's name; empty for
+    # all
     sessions: tuple[str, ...] = ()
-    # depths below the pia in um that units lie between, the first included; None for all
+    # range of the units' depth below the pia in um, the upper limit excluded; None for all
     depth_um: tuple[float, float] | None = None
     # type of the units, ``excitatory`` or ``inhibitory`` (putative); None for both
     cells: str | None = None
@@ -47,31 +47,31 @@ class Selection:
         depth: str | None = None,
         cells: str | None = None,
     ) -> "Selection":
-        """A selection from texts; depth is a layer, ``L4``, or a range in um, ``419-626``.
+        """Make a selection from texts; depth is a layer, ``L4``, or range, ``419-626`` um.
 
         Raises:
-            ConfigError: no such task, layer or cell type, or a range that is none.
+            ConfigError: no such task, layer or cell type, or an invalid range.
         """
         for what, value, known in (("task", task, TASKS), ("cell type", cells, CELLS)):
             if value is not None and value not in known:
                 raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
-        return cls(task, tuple(sessions), _depths(depth) if depth else None, cells)
+        return cls(task, tuple(sessions), _parse_depths(depth) if depth else None, cells)
 
     def takes(self, session: str) -> bool:
-        """Whether a session's name fits."""
+        """Return whether a session's name matches."""
         return not self.sessions or any(fnmatchcase(session, f"*{p}*") for p in self.sessions)
 
     def units(
         self, depth: NDArray[np.float64] | None, inhibitory: NDArray[Any] | None, number: int
     ) -> NDArray[np.bool_]:
-        """Which of a session's units are kept, (unit,).
+        """Return a mask (unit,) of the units of a session to keep.
 
         Args:
             depth: (unit,) in um below the pia, or None.
             inhibitory: (unit,) or None.
 
         Raises:
-            ConfigError: what is asked for is not known of the session's units.
+            ConfigError: a selected property is unknown for the session's units.
         """
         kept = np.ones(number, dtype=np.bool_)
         if self.depth_um is not None:
@@ -95,9 +95,9 @@ class Selection:
         return ", ".join(part for part in parts if part)
 
 
-def _depths(text: str) -> tuple[float, float]:
-    named = {name.replace("/", ""): depths for name, depths in LAYERS_UM.items()}
-    if (known := named.get(text.upper().replace("/", ""))) is not None:
+def _parse_depths(text: str) -> tuple[float, float]:
+    layers = {name.replace("/", ""): depths for name, depths in LAYERS_UM.items()}
+    if (known := layers.get(text.upper().replace("/", ""))) is not None:
         return known
     low, _, high = text.partition("-")
     try:
@@ -117,8 +117,8 @@ TARGET_PARTS = ("all", *LAYERS_UM, *CELLS)
 def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
     """Keep the units of one part of cortex; animals without any are left out.
 
-    A mouse's borders differ from those of `LAYERS_UM`, and what lies at a border is what its depth
-    says.
+    The borders of layers are those of `LAYERS_UM`, though they differ between mice: units near a
+    border are assigned by depth alone.
     """
     if part not in TARGET_PARTS:
         raise ConfigError(no_such("part of cortex", part, TARGET_PARTS))
@@ -133,10 +133,10 @@ def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
 
 
 def _cut_session(session: NeuralSession, part: str) -> NeuralSession | None:
-    wanted = Selection(depth_um=LAYERS_UM.get(part), cells=part if part in CELLS else None)
+    selection = Selection(depth_um=LAYERS_UM.get(part), cells=part if part in CELLS else None)
     try:
-        chosen = wanted.units(session.depth, session.inhibitory, session.rates.shape[1])
-    except ConfigError:  # it is not known of them
+        chosen = selection.units(session.depth, session.inhibitory, session.rates.shape[1])
+    except ConfigError:  # depth or type of the units is unknown
         return None
     if not chosen.any():
         return None

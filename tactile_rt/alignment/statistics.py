@@ -1,8 +1,8 @@
-"""Choosing a layer without looking at the animal it is scored on, and what chance would give.
+"""Choice of a layer without the animal that it is scored on, and permutation tests.
 
-Six stimuli can be relabelled in 720 ways, so the null distribution is exact; of more than seven
-it is drawn (`rdm.relabellings`). Every step that looks at the neural data, the choice of a layer
-included, is done again for each.
+Six stimuli can be relabelled in 720 ways, so the null distribution is exact; for more than seven
+stimuli it is sampled (`rdm.relabellings`). Every step that uses the neural data, including the
+choice of a layer, is repeated for each relabelling.
 """
 
 from collections.abc import Callable
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.rdm import Floats, count_stimuli, normalised, relabellings
 
-# Points of Student's t that it exceeds in one of so many cases, for 1, 2, ... degrees of freedom;
-# and the normal's beyond.
+# Values that Student's t exceeds in one of 8 or 10 cases, for 1, 2, ... degrees of freedom; the
+# last is that of the normal distribution, for more degrees.
 STUDENT = {
     8: (2.414, 1.604, 1.423, 1.344, 1.301, 1.273, 1.254, 1.240, 1.230, 1.221, 1.214, 1.209, 1.204,
         1.200, 1.197, 1.194, 1.191, 1.189, 1.187, 1.185, 1.183, 1.182, 1.180, 1.179, 1.178, 1.177,
@@ -25,30 +25,29 @@ STUDENT = {
 }  # fmt: skip
 Statistic = Callable[[Floats], Floats]
 
-# Relabellings that leave an RDM as it is give its statistic again, but for rounding.
-TIE = 1e-12
-AT_ONCE = 1 << 24  # numbers: of fifty stimuli and many layers, all relabellings take gigabytes
+TIE = 1e-12  # rounding error of relabellings that do not change an RDM, and so its statistic
+AT_ONCE = 1 << 24  # numbers per batch: for 50 stimuli and many layers, all would take gigabytes
 
 
 @dataclass(frozen=True, eq=False)
 class Permutations:
-    """A statistic among those of all relabelled stimuli."""
+    """A statistic and its null distribution over relabelled stimuli."""
 
-    statistic: float  # statistic of the stimuli as they are; NaN if there is none
+    statistic: float  # statistic of the true labels; NaN if it cannot be computed
     null: Floats  # (way,) statistics of all relabellings, the identity first: 720 of six stimuli
     p: float  # share of relabellings that reach the statistic, at least one of them
     percentile_95: float
 
 
 def held_out(values: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
-    """For each animal the layer that is best on the mean of all others, and its score there.
+    """Score each animal by the layer that is best on the mean of all others.
 
     Args:
         values: (..., layer, animal), finite.
 
     Returns:
         Scores (..., animal) and chosen layers (..., animal), the first of equals. With fewer than
-        two animals or no layer there is no choice: NaN and -1.
+        two animals, or without layers, all are NaN and -1.
     """
     values = np.asarray(values, dtype=np.float64)
     layers, animals = values.shape[-2:]
@@ -62,12 +61,12 @@ def held_out(values: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def mean_held_out(values: Floats) -> Floats:
-    """Mean over animals of `held_out` scores: (..., layer, animal) -> (...)."""
+    """Average `held_out` scores over animals: (..., layer, animal) -> (...)."""
     return np.asarray(held_out(values)[0].mean(axis=-1))
 
 
 def highest(values: Floats) -> Floats:
-    """The highest of all layers and targets, as published: (..., layer, target) -> (...)."""
+    """Return the maximum over layers and targets, as published: (..., layer, target) -> (...)."""
     if values.shape[-1] * values.shape[-2] == 0:
         return np.full(values.shape[:-2], np.nan)
     return np.asarray(values.max(axis=(-2, -1)))
@@ -76,13 +75,13 @@ def highest(values: Floats) -> Floats:
 def max_statistic(
     rdms: ArrayLike, targets: ArrayLike, factors: ArrayLike, statistic: Statistic = mean_held_out
 ) -> Permutations:
-    """Test a statistic that chooses among layers by relabelling the stimuli.
+    """Test a statistic that chooses among layers, by relabelling the stimuli.
 
     Args:
-        rdms: (layer, pair) of a model; a layer with a NaN takes no part.
+        rdms: (layer, pair) of a model; a layer with a NaN is left out.
         targets: (target, pair), finite.
-        factors: (target,) that correct a target's correlations for its noise, finite.
-        statistic: of corrected correlations (..., layer, target).
+        factors: (target,), finite; they correct a target's correlations for its noise.
+        statistic: function of corrected correlations (..., layer, target).
     """
     unit = normalised(rdms)  # (layer, pair): relabelling keeps mean and length
     unit = unit[np.isfinite(unit).all(axis=-1)]
@@ -108,19 +107,19 @@ def max_statistic(
 
 
 def standard_error(values: ArrayLike, ddof: int = 1) -> float:
-    """s.e.m. over animals that have a value; NaN with too few of them.
+    """Compute the s.e.m. over animals with a finite value; NaN if these are too few.
 
     Args:
-        ddof: degrees of freedom that are left to the mean: 0 in the published analysis.
+        ddof: degrees of freedom to deduct for the mean; 0 in the published analysis.
     """
-    there = np.asarray(values, dtype=np.float64)
-    there = there[np.isfinite(there)]
-    if there.size <= ddof:
+    finite = np.asarray(values, dtype=np.float64)
+    finite = finite[np.isfinite(finite)]
+    if finite.size <= ddof:
         return float("nan")
-    return float(there.std(ddof=ddof) / np.sqrt(there.size))
+    return float(finite.std(ddof=ddof) / np.sqrt(finite.size))
 
 
 def student(degrees: int, cases: int) -> float:
-    """What Student's t of one or more degrees of freedom exceeds in one of 8 or of 10 cases."""
+    """Return the value that Student's t exceeds in one of 8 or 10 cases."""
     points = STUDENT[cases]
-    return points[min(degrees, len(points)) - 1]
+    return points[min(degrees, len(points)) - 1]  # degrees of freedom from 1 on

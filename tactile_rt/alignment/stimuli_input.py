@@ -1,8 +1,8 @@
-"""What an array feels while it whisks the six stimuli: the input that models are scored on.
+"""Loads of an array that whisks the six stimuli: the input of models to score.
 
-One such input ships, of the right mouse array, so that scoring needs no simulator; of any other
-array `tactile-rt whisk --array ...` makes one. A stimulus has 22 steps of 5 sub-steps from the
-first contact on.
+The input of the right mouse array ships, so that scoring needs no simulator; for any other array,
+`tactile-rt whisk --array ...` makes it. A stimulus has 22 steps of 5 sub-steps from the first
+contact on.
 """
 
 import hashlib
@@ -29,8 +29,8 @@ class StimuliInput:
     Attributes:
         samples: (6, step, sub-step, element, channel) The loads while the array whisks each
             stimulus, float32, N and N m.
-        sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
-            assumed of a sensor. The baseline is zero, for the whiskers rest before they whisk.
+        sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest assumed
+            for a sensor. The baseline is zero, since the whiskers are at rest before they whisk.
         elements, channels, units: Names along the last two axes, and the unit of each channel.
     """
 
@@ -44,18 +44,18 @@ class StimuliInput:
 
     @property
     def offset(self) -> NDArray[np.float32]:
-        """(6, element, channel) float32: the baseline."""
+        """Baseline (6, element, channel), float32, N and N m: zeros."""
         return np.zeros_like(self.sigma)
 
     def check(self, spec: ArraySpec, steps: int, substeps: int, model: str, period_ns: int) -> None:
-        """Hold the input against what a model was trained on.
+        """Check that the input fits the array and timing that a model was trained on.
 
         Args:
-            period_ns: of its samples, ns.
+            period_ns: period of the model's samples, ns.
 
         Raises:
-            ConfigError: they differ in elements, channels or units, in the cut of a window, or in
-                how far samples are apart.
+            ConfigError: they differ in elements, channels or units, in the steps and sub-steps of a
+                window, or in the period.
         """
         make = "make its input with `tactile-rt whisk OUT.npz --array ...`, for --stimuli"
         only = "only a model of base forces and moments can be compared with barrel cortex"
@@ -63,8 +63,8 @@ class StimuliInput:
             ours, theirs = getattr(self, what), getattr(spec, what)
             if ours != theirs:
                 raise ConfigError(
-                    f"{self.name} has the {what} {_few(ours)}, but {model} was trained on "
-                    f"{_few(theirs)}: {do}"
+                    f"{self.name} has the {what} {_name_few(ours)}, but {model} was trained on "
+                    f"{_name_few(theirs)}: {do}"
                 )
         if (steps, substeps) != (STEPS, SUBSTEPS):
             raise ConfigError(
@@ -80,13 +80,13 @@ class StimuliInput:
             )
 
     def raw(self) -> NDArray[np.float64]:
-        """The control: the loads themselves, mean over time, (6, element * channel), SI."""
+        """Return the loads averaged over time as a control, (6, element * channel), SI."""
         mean: NDArray[np.float64] = self.samples.astype(np.float64).mean(axis=(1, 2))
         return mean.reshape(len(STIMULI), -1)
 
 
 def read_stimuli(path: Path | None = None) -> StimuliInput:
-    """Read what `tactile-rt whisk` wrote; without a path, the input that ships."""
+    """Read a file of `tactile-rt whisk`; without a path, the input that ships."""
     path = SHIPPED if path is None else path
     check_no_pointer(path)
     try:
@@ -135,5 +135,5 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
     )
 
 
-def _few(names: tuple[str, ...]) -> str:
+def _name_few(names: tuple[str, ...]) -> str:
     return f"{', '.join(names[:4])}{', ...' if len(names) > 4 else ''} ({len(names)})"

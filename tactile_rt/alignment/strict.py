@@ -1,24 +1,24 @@
-"""Protocol `strict`: the default.
+"""The default protocol `strict`: named stimuli, cross-fitted choice of units, noise correction.
 
-- Stimuli are named; sessions pool by name, and nothing that was not shown counts.
-- *Cross-fit.* Trials are divided in two within every session and stimulus: on one half units are
-  chosen (reliability of their tuning > 0.5), on the other everything is scored, and the other way
-  round. An RDM is the mean over many such divisions, in both directions; no one draw decides.
-- An animal's reliability is that of the RDM of a scored half: its own halves correlate by r, and
-  Spearman-Brown makes that of the mean over all divisions, negative ones included. It corrects for
-  noise once, and an animal at or below zero is not scored. Only animals whose RDM has a reliability
-  of at least 0.5 count in a mean.
-- The same without the choice of units stands beside it.
-- Divisions are drawn from trials in an order that depends on nothing but the data (`canonical`), so
-  that neither the order of files, trials and units nor the scale of rates matters.
+- Stimuli are named; sessions pool by name, and stimuli that were not shown do not count.
+- *Cross-fit.* Trials are divided in two within every session and stimulus: units are chosen on one
+  half (reliability of their tuning > 0.5) and scored on the other, and vice versa. An RDM is the
+  mean over many such divisions, in both directions, so that it depends little on a single one.
+- An animal's reliability is that of the RDM of a scored half: the RDMs of its own two halves have
+  a correlation r, and Spearman-Brown is applied to the mean of r over all divisions, including
+  negative ones. It corrects for noise once, and an animal at or below zero is not scored. Only
+  animals whose RDM has a reliability of at least 0.5 count in a mean.
+- The same values without the choice of units are reported as well.
+- Divisions are drawn from trials in an order that depends only on the data (`canonical`), so that
+  neither the order of files, trials and units nor the scale of rates matters.
 
-Random divisions of trials are the same for the same data only if trials stand in an order that the
-data decide. Sorting by value will not do: it depends on the order of units, and sorting units by
-value on that of trials. So trials and units are told apart together, by colour refinement
-(Weisfeiler and Leman): a unit's key is made from its rates in trials of which keys, a trial's key
-from its rates in units of which keys, again and again. Sums of keys are whole numbers modulo 2^64,
-so that no order of summation matters. Rates enter by their rank, which no scale changes. What has
-the same key in the end is interchangeable.
+Random divisions are the same for the same data only if the order of trials follows from the data.
+Sorting trials by value depends on the order of units, and sorting units on that of trials. So both
+get keys together, by colour refinement (Weisfeiler and Leman): a unit's key is computed from its
+rates and the keys of their trials, a trial's key from its rates and the keys of their units, again
+and again. Sums of keys are integers modulo 2^64, so the order of summation does not matter. Rates
+enter by their rank, which no scale changes. Trials or units with the same final key are
+interchangeable.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,7 +45,7 @@ MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
 class Moments:
     """Sums over units of responses to stimuli."""
 
-    units: Floats  # (...) number of units that the sums run over
+    units: Floats  # (...) number of units in the sums
     sums: Floats  # (..., stimulus) sum over units of the response to each stimulus
     # (..., stimulus, stimulus) sum over units of the products of the responses to two stimuli
     products: Floats
@@ -56,7 +56,7 @@ class Moments:
         )
 
     def rdm(self) -> Floats:
-        """RDMs (..., pair); NaN where a stimulus's response is the same in all units."""
+        """Compute RDMs (..., pair); NaN where a response is the same in all units."""
         units = np.maximum(self.units, 1)[..., None]
         mean = self.sums / units
         covariance = self.products - units[..., None] * mean[..., :, None] * mean[..., None, :]
@@ -70,38 +70,38 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Units of an animal, or of several, in every division and both halves of it."""
+    """Moments of one or more animals' units, in every division and both of its halves."""
 
-    # (division, 2, ...) moments of the mean responses over each half of the trials, of the units
+    # (division, 2, ...) moments of the mean responses over each half of the trials, for the units
     # that were chosen on the other half
     halves: Moments
-    quarters: Moments  # (division, 2, 2, ...) the same of the two halves of each half
+    quarters: Moments  # (division, 2, 2, ...) the same for the two halves of each half
 
     def __add__(self, other: "_Pool") -> "_Pool":
         return _Pool(self.halves + other.halves, self.quarters + other.quarters)
 
     def freeze(self) -> Frozen:
-        """Mean RDM, reliability and the factor that corrects for noise.
+        """Compute the mean RDM, its reliability and the factor that corrects for noise.
 
-        A model's score is the mean over halves of its correlation with their RDMs, over the root of
-        their reliability. Correlations are products of RDMs of length one, so that mean is the
-        product with the mean of these, whose length goes into the factor.
+        A model's score is its mean correlation with the RDMs of the halves, divided by the root of
+        their reliability. Correlations are products of RDMs of length one, so their mean is the
+        product with the mean RDM, whose length goes into the factor.
         """
         enough = self.halves.units >= MINIMUM_UNITS
         rdms = self.halves.rdm()
         parts = self.quarters.rdm()
         r = pearson(parts[..., 0, :], parts[..., 1, :])
         unit = normalised(rdms)
-        there = enough & np.isfinite(r) & np.isfinite(unit).all(axis=-1)
+        valid = enough & np.isfinite(r) & np.isfinite(unit).all(axis=-1)
         units = round(float(self.halves.units.mean()))
-        if 2 * there.sum() < there.size:
+        if 2 * valid.sum() < valid.size:
             return Frozen(np.zeros(rdms.shape[-1]), np.nan, np.nan, units)
-        reliability = float(spearman_brown(r[there].mean()))
-        mean = unit[there].mean(axis=0)
+        reliability = float(spearman_brown(r[valid].mean()))
+        mean = unit[valid].mean(axis=0)
         length = float(np.sqrt(mean @ mean))
         factor = length / np.sqrt(reliability) if reliability > 0 else np.nan
-        level = rdms[there].mean(axis=-1, keepdims=True)
-        spread = np.sqrt(((rdms[there] - level) ** 2).sum(axis=-1)).mean()
+        level = rdms[valid].mean(axis=-1, keepdims=True)
+        spread = np.sqrt(((rdms[valid] - level) ** 2).sum(axis=-1)).mean()
         return Frozen(level.mean() + spread * mean, reliability, float(factor), units)
 
 
@@ -111,11 +111,11 @@ def freeze_strict(
     seed: int = SEED,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Benchmark:
-    """Reliabilities and RDMs of animals, and their consistency.
+    """Compute reliabilities and RDMs of animals, and their consistency.
 
     Args:
-        animals: whose rates count from first contact to choice, and no session twice.
-        bootstraps: the number of divisions of the trials; each is used in both directions.
+        animals: rates must count from first contact to choice, and no session may be given twice.
+        bootstraps: number of divisions of the trials; each is used in both directions.
     """
     names, notes = [], []
     targets: list[Target] = []
@@ -137,7 +137,7 @@ def freeze_strict(
             progress(done / len(animals))
             continue
         ordered = sorted((canonical(s) for s in sessions), key=lambda pair: pair[1])
-        every, kept = _pools(ordered, bootstraps, seed)
+        every, kept = _make_pools(ordered, bootstraps, seed)
         chosen = kept.freeze()
         names.append(animal.name)
         pools.append(kept)
@@ -161,7 +161,7 @@ def freeze_strict(
         protocol="strict",
         targets=tuple(targets),
         pooled=None,
-        a2a=_consistency(tuple(names), targets, pools),
+        a2a=_compare_animals(tuple(names), targets, pools),
         bootstraps=bootstraps,
         seed=seed,
         notes=tuple(notes),
@@ -169,15 +169,15 @@ def freeze_strict(
     )
 
 
-def _pools(
+def _make_pools(
     sessions: Sequence[tuple[NeuralSession, int]], divisions: int, seed: int
 ) -> tuple[_Pool, _Pool]:
-    """All units, and the reliable ones, of an animal's canonical sessions and their keys."""
+    """Pool all units, and the reliable ones, of an animal's canonical sessions with keys."""
     every, kept = [], []
     for session, key in sessions:
         made = divided(session, divisions, np.random.default_rng([seed, key]))
         every.append(_Pool(moments_of(made.halves), moments_of(made.quarters)))
-        chosen = made.reliable[:, ::-1]  # on the other half than is scored
+        chosen = made.reliable[:, ::-1]  # chosen on the half that is not scored
         kept.append(
             _Pool(moments_of(made.halves, chosen), moments_of(made.quarters, chosen[:, :, None]))
         )
@@ -189,7 +189,7 @@ class Divided:
     """Random divisions of a session's trials in two, and of each half in two."""
 
     halves: Floats  # (division, 2, stimulus, unit) mean responses over each half of the trials
-    quarters: Floats  # (division, 2, 2, stimulus, unit) those over each half of each half
+    quarters: Floats  # (division, 2, 2, stimulus, unit) the same over each half of each half
     # (division, 2, unit) whether the tuning of a unit over that half of the trials has a
     # reliability above `MINIMUM_RELIABILITY`
     reliable: NDArray[np.bool_]
@@ -199,8 +199,8 @@ def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) ->
     """Divide trials within every stimulus at random.
 
     A unit's reliability is the share of the variance over stimuli of its mean responses that noise,
-    known from the variance within stimuli, does not explain: 1 - 1/F of an analysis of variance. It
-    is what Spearman-Brown makes of the correlation of two halves, without drawing any.
+    estimated from the variance within stimuli, does not explain: 1 - 1/F of an analysis of
+    variance. It equals the Spearman-Brown corrected correlation of two halves, without drawing any.
     """
     units = session.rates.shape[1]
     stimuli = len(session.stimuli)
@@ -225,15 +225,15 @@ def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) ->
         noise += spread / (sizes - 1) / stimuli
     signal = halves.var(axis=2, ddof=1)
     varies = signal > CONSTANT * (halves**2).mean(axis=2)
-    # Counts of spikes are whole, so that a unit may be just at the limit: rounding must not decide.
+    # Spike counts are integers, so a unit may be exactly at the limit: rounding must not decide.
     reliable = varies & (noise < (1 - MINIMUM_RELIABILITY - TIE) * signal)
     return Divided(halves, quarters.reshape(divisions, 2, 2, stimuli, units), reliable)
 
 
-def _consistency(
+def _compare_animals(
     names: tuple[str, ...], targets: Sequence[Target], pools: Sequence[_Pool]
 ) -> Consistency:
-    """Each reliable animal against all other reliable ones pooled, and against each of them."""
+    """Score each reliable animal against all others pooled, and against each of them."""
     pooled = np.full(len(names), np.nan)
     pairwise = np.full((len(names), len(names)), np.nan)
     usable = [i for i, target in enumerate(targets) if target.reliable]
@@ -267,24 +267,24 @@ def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Mo
 Keys = NDArray[np.uint64]
 
 ROUNDS = 3
-SAME = 1e-9  # rates that differ by a smaller share are the same, but for rounding
+SAME = 1e-9  # rates with a smaller relative difference are the same, but for rounding
 
 
 def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
-    """The same trials and units in one order, and a number that tells this session from others.
+    """Put a session's trials and units into an order that depends only on the data.
 
     Returns:
-        The session's rates and stimuli alone, its trials sorted by stimulus; and a key below 2^64
-        that no order of trials or units and no common factor of the rates changes.
+        The session with rates and stimuli alone, its trials sorted by stimulus; and a key below
+        2^64 of its data, which no order of trials or units and no scale of the rates changes.
     """
-    ranks = _ranks(session.rates)
-    trial = _mixed(session.stimulus.astype(np.uint64) + np.uint64(1))
-    trial, unit = _refined(ranks, trial)
+    ranks = _rank_rates(session.rates)
+    trial = _mix(session.stimulus.astype(np.uint64) + np.uint64(1))
+    trial, unit = _refine(ranks, trial)
     key = int(trial.sum(dtype=np.uint64))
-    while len(found := _twice(trial)):
-        # These may change places, but only together with units: one of them is put first.
-        trial[found[0]] = _mixed(trial[found[:1]])[0]
-        trial, unit = _refined(ranks, trial)
+    while len(found := _find_repeated(trial)):
+        # These may be exchanged, but only together with units: one of them is put first.
+        trial[found[0]] = _mix(trial[found[:1]])[0]
+        trial, unit = _refine(ranks, trial)
     rows, columns = np.lexsort((trial, session.stimulus)), np.argsort(unit)
     ordered = NeuralSession(
         session.animal, session.name, session.rates[np.ix_(rows, columns)],
@@ -293,35 +293,35 @@ def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
     return ordered, key
 
 
-def _refined(ranks: Keys, start: Keys) -> tuple[Keys, Keys]:
-    """Keys of trials and units that tell apart what the keys of trials to start with do."""
+def _refine(ranks: Keys, start: Keys) -> tuple[Keys, Keys]:
+    """Refine keys of trials, and compute those of units, from initial keys of trials."""
     trial = start
     for _ in range(ROUNDS):
-        unit = _mixed(_mixed(ranks + trial[:, None]).sum(axis=0, dtype=np.uint64))
-        trial = _mixed(_mixed(ranks ^ unit).sum(axis=1, dtype=np.uint64) + start)
+        unit = _mix(_mix(ranks + trial[:, None]).sum(axis=0, dtype=np.uint64))
+        trial = _mix(_mix(ranks ^ unit).sum(axis=1, dtype=np.uint64) + start)
     return trial, unit
 
 
-def _twice(keys: Keys) -> NDArray[np.intp]:
-    """Where the lowest of the keys stands that are there more than once."""
+def _find_repeated(keys: Keys) -> NDArray[np.intp]:
+    """Return the positions of the lowest key that occurs more than once."""
     values, counts = np.unique(keys, return_counts=True)
     return (
         np.flatnonzero(keys == values[counts > 1][:1]) if (counts > 1).any() else np.array([], int)
     )
 
 
-def _ranks(rates: NDArray[np.float64]) -> Keys:
-    """Rank of each rate among all of them, mixed into 64 bits; equal rates have equal ranks."""
+def _rank_rates(rates: NDArray[np.float64]) -> Keys:
+    """Rank each rate among all, equal ones alike, and mix the ranks into 64 bits."""
     order = np.argsort(rates, axis=None)
     sorted_ = rates.ravel()[order]
     steps = np.diff(sorted_) > SAME * np.maximum(np.abs(sorted_[1:]), np.abs(sorted_[:-1]))
     ranks = np.empty(rates.size, dtype=np.uint64)
     ranks[order] = np.concatenate([[0], np.cumsum(steps)])[: rates.size]
-    return _mixed(ranks.reshape(rates.shape))
+    return _mix(ranks.reshape(rates.shape))
 
 
-def _mixed(keys: Keys) -> Keys:
-    """Each key scattered over 64 bits (the finaliser of SplitMix64, Steele et al. 2014)."""
+def _mix(keys: Keys) -> Keys:
+    """Scatter each key over 64 bits (the finaliser of SplitMix64, Steele et al. 2014)."""
     keys = keys + np.uint64(0x9E3779B97F4A7C15)
     keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

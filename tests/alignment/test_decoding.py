@@ -99,7 +99,7 @@ def test_the_papers_variant_uses_one_thread_whatever_others_use():
         return 0.0
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tactile_rt.alignment.decoding._one_out", fit)
+        patch.setattr("tactile_rt.alignment.decoding._leave_one_out", fit)
         decode_paper(np.random.default_rng(0).normal(size=(6, 9)))
     assert seen and set().union(*seen) == {1}
 

@@ -85,7 +85,7 @@ def test_a_benchmark_without_reliable_animals_says_so(benchmark):
 
 def axes_of(monkeypatch, draw, *arguments, **more):
     """What a figure is made of, instead of its SVG."""
-    monkeypatch.setattr("tactile_rt.alignment.pictures._finish", lambda figure: figure)
+    monkeypatch.setattr("tactile_rt.alignment.pictures._finish_figure", lambda figure: figure)
     return draw(*arguments, **more).axes
 
 

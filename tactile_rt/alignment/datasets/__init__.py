@@ -1,9 +1,9 @@
-"""Recordings that models are compared with, by name, each imported when it is asked for.
+"""Recordings that models are compared with, by name; each is imported on request.
 
-A dataset says where its recordings come from (title, citation, license, size), and reads what its
-user downloaded or fetched: animals, and the input of the models if it is not the six stimuli that
-ship. Recordings are never bundled. Datasets of other packages are found by the entry points
-``tactile_rt.alignment_datasets``.
+A dataset states where its recordings come from (title, citation, license, size), and reads the
+files that its user downloaded or fetched: animals, and the input of the models if it is not the six
+stimuli that ship. Recordings are never bundled. Datasets of other packages are found by the entry
+points ``tactile_rt.alignment_datasets``.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,11 +24,11 @@ ENTRY_POINTS = "tactile_rt.alignment_datasets"  # of other packages
 
 @dataclass(frozen=True, eq=False)
 class DatasetContents:
-    """What was read of a dataset.
+    """The recordings that were read from a dataset.
 
     Attributes:
-        stimuli: The input that models get for its conditions; None for the six stimuli that ship
-            or that the user names.
+        stimuli: The input of the models for the dataset's conditions; None for the six stimuli
+            that ship or that the user names.
     """
 
     animals: tuple[Animal, ...]
@@ -49,10 +49,10 @@ class NeuralDataset:
         read: The function that reads downloaded files or folders. It takes them, the input of the
             six stimuli, and a function to call with the share done, 0 to 1, and raises
             `ConfigError` where they cannot be used.
-        listing: The file beside `fetching` that lists the files of one version, of which
-            `align fetch` gets what is needed; empty if they must be downloaded.
-        counts: The mice and the units that the published analysis is of, which what is fetched is
-            held against; None where that is not known.
+        listing: The file beside `fetching` that lists the files of one version, from which
+            `align fetch` gets the needed parts; empty if users must download the files.
+        counts: The numbers of mice and of units in the published analysis, to compare the fetched
+            files with; None if unknown.
     """
 
     name: str
@@ -67,7 +67,7 @@ class NeuralDataset:
     counts: tuple[int, int] | None = None
 
 
-# name: where the dataset is
+# name: module and attribute of the dataset
 DATASETS = {
     "000231": f"{__name__}.rodgers:DANDI_000231",
     "example": f"{__name__}.rodgers:EXAMPLE",
@@ -76,12 +76,12 @@ DATASETS = {
 
 
 def dataset_names() -> tuple[str, ...]:
-    """All datasets that are installed, ours first."""
+    """Return the names of all installed datasets, those of this package first."""
     return (*DATASETS, *(name for name in added_names(ENTRY_POINTS) if name not in DATASETS))
 
 
 def find_dataset(name: str) -> NeuralDataset:
-    """A dataset by its name."""
+    """Return a dataset by its name."""
     if name in DATASETS:
         module, _, attribute = DATASETS[name].partition(":")
         ours: NeuralDataset = getattr(import_module(module), attribute)

@@ -1,11 +1,11 @@
-"""The sessions of a published dataset, by name, size and checksum, and what is needed of them.
+"""Download of the needed parts of a published dataset's sessions.
 
-A session is gigabytes, of which its voltages are nearly all. What alignment reads, trials, contacts
-and spikes, is read from the archive's own files by HTTP ranges and written to small NWB files of
-the same structure, which everything else takes like whole ones.
+A session has gigabytes, nearly all of them voltages. Alignment needs trials, contacts and spikes:
+these are read from the archive's own files by HTTP ranges and written to small NWB files of the
+same structure, which can be used like whole ones.
 
-The list is of one version of the dataset, and its addresses are of one version of every file, so
-that whoever fetches gets the same.
+The list names files by name, size and checksum. It is of one version of the dataset, and its
+addresses are of one version of every file, so that everybody fetches the same data.
 """
 
 import csv
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     import urllib3
 
 UNITS = ("spike_times", "spike_times_index", "depth", "inhibitory")
-BLOCK = 1 << 16  # bytes
-KEPT = 1 << 10  # blocks
-PATIENCE_S = 60.0  # of a request that is answered with nothing
-AGAIN = 4  # times that a request is repeated, after 0, 1, 2 and 4 s
-BUSY = (429, 500, 502, 503, 504)
+BLOCK = 1 << 16  # bytes of a block
+KEPT = 1 << 10  # blocks in the cache at most
+PATIENCE_S = 60.0  # timeout of a request
+AGAIN = 4  # retries of a request, after 0, 1, 2 and 4 s
+BUSY = (429, 500, 502, 503, 504)  # HTTP status codes that are worth a retry
 
 
 def connections() -> "urllib3.PoolManager":
-    """Connections to servers, kept open from request to request, through the proxy that is set."""
+    """Return a pool of connections that stay open, through the proxy if one is set."""
     import urllib3
 
     again = urllib3.Retry(AGAIN, backoff_factor=0.5, status_forcelist=BUSY, raise_on_status=False)
@@ -45,18 +45,18 @@ def connections() -> "urllib3.PoolManager":
 
 
 class RangeFile(io.RawIOBase):
-    """Read a file of known size from a web server, by HTTP ranges.
+    """A file of known size on a web server, read by HTTP ranges.
 
-    Bytes come in blocks, which are kept: what HDF5 says of its data is small, read again and again,
-    and strewn over gigabytes. Blocks that are missing beside each other come by one request.
-    h5py swallows what its file raises and says something else; the first error stays in `error`.
+    Bytes are fetched in blocks, which are cached: the metadata of HDF5 is small, scattered over
+    gigabytes, and read again and again. Adjacent missing blocks are fetched by one request.
+    h5py replaces errors of its file by errors of its own; the first one stays in `error`.
 
     Args:
-        size: in bytes; a server that has another size has another file.
+        size: in bytes; a server that reports another size has another file.
     """
 
     def __init__(self, pool: "urllib3.PoolManager", url: str, size: int) -> None:
-        self.error = ""  # the first one of a request, in words
+        self.error = ""  # message of the first failed request
         self.transferred = 0  # bytes
         self._pool, self._url, self._size = pool, url, size
         self._blocks: dict[int, bytes] = {}
@@ -92,7 +92,7 @@ class RangeFile(io.RawIOBase):
         return end - begin
 
     def _fetch(self, first: int, last: int) -> None:
-        """Get blocks, all between them included."""
+        """Fetch the blocks from first to last, both included."""
         import urllib3
 
         begin, end = first * BLOCK, min((last + 1) * BLOCK, self._size)
@@ -113,13 +113,13 @@ class RangeFile(io.RawIOBase):
                     raise ConfigError(f"the server says {answer.status} {answer.reason or ''}")
                 data = answer.read()
             except ConfigError:
-                answer.close()  # what it still sends would be taken for the next answer
+                answer.close()  # its remaining bytes would be taken for the next answer
                 raise
             answer.release_conn()
             if len(data) != end - begin:
                 raise ConfigError(f"{len(data)} bytes came where {end - begin} were asked for")
         except (ConfigError, urllib3.exceptions.HTTPError) as error:
-            reason = str(getattr(error, "reason", error))  # of many tries, the last one
+            reason = str(getattr(error, "reason", error))  # of the last retry
             self.error = self.error or " ".join(reason.split())
             raise ConfigError(self.error) from None
         self.transferred += len(data)
@@ -143,7 +143,7 @@ class PublishedFile:
 
 
 def published_files(listing: str) -> tuple[PublishedFile, ...]:
-    """The files with spikes of a dataset, from the list of them that ships."""
+    """Read the list of a dataset's files with spikes that ships with the package."""
     text = resources.files(__package__).joinpath(listing).read_text("utf-8")
     return tuple(
         PublishedFile(row["path"], int(row["bytes"]), row["sha256"], row["url"])
@@ -156,15 +156,15 @@ def fetch(
     folder: Path,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[int, int]:
-    """Write what alignment needs of some files to a folder, one small NWB file each.
+    """Fetch the parts of files that alignment needs, each into a small NWB file.
 
-    What is there already stays, so that a fetch that broke off goes on.
+    Files that exist are skipped, so that an interrupted fetch can be resumed.
 
     Returns:
-        The number of new files, and of bytes that came over the network.
+        The number of new files, and the number of bytes received over the network.
 
     Raises:
-        ConfigError: a file cannot be had, or is not the one that was published; those before it
+        ConfigError: a file cannot be fetched, or is not the published one; the files before it
             are in the folder.
     """
     pool = connections()
@@ -172,42 +172,42 @@ def fetch(
     for done, file in enumerate(files, start=1):
         path = folder / file.name
         if not path.exists():
-            small, came = _needed(RangeFile(pool, file.url, file.size), file)
+            small, received = _extract_needed(RangeFile(pool, file.url, file.size), file)
             folder.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda out, small=small: out.write(small))  # type: ignore[misc]
-            new, transferred = new + 1, transferred + came
+            new, transferred = new + 1, transferred + received
         progress(done / len(files))
     return new, transferred
 
 
 def counted(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
-    """Mice and units of sessions with valid trials, and notes on what was left out."""
+    """Count mice and units of sessions with valid trials, and note what was left out."""
     readings, notes = read_nwb(paths, "start")
     mice = {reading.session.animal for reading in readings}
     return len(mice), sum(r.session.rates.shape[1] for r in readings), notes
 
 
-def _needed(remote: RangeFile, published: PublishedFile) -> tuple[bytes, int]:
-    """An NWB file of what is needed of another, and the bytes that came for it."""
+def _extract_needed(remote: RangeFile, published: PublishedFile) -> tuple[bytes, int]:
+    """Copy the needed parts of a remote NWB file; return them and the bytes received."""
     import h5py
 
     small = io.BytesIO()
     try:
         with h5py.File(remote, "r") as source, h5py.File(small, "w") as target:
-            for name in _columns(source):
-                _copy(source, target, name)
-            for name, end in _clocks(source):
+            for name in _find_columns(source):
+                _copy_dataset(source, target, name)
+            for name, end in _find_clocks(source):
                 target[name] = [end]
             target.attrs["source"] = published.url
             target.attrs["source_sha256"] = published.sha256
-    except Exception as error:  # of what a file over the network raises, h5py makes many things
+    except Exception as error:  # h5py turns errors of a remote file into many types
         reason = remote.error or describe_error(error)
         raise ConfigError(f"{published.path} cannot be fetched: {reason}") from None
     return small.getvalue(), remote.transferred
 
 
-def _columns(file: Any) -> Iterator[str]:
-    """Datasets that `nwb` reads, those that are there."""
+def _find_columns(file: Any) -> Iterator[str]:
+    """Yield the names of the HDF5 datasets that `nwb` reads and the file has."""
     yield from (name for name in (parts.SUBJECT, parts.EXPERIMENT) if name in file)
     for table, columns in ((parts.TRIALS, parts.COLUMNS), ("units", UNITS)):
         yield from (f"{table}/{c}" for c in columns if table in file and c in file[table])
@@ -224,8 +224,8 @@ def _columns(file: Any) -> Iterator[str]:
         )
 
 
-def _clocks(file: Any) -> Iterator[tuple[str, float]]:
-    """Clocks of whiskers, millions of times, and the last time, which alone counts."""
+def _find_clocks(file: Any) -> Iterator[tuple[str, float]]:
+    """Yield names of whiskers' timestamps and the last time, s; the others are not needed."""
     for module in file.get("processing", {}).values():
         for name, group in module.items():
             end = parts.last_time(group) if name.startswith(parts.WHISKER) else None
@@ -233,11 +233,11 @@ def _clocks(file: Any) -> Iterator[tuple[str, float]]:
                 yield f"{group.name[1:]}/angle/timestamps", end
 
 
-def _copy(source: Any, target: Any, name: str) -> None:
+def _copy_dataset(source: Any, target: Any, name: str) -> None:
     data, (place, _, leaf) = source[name], name.rpartition("/")
     if data.size * max(data.dtype.itemsize, 1) > parts.LARGEST:
         raise ConfigError(f"{name} has {data.size} values, more than a session can have")
     group = target.require_group(place)
     source.copy(data, group, leaf)
-    if "neurodata_type" in data.parent.attrs:  # by which the recording is known among series
+    if "neurodata_type" in data.parent.attrs:  # distinguishes the recording from other series
         group.attrs["neurodata_type"] = data.parent.attrs["neurodata_type"]

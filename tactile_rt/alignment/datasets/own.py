@@ -1,4 +1,4 @@
-"""Recordings of the user's own stimuli, as `named_recordings` reads them."""
+"""The dataset of a user's own recordings, of any stimuli, which `named_recordings` reads."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Shapes felt by mice: DANDI 000231 (Rodgers 2022), and recordings made up in its form."""
+"""Shapes felt by mice: DANDI 000231 (Rodgers 2022), and made-up recordings in its format."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,9 +17,9 @@ def _read(
     return DatasetContents(by_animal(sessions), None, tuple(notes))
 
 
-# Title, citation, license, size: dandiset.yaml of the draft, github.com/dandisets/000231. The list:
-# its tag 0.220904.1554, which names every file by size and SHA-256, and its addresses. The counts:
-# Chung et al. (2025), of the units with valid trials.
+# Title, citation, license, size: dandiset.yaml of the draft, github.com/dandisets/000231. Listing:
+# its tag 0.220904.1554, which has the size, SHA-256 and address of every file. Counts: Chung et al.
+# (2025), units with valid trials.
 DANDI_000231 = NeuralDataset(
     name="000231",
     title="A detailed behavioral, videographic, and neural dataset on object recognition in mice",

@@ -1,14 +1,14 @@
-"""Metrics: how like a layer and an animal are, beside what the noise of the recording lets through.
+"""Metrics of the similarity of a layer and an animal, each with its noise ceiling.
 
-A metric is one function. It takes an animal and gives its `Measure`: the value that a perfect model
-is expected to reach (the ceiling), and a function that measures a layer. Whatever depends on the
-animal alone is thus computed once for all layers and models. Metrics of other packages are found
-by the entry points ``tactile_rt.alignment_metrics``.
+A metric is a function. It takes an animal and returns its `Measure`: the value that a perfect model
+is expected to reach (the ceiling), and a function that measures a layer. What depends on the animal
+alone is thus computed only once for all layers and models. Metrics of other packages are found by
+the entry points ``tactile_rt.alignment_metrics``.
 
-noise_ceiling  means of random halves of the trials, over which ceilings are estimated
+noise_ceiling  means over random halves of the trials, from which ceilings are estimated
 rsa_cka        rsa, rsa-time and cka: the similarity of two geometries
-crossnobis     distances that noise does not lengthen
-linear         what a linear readout of a layer predicts of every unit
+crossnobis     distances without the bias that noise adds
+linear         the share of every unit's variance that a linear readout of a layer predicts
 """
 
 from collections.abc import Callable
@@ -24,21 +24,21 @@ from tactile_rt.core.settings import no_such
 __all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "metric_names"]
 
 ENTRY_POINTS = "tactile_rt.alignment_metrics"  # of other packages
-# Of a correlation: with a lower one the correction for noise would more than double a value.
+# Lowest ceiling of a correlation: below it, the noise correction would more than double a value.
 MINIMUM_CEILING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """What a metric makes of one animal.
+    """A metric prepared for one animal.
 
     Attributes:
-        ceiling: The value that a perfect model is expected to reach on these trials; NaN if the
-            animal cannot be measured on.
-        fit: The function that measures a layer, given as responses (stimulus, step, unit) with
-            NaN in the steps that input cannot reach. NaN for a layer that tells nothing apart.
-        minimum: The lowest ceiling that is corrected for; for a share of variance the square of
-            that for a correlation.
+        ceiling: The value that a perfect model is expected to reach on these trials; NaN if it
+            cannot be estimated, for example from too few trials.
+        fit: The function that measures a layer, given as responses (stimulus, step, unit), NaN in
+            the steps that input cannot reach. It returns NaN if all stimuli give one response.
+        minimum: The lowest usable ceiling; for a share of variance, the square of the limit for
+            a correlation.
     """
 
     ceiling: float
@@ -47,13 +47,13 @@ class Measure:
 
     @property
     def usable(self) -> bool:
-        """Whether the noise is low enough to be corrected for."""
+        """True if the noise is low enough to be corrected for."""
         return bool(self.ceiling >= self.minimum)
 
 
 Metric = Callable[[Animal], Measure]
 
-# name: (where the function is, what it says in a line)
+# name: (path of the function, description in one line)
 METRICS = {
     "rsa": (
         f"{__name__}.rsa_cka:rsa",
@@ -79,12 +79,12 @@ METRICS = {
 
 
 def metric_names() -> tuple[str, ...]:
-    """All metrics that are installed, ours first."""
+    """Return the names of all installed metrics, those of this package first."""
     return (*METRICS, *(name for name in added_names(ENTRY_POINTS) if name not in METRICS))
 
 
 def find_metric(name: str) -> Metric:
-    """The function of a metric."""
+    """Return the function of a metric."""
     if name in METRICS:
         module, _, function = METRICS[name][0].partition(":")
         ours: Metric = getattr(import_module(module), function)

@@ -1,10 +1,10 @@
 """Squared distances between responses in units of the noise, without the bias that noise adds.
 
 Every session's units are whitened by the covariance of their trials about the stimulus's mean,
-shrunk towards its diagonal as far as its own uncertainty says (Schäfer & Strimmer 2005). Products
-run over pairs of *different* trials only, all of them: noise then lengthens no distance, 0 means
-the same response, and nothing depends on how trials are divided (Walther et al. 2016; Diedrichsen
-et al. 2021). Sessions add up, as units of their own.
+shrunk towards its diagonal by an estimate of its uncertainty (Schäfer & Strimmer 2005). Products
+run over all pairs of *different* trials only: noise then lengthens no distance, 0 means the same
+response, and the result does not depend on a division of the trials (Walther et al. 2016;
+Diedrichsen et al. 2021). Each session has its own units, so the distances of sessions add up.
 
 A layer has no noise: its distances are Euclidean. The fit is Pearson's r of the two.
 """
@@ -20,7 +20,7 @@ from tactile_rt.alignment.rdm import Floats, pearson, upper
 
 
 def crossnobis(animal: Animal) -> Measure:
-    """Correlation of a layer's squared distances with an animal's cross-validated ones."""
+    """Prepare the correlation of a layer's distances with an animal's cross-validated ones."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING
@@ -28,7 +28,7 @@ def crossnobis(animal: Animal) -> Measure:
     pairs = len(upper(len(sessions[0].stimuli))[0])
     whole, halves = np.zeros(pairs), np.zeros((2, 1, pairs))
     for session in sessions:
-        white = session.rates @ _whitening(session)
+        white = session.rates @ _compute_whitening(session)
         every = np.ones((1, len(white)), dtype=np.bool_)
         first = divisions(session)
         whole = whole + distances(white, session.stimulus, every)[0] / units
@@ -38,17 +38,17 @@ def crossnobis(animal: Animal) -> Measure:
     goal = whole
     return Measure(
         ceiling_of(pearson(halves[0], halves[1])),
-        lambda layer: float(pearson(_euclidean(mean_pattern(layer)), goal)),
+        lambda layer: float(pearson(_measure_distances(mean_pattern(layer)), goal)),
     )
 
 
 def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
-    """Cross-validated squared distances, summed over units.
+    """Compute cross-validated squared distances, summed over units.
 
     Args:
         white: (trial, unit), whitened.
-        stimulus: (trial,), as indices of which each is there.
-        chosen: (division, trial), which trials count; at least two of every stimulus.
+        stimulus: (trial,), indices from 0 on without gaps.
+        chosen: (division, trial), True for trials that count; at least two of every stimulus.
 
     Returns:
         (division, pair).
@@ -66,7 +66,7 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
 
 
 def shrunk_covariance(residuals: Floats, freedom: int) -> Floats:
-    """Covariance of (trial, unit) about zero, its correlations shrunk towards none."""
+    """Estimate the covariance of residuals (trial, unit), correlations shrunk towards zero."""
     n = len(residuals)
     products = residuals.T @ residuals
     squares = (residuals**2).T @ residuals**2
@@ -80,18 +80,18 @@ def shrunk_covariance(residuals: Floats, freedom: int) -> Floats:
     return np.asarray(products / freedom * np.where(off, 1 - shrinkage, 1.0))
 
 
-def _whitening(session: NeuralSession) -> Floats:
-    """(unit, unit) whose product with its transpose is the inverse covariance of the noise."""
+def _compute_whitening(session: NeuralSession) -> Floats:
+    """Compute the whitening matrix (unit, unit), the root of the inverse noise covariance."""
     rates, stimulus = session.rates, session.stimulus
     residuals = rates.copy()
     for k in range(len(session.stimuli)):
         residuals[stimulus == k] -= rates[stimulus == k].mean(axis=0)
-    live = (residuals**2).sum(axis=0) > 0  # a unit that never varies has no noise to measure by
+    live = (residuals**2).sum(axis=0) > 0  # the noise of a unit that never varies is unknown
     out = np.zeros((len(live), len(live)))
     if live.any():
         freedom = len(rates) - len(session.stimuli)
         covariance = shrunk_covariance(residuals[:, live], freedom)
-        # With few trials it may be short of positive: such directions are left out.
+        # With few trials some eigenvalues may not be positive: their directions are left out.
         values, vectors = np.linalg.eigh(covariance)
         kept = values > 1e-9 * values.max()
         roots = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1)), 0)
@@ -99,6 +99,7 @@ def _whitening(session: NeuralSession) -> Floats:
     return out
 
 
-def _euclidean(patterns: Floats) -> Floats:
+def _measure_distances(patterns: Floats) -> Floats:
+    """Compute squared Euclidean distances (pair,) of responses (stimulus, unit)."""
     i, j = upper(len(patterns))
     return np.asarray(((patterns[i] - patterns[j]) ** 2).sum(axis=-1))

@@ -1,16 +1,15 @@
-"""How much of each unit's response to a stimulus a linear readout of a layer predicts unseen.
+"""Share of units' variance that a layer's linear readout predicts for a held-out stimulus.
 
 One stimulus is held out at a time. A ridge regression from the layer's steps to the units'
-bins of 45 ms (without a time course: from means to means) learns from the others, its penalty
-chosen by holding out each of these in turn. Both sides are taken about the mean of the learning
-stimuli in each bin, so that a course which all stimuli share, such as the onset of touch, earns
-nothing, and a regression that knows nothing scores 0 (a correlation would be negative: the mean of
-the others lies opposite to what was held out).
+bins of 45 ms (without a time course: from means to means) is fitted to the others, its penalty
+chosen by holding out each of these in turn. In each bin, the mean of the training stimuli is
+subtracted from layer and units: a time course that all stimuli share, such as the onset of touch,
+then adds nothing, and a regression without information scores 0 (a correlation would be negative:
+the mean of the others lies opposite to the held-out response).
 
 The score is 1 - error / variance over all bins and units, each unit in units of its noise, so that
-units which tell stimuli apart weigh most. The ceiling
-is what is left of the variance without the noise of the means, known from the spread of trials: a
-perfect model reaches it in expectation.
+units that distinguish stimuli weigh most. A perfect model is expected to reach the ceiling, the
+share of the variance that remains without the noise of the means (from the spread of trials).
 """
 
 import numpy as np
@@ -25,13 +24,13 @@ PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel
 
 
 def linear(animal: Animal) -> Measure:
-    """Held-out variance explained, pooled over units."""
+    """Prepare the held-out variance that a layer explains, pooled over an animal's units."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING
     bins = bins_of(sessions)
     goal = means_of(sessions, bins)
-    noise = np.concatenate([_noise(s, bins) for s in sessions], axis=-1)
+    noise = np.concatenate([_estimate_noise(s, bins) for s in sessions], axis=-1)
     spread = (goal - goal.mean(axis=0)).std(axis=(0, 1))
     live = spread > 1e-12 * np.abs(goal).max(initial=0.0)
     if not live.any():
@@ -43,9 +42,9 @@ def linear(animal: Animal) -> Measure:
         float(((goal[i] - np.delete(goal, i, axis=0).mean(axis=0)) ** 2).sum())
         for i in range(len(goal))
     )
-    # Of what is held out, and of the mean of the others that it is measured from.
+    # Noise of the held-out response, and of the mean of the others that is subtracted from it.
     others = len(goal) - 1
-    unknown = float(noise.sum() * (1 + 1 / others))
+    unexplained = float(noise.sum() * (1 + 1 / others))
 
     def fit(layer: Floats) -> float:
         steps = np.nan_to_num(layer[:, : goal.shape[1]]) if bins else mean_pattern(layer)[:, None]
@@ -55,13 +54,13 @@ def linear(animal: Animal) -> Measure:
         steps = np.pad(steps, ((0, 0), (0, max(missing, 0)), (0, 0)))
         return 1 - float(((goal - predicted(steps, goal)) ** 2).sum()) / variance
 
-    return Measure(1 - unknown / variance, fit, MINIMUM_CEILING**2)
+    return Measure(1 - unexplained / variance, fit, MINIMUM_CEILING**2)
 
 
 def predicted(layer: Floats, goal: Floats) -> Floats:
-    """Predict the goal's responses to every stimulus from those to the others.
+    """Predict the goal's responses to every stimulus by regressions fitted to the others.
 
-    From a layer (stimulus, bin, feature) and a goal (stimulus, bin, unit) to the goal's shape.
+    The layer is (stimulus, bin, feature), the goal (stimulus, bin, unit), and so is the result.
     """
     out = np.empty_like(goal)
     for i in range(len(goal)):
@@ -69,17 +68,17 @@ def predicted(layer: Floats, goal: Floats) -> Floats:
         errors = np.zeros(len(PENALTIES))
         for j in rest:
             inner = [k for k in rest if k != j]
-            for p, guess in enumerate(_ridge(layer, goal, inner, j, PENALTIES)):
+            for p, guess in enumerate(_predict_ridge(layer, goal, inner, j, PENALTIES)):
                 errors[p] += ((guess - goal[j]) ** 2).sum()
         best = PENALTIES[int(errors.argmin())]
-        out[i] = _ridge(layer, goal, rest, i, (best,))[0]
+        out[i] = _predict_ridge(layer, goal, rest, i, (best,))[0]
     return out
 
 
-def _ridge(
+def _predict_ridge(
     layer: Floats, goal: Floats, known: list[int], held: int, penalties: tuple[float, ...]
 ) -> list[Floats]:
-    """Predictions (bin, unit) of a stimulus from the known ones, one for every penalty."""
+    """Predict the response (bin, unit) to a held-out stimulus, once for every penalty."""
     middle, level = layer[known].mean(axis=0), goal[known].mean(axis=0)
     x = (layer[known] - middle).reshape(-1, layer.shape[-1])
     y = (goal[known] - level).reshape(-1, goal.shape[-1])
@@ -89,12 +88,12 @@ def _ridge(
     size = float(values.mean())
     if size <= 0:
         return [level] * len(penalties)
-    turned, towards = vectors.T @ y, (new @ x.T) @ vectors
-    return [level + (towards / (values + penalty * size)) @ turned for penalty in penalties]
+    rotated, projected = vectors.T @ y, (new @ x.T) @ vectors
+    return [level + (projected / (values + penalty * size)) @ rotated for penalty in penalties]
 
 
-def _noise(session: NeuralSession, bins: int) -> Floats:
-    """Variance of the mean over trials: (stimulus, bin, unit)."""
+def _estimate_noise(session: NeuralSession, bins: int) -> Floats:
+    """Estimate the variance of the mean over trials: (stimulus, bin, unit)."""
     values = values_of(session, bins)
     out = np.empty((len(session.stimuli), *values.shape[1:]))
     for k in range(len(session.stimuli)):

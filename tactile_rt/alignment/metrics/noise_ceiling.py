@@ -1,7 +1,7 @@
-"""Means of an animal's trials, and of random halves of them.
+"""Means over an animal's trials and over random halves of them, and the noise ceiling.
 
-Halves are drawn within every session and stimulus; how two halves agree says how far their whole
-can be relied on (Spearman-Brown). Bins that some trials do not reach are means over those that do.
+Halves are drawn within every session and stimulus; their agreement gives the reliability of the
+whole (Spearman-Brown). A bin that some trials do not reach is averaged over those that do.
 """
 
 import numpy as np
@@ -19,33 +19,33 @@ LONGEST = 22  # bins: the steps of the models
 
 
 def sessions_of(animal: Animal) -> tuple[NeuralSession, ...]:
-    """The sessions with enough trials of every stimulus; none if they have too few units."""
+    """Return the sessions with enough trials per stimulus; none if their units are too few."""
     kept = tuple(s for s in animal.sessions if s.trials.min() >= MINIMUM_TRIALS)
     return kept if sum(s.rates.shape[1] for s in kept) >= MINIMUM_UNITS else ()
 
 
 def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
-    """The bins that enough trials of every stimulus reach in all sessions; 0 without any."""
+    """Count first bins that enough trials per stimulus reach in all sessions; 0 without courses."""
     reached = [LONGEST]
     for session in sessions:
         if session.course is None:
             return 0
-        there = np.asarray(np.isfinite(session.course).all(axis=2))  # (trial, bin)
-        trials = [there[session.stimulus == k].sum(axis=0) for k in range(len(session.stimuli))]
+        finite = np.asarray(np.isfinite(session.course).all(axis=2))  # (trial, bin)
+        trials = [finite[session.stimulus == k].sum(axis=0) for k in range(len(session.stimuli))]
         enough = np.min(trials, axis=0) >= MINIMUM_TRIALS
         reached.append(int(enough.size if enough.all() else enough.argmin()))
     return min(reached)
 
 
 def values_of(session: NeuralSession, bins: int) -> Floats:
-    """Rates (trial, bin, unit): the course's first bins, or with none, one bin of whole rates."""
+    """Return rates (trial, bin, unit) of the first bins, or one bin of whole trials."""
     if bins and session.course is not None:
         return session.course[:, :bins]
     return session.rates[:, None]
 
 
 def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.bool_]:
-    """Random divisions of a session's trials: (division, trial), whether it is in half 1."""
+    """Draw random divisions of a session's trials: (division, trial), True for half 1."""
     rng = np.random.default_rng([SEED, len(session.stimulus)])
     first = np.zeros((number, len(session.stimulus)), dtype=np.bool_)
     for stimulus in range(len(session.stimuli)):
@@ -56,17 +56,17 @@ def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.boo
 
 
 def half_means(session: NeuralSession, bins: int, number: int = DIVISIONS) -> Floats:
-    """Means of both halves of every division: (division, 2, stimulus, bin, unit)."""
+    """Compute means of both halves of every division: (division, 2, stimulus, bin, unit)."""
     values = values_of(session, bins)
     first = divisions(session, number)
-    return np.stack([_means(values, session, half) for half in (first, ~first)], axis=1)
+    return np.stack([_average_trials(values, session, half) for half in (first, ~first)], axis=1)
 
 
 def means_of(sessions: tuple[NeuralSession, ...], bins: int) -> Floats:
-    """Means over all trials of the units of all sessions: (stimulus, bin, unit)."""
+    """Compute means over all trials, for the units of all sessions: (stimulus, bin, unit)."""
     return np.concatenate(
         [
-            _means(values_of(s, bins), s, np.ones((1, len(s.stimulus)), np.bool_))[0]
+            _average_trials(values_of(s, bins), s, np.ones((1, len(s.stimulus)), np.bool_))[0]
             for s in sessions
         ],
         axis=-1,
@@ -74,25 +74,25 @@ def means_of(sessions: tuple[NeuralSession, ...], bins: int) -> Floats:
 
 
 def ceiling_of(agreements: Floats) -> float:
-    """Return what a perfect model reaches: the root of the reliability of halves.
+    """Return the ceiling: the root of the reliability, from the agreements of halves.
 
-    The agreements (division,) are between both halves; NaN where reliability is not above 0.
+    The agreements (division,) are correlations or cosines; NaN if the reliability is not above 0.
     """
-    there = agreements[np.isfinite(agreements)]
-    reliability = float(spearman_brown(there.mean())) if there.size else np.nan
+    finite = agreements[np.isfinite(agreements)]
+    reliability = float(spearman_brown(finite.mean())) if finite.size else np.nan
     return float(np.sqrt(reliability)) if reliability > 0 else float("nan")
 
 
-def _means(values: Floats, session: NeuralSession, chosen: NDArray[np.bool_]) -> Floats:
+def _average_trials(values: Floats, session: NeuralSession, chosen: NDArray[np.bool_]) -> Floats:
     """Average chosen trials (division, trial) by stimulus: (division, stimulus, bin, unit)."""
     trials, bins, units = values.shape
-    there = np.asarray(np.isfinite(values).all(axis=2), dtype=np.float64)  # (trial, bin)
+    finite = np.asarray(np.isfinite(values).all(axis=2), dtype=np.float64)  # (trial, bin)
     flat = np.nan_to_num(values).reshape(trials, -1)
     out = np.empty((len(chosen), len(session.stimuli), bins, units))
     for k in range(len(session.stimuli)):
         rows = np.flatnonzero(session.stimulus == k)
         weights = chosen[:, rows].astype(np.float64)
-        number = weights @ there[rows]
+        number = weights @ finite[rows]
         total = (weights @ flat[rows]).reshape(-1, bins, units)
         out[:, k] = total / np.where(number > 0, number, np.nan)[..., None]
     return out

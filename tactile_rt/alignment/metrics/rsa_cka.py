@@ -3,10 +3,10 @@
 - `rsa`: Pearson's r of the dissimilarities 1 - r (Kriegeskorte 2008), mean over time.
 - `rsa_time`: the same in each bin of 45 ms, which is a step of the model, both counted from the
   first contact; r and ceiling are each averaged over the bins in which the animal is reliable. In
-  a bin in which a layer does not tell the stimuli apart it fits by 0.
-- `cka`: the cosine of the U-centred linear kernels. Dropping the diagonal and centring so makes
-  the mean of both HSIC and noise zero (Song et al. 2012, equation 5), where the usual linear CKA
-  of few stimuli and many units is near 1 for any pair.
+  a bin in which a layer responds to all stimuli alike, its fit is 0.
+- `cka`: the cosine of the U-centred linear kernels. Dropping the diagonal and U-centring make the
+  mean of HSIC, and of the noise in it, zero (Song et al. 2012, equation 5), whereas the usual
+  linear CKA of few stimuli and many units is near 1 for any pair.
 
 The ceiling is the root of the Spearman-Brown reliability of the animal's own geometry.
 """
@@ -20,22 +20,22 @@ from tactile_rt.alignment.metrics import Measure, noise_ceiling
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
 
-NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # of an animal that has too little
+NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # for too few trials or units
 
 
 def rsa(animal: Animal) -> Measure:
-    """Representational similarity of mean responses."""
+    """Prepare the representational similarity of mean responses."""
     return _compare_means(animal, rdm, pearson)
 
 
 def rsa_time(animal: Animal) -> Measure:
-    """Representational similarity in every bin of 45 ms."""
+    """Prepare the representational similarity in every bin of 45 ms."""
     found = time_course(animal)
     if found is None:
         return NOTHING
     goal, ceilings = found
-    there = np.isfinite(ceilings)
-    if not there.any():
+    usable = np.isfinite(ceilings)
+    if not usable.any():
         return NOTHING
 
     def fit(layer: Floats) -> float:
@@ -45,13 +45,13 @@ def rsa_time(animal: Animal) -> Measure:
             return float("nan")
         whole = np.zeros(len(goal))
         whole[:bins] = np.nan_to_num(r)
-        return float(whole[there].mean())
+        return float(whole[usable].mean())
 
-    return Measure(float(ceilings[there].mean()), fit)
+    return Measure(float(ceilings[usable].mean()), fit)
 
 
 def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
-    """RDMs (bin, pair) of an animal and the ceiling (bin,) of each; None without a time course."""
+    """Compute an animal's RDMs (bin, pair) and ceilings (bin,); None without time bins."""
     sessions = noise_ceiling.sessions_of(animal)
     bins = noise_ceiling.bins_of(sessions) if sessions else 0
     if not bins:
@@ -64,14 +64,14 @@ def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
 
 
 def cka(animal: Animal) -> Measure:
-    """Centred kernel alignment of mean responses, U-centred."""
+    """Prepare the centred kernel alignment of mean responses, U-centred."""
     return _compare_means(animal, u_centred, cosine)
 
 
 def _compare_means(
     animal: Animal, form: Callable[[Floats], Floats], agree: Callable[[Floats, Floats], Floats]
 ) -> Measure:
-    """Measure how mean responses agree in a form such as their RDM."""
+    """Prepare the agreement of mean responses in a form such as their RDM."""
     sessions = noise_ceiling.sessions_of(animal)
     if not sessions:
         return NOTHING
@@ -85,7 +85,7 @@ def _compare_means(
 
 
 def u_centred(patterns: Floats) -> Floats:
-    """The U-centred linear kernel of responses (..., n, unit), its entries above the diagonal.
+    """Compute the U-centred linear kernel's upper entries from responses (..., n, unit).
 
     Returns:
         (..., n (n - 1) / 2), for n of at least 4.
@@ -104,14 +104,14 @@ def u_centred(patterns: Floats) -> Floats:
 
 
 def cosine(a: Floats, b: Floats) -> Floats:
-    """Cosine along the last axis; NaN where a vector is zero."""
+    """Return the cosine along the last axis; NaN where a vector is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
         return np.asarray((a * b).sum(axis=-1) / np.where(lengths > 0, lengths, np.nan))
 
 
 def mean_pattern(layer: Floats) -> Floats:
-    """Mean over the steps that input reaches: (stimulus, step, unit) -> (stimulus, unit)."""
+    """Average over the steps that input reaches: (stimulus, step, unit) -> (stimulus, unit)."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a layer that no input reaches is NaN
+        warnings.simplefilter("ignore", RuntimeWarning)  # NaN for a layer that no input reaches
         return np.asarray(np.nanmean(layer, axis=1))
