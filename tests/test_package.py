@@ -108,9 +108,9 @@ def test_neither_does_running_a_model() -> None:
 import numpy as np
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 spec = load_model(shipped_model())[1].array
-for chunk in cut(np.zeros((100, *spec.shape)), spec.rate_hz):
+for chunk in cut_chunks(np.zeros((100, *spec.shape)), spec.rate_hz):
     Classifier(shipped_model(), spec).push(chunk)
 """
     assert not modules_after(code) & set(HEAVY)

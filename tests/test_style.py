@@ -15,7 +15,7 @@ FILE = Path(__file__).with_name("style.txt")
 WORDS = 15  # of a docstring's first sentence
 # A function does something: its name is a verb. A true conversion may be a participle.
 PARTICIPLE = re.compile(
-    r"_*(?:(?!feed)[a-z]+ed|said|told|kept|heard|found|made|drawn|taken|given|sent|left|seen|felt|cut|put"
+    r"_*(?:(?!(?:feed|embed)$)[a-z]+ed|said|told|kept|heard|found|made|drawn|taken|given|sent|left|seen|felt"
     r"|built|shown|known|written|held|met|lost|meant|begun|of_[a-z_]+)"
 )
 # Its first line is an imperative: not a riddle about what comes out.

@@ -22,7 +22,7 @@ from bench.perception.geometry import Bounds, measure_bounds
 from bench.perception.methods import Method, baselines, of_kinds, onnx_model
 from bench.perception.scores import Figures, robustness, score
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.models.datasets import SweepSet, joined
+from tactile_rt.models.datasets import SweepSet, join_sets
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation.measured_coverage import (
     Coverage,
@@ -145,7 +145,7 @@ def measure(
         }
         covered = {name: measure_coverage(path, *one) for name, one in on.items()}
         results.coverage[path.stem] = {n: c for n, c in covered.items() if c is not None}
-        every = joined([tests[OBJECTS], tests[LEANING]])
+        every = join_sets([tests[OBJECTS], tests[LEANING]])
         for name, test in {OBJECTS: tests[OBJECTS], BOTH: every}.items():
             if enrolled := measure_enrolment(path, test):
                 results.enrolment.setdefault(path.stem, {})[name] = enrolled

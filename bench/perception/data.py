@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.perception.folds import KINDS, hold_out_makers
-from tactile_rt.models.datasets import SweepSet, joined
+from tactile_rt.models.datasets import SweepSet, join_sets
 from tactile_rt.sets.manifest import OUTLIERS, WITHHELD, SweepManifest
 from tactile_rt.sets.objects import Sweeps
 from tactile_rt.sim_backend.objects.object_sets import Origin
@@ -92,7 +92,7 @@ class Data:
 
     def without_makers(self, makers: Sequence[str]) -> "Data":
         """The same with all objects of some makers in a split of their own, `MAKER`."""
-        whole = joined([one for one in self.sets.values() if len(one.sweeps)])
+        whole = join_sets([one for one in self.sets.values() if len(one.sweeps)])
         split = hold_out_makers(self.sets["train"].manifest, self.origins, makers).split
         sets = {
             side: whole[np.flatnonzero(np.isin(whole.sweeps.objects, names))]

@@ -107,7 +107,9 @@ def false_touches(folder: Path, noise: float) -> float:
     for _ in make_sweeps(recipe, there, splits=("test",)):
         pass
     data = SweepSet.read(there, "test")
-    values = Disturbance(noise=noise).of_samples(data.sweeps.values, data, np.random.default_rng(0))
+    values = Disturbance(noise=noise).disturb_samples(
+        data.sweeps.values, data, np.random.default_rng(0)
+    )
     found = find_onsets(values, data.floor).start >= 0
     moving_s = (values.shape[1] - data.manifest.lead) * data.manifest.period_ns / 1e9
     return float(found.sum() / (len(found) * moving_s / 60))

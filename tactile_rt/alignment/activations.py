@@ -25,7 +25,7 @@ from tactile_rt.core.stream import ArraySpec, Timing
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
 from tactile_rt.models.attenders.mamba import MambaStack
-from tactile_rt.models.checkpoints import load_checkpoint, untrained
+from tactile_rt.models.checkpoints import build_untrained, load_checkpoint
 from tactile_rt.models.ead import EADConfig, TactileClassifier, count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
@@ -50,7 +50,7 @@ def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0
     """Return the layers of a checkpoint's network with random weights, as a control."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = _draw_first_weights(untrained(saved), saved.get("config"))
+        model = _draw_first_weights(build_untrained(saved), saved.get("config"))
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 

@@ -148,7 +148,7 @@ def with_cells(
     return Alignments(every, tuple(columns), tuple(map(tuple, cells)), (card,), texts)
 
 
-def joined(boards: Sequence[Alignments]) -> Alignments:
+def join_boards(boards: Sequence[Alignments]) -> Alignments:
     """Join boards of the same rows side by side."""
     return msgspec.structs.replace(
         boards[0],

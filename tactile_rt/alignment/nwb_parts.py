@@ -33,7 +33,7 @@ FAR_S = 3600.0  # spikes are far if outside the trials by more than this and tha
 FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; smaller shares are mistakes or chance
 
 
-def stored(file: Any, name: str) -> NDArray[Any]:
+def read_column(file: Any, name: str) -> NDArray[Any]:
     """Read a column as stored; it must have one dimension and not be too large."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
@@ -52,7 +52,7 @@ def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
     if missing:
         lacks = f"lacks the column{'s' * (len(missing) > 1)} {name_some(missing)}"
         raise ConfigError(f"{TRIALS} {lacks} (it has {', '.join(sorted(table))})")
-    columns = {name: stored(table, name) for name in COLUMNS}
+    columns = {name: read_column(table, name) for name in COLUMNS}
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ConfigError(f"columns of {TRIALS} differ in length: {lengths}")
@@ -69,7 +69,7 @@ def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
         table = found[name]
         if "start_time" not in table:
             raise ConfigError(f"{table.name} lacks the column start_time")
-        starts = numbers(stored(table, "start_time"), f"{name} start_time")
+        starts = numbers(read_column(table, "start_time"), f"{name} start_time")
         end = last.get(WHISKER + name.removeprefix(CONTACTS), max(last.values(), default=np.inf))
         good = np.isfinite(starts) & (starts <= end)
         if not good.all():
@@ -103,8 +103,8 @@ def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
     for name in ("units/spike_times", "units/spike_times_index"):
         if name not in file:
             raise ConfigError(f"has no {name}: is this a session with spikes?")
-    times = numbers(stored(file, "units/spike_times"), "units/spike_times")
-    index = stored(file, "units/spike_times_index")
+    times = numbers(read_column(file, "units/spike_times"), "units/spike_times")
+    index = read_column(file, "units/spike_times_index")
     edges = np.concatenate([[0], index.astype(np.int64) if index.dtype.kind in "iu" else [-1]])
     if index.size == 0 or (np.diff(edges) < 0).any() or edges[-1] != len(times):
         raise ConfigError(
@@ -196,7 +196,7 @@ def unit_column(
     """Read a column (unit,) as numbers, all in `among` if given; None if unusable."""
     if name not in file.get("units", {}):
         return None
-    values = stored(file["units"], name)
+    values = read_column(file["units"], name)
     if len(values) != units or values.dtype.kind not in "fiub":
         why = f"it is not a number for each of {units} units"
     elif among and (odd := np.flatnonzero(~np.isin(values, among))).size:

@@ -55,7 +55,7 @@ def rdm(patterns: ArrayLike) -> Floats:
     Returns:
         (..., pair). NaN where one of the two responses is not finite or the same in all units.
     """
-    unit_length = normalised(patterns)
+    unit_length = normalise_vectors(patterns)
     correlation = np.matmul(unit_length, np.swapaxes(unit_length, -1, -2))
     i, j = upper(unit_length.shape[-2])
     return np.asarray(1 - correlation[..., i, j])
@@ -67,7 +67,7 @@ def pearson(a: ArrayLike, b: ArrayLike) -> Floats:
     Returns:
         (...), NaN where a vector is constant or not finite.
     """
-    return np.asarray((normalised(a) * normalised(b)).sum(axis=-1))
+    return np.asarray((normalise_vectors(a) * normalise_vectors(b)).sum(axis=-1))
 
 
 def rsa(a: ArrayLike, b: ArrayLike) -> float:
@@ -108,7 +108,7 @@ def relabellings(stimuli: int) -> NDArray[np.intp]:
     return entries
 
 
-def normalised(values: ArrayLike) -> Floats:
+def normalise_vectors(values: ArrayLike) -> Floats:
     """Centre vectors (..., n) and scale them to length one: products are Pearson's r.
 
     Returns:

@@ -12,7 +12,7 @@ from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_be
 from tactile_rt.alignment.gate import neural_checks
 from tactile_rt.alignment.json_file import Number, read_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.rdm import Floats, normalised, upper
+from tactile_rt.alignment.rdm import Floats, normalise_vectors, upper
 from tactile_rt.alignment.scoring import Score, score
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
@@ -98,7 +98,7 @@ def _note_missing_rdms(
     """Yield notes on layers without an RDM and so without score, one per cause."""
     found: dict[tuple[str, ...], list[str]] = {}
     for layer, responses in patterns.items():
-        varies = np.asarray(np.isfinite(normalised(responses)).all(axis=1))
+        varies = np.asarray(np.isfinite(normalise_vectors(responses)).all(axis=1))
         if not varies.all():
             alike = tuple(s for s, good in zip(names, varies, strict=True) if not good)
             found.setdefault(alike, []).append(layer)

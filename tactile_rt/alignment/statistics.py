@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import Floats, count_stimuli, normalised, relabellings
+from tactile_rt.alignment.rdm import Floats, count_stimuli, normalise_vectors, relabellings
 
 # Values that Student's t exceeds in one of 8 or 10 cases, for 1, 2, ... degrees of freedom; the
 # last is that of the normal distribution, for more degrees.
@@ -83,9 +83,9 @@ def max_statistic(
         factors: (target,), finite; they correct a target's correlations for its noise.
         statistic: function of corrected correlations (..., layer, target).
     """
-    unit = normalised(rdms)  # (layer, pair): relabelling keeps mean and length
+    unit = normalise_vectors(rdms)  # (layer, pair): relabelling keeps mean and length
     unit = unit[np.isfinite(unit).all(axis=-1)]
-    goal = normalised(targets) * np.asarray(factors, dtype=np.float64)[:, None]
+    goal = normalise_vectors(targets) * np.asarray(factors, dtype=np.float64)[:, None]
     ways = relabellings(count_stimuli(unit.shape[-1]))
     if unit.size and goal.size:
         together = max(1, AT_ONCE // unit.size)

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import Animal, NeuralSession, rates_sha256
-from tactile_rt.alignment.rdm import CONSTANT, Floats, normalised, pearson, upper
+from tactile_rt.alignment.rdm import CONSTANT, Floats, normalise_vectors, pearson, upper
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
 
@@ -91,7 +91,7 @@ class _Pool:
         rdms = self.halves.rdm()
         parts = self.quarters.rdm()
         r = pearson(parts[..., 0, :], parts[..., 1, :])
-        unit = normalised(rdms)
+        unit = normalise_vectors(rdms)
         valid = enough & np.isfinite(r) & np.isfinite(unit).all(axis=-1)
         units = round(float(self.halves.units.mean()))
         if 2 * valid.sum() < valid.size:
@@ -175,7 +175,7 @@ def _make_pools(
     """Pool all units, and the reliable ones, of an animal's canonical sessions with keys."""
     every, kept = [], []
     for session, key in sessions:
-        made = divided(session, divisions, np.random.default_rng([seed, key]))
+        made = divide_trials(session, divisions, np.random.default_rng([seed, key]))
         every.append(_Pool(moments_of(made.halves), moments_of(made.quarters)))
         chosen = made.reliable[:, ::-1]  # chosen on the half that is not scored
         kept.append(
@@ -195,7 +195,7 @@ class Divided:
     reliable: NDArray[np.bool_]
 
 
-def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) -> Divided:
+def divide_trials(session: NeuralSession, divisions: int, rng: np.random.Generator) -> Divided:
     """Divide trials within every stimulus at random.
 
     A unit's reliability is the share of the variance over stimuli of its mean responses that noise,

@@ -9,7 +9,7 @@ tare_measurement    offsets and noise, measured while nothing is touched
 calibration_fit     fit of the matrix to a table of known loads
 """
 
-from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declared
+from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declare_calibration
 from tactile_rt.calibration.calibration_fit import (
     Fit,
     LoadTable,
@@ -31,7 +31,7 @@ __all__ = [
     "calibrate",
     "calibration_path",
     "declare",
-    "declared",
+    "declare_calibration",
     "load_calibration",
     "raw_readings",
     "read_loads",

@@ -57,10 +57,10 @@ def declare(source: Source, array: ArraySpec) -> Source:
         return source
     if isinstance(source, CalibratedSource):
         return CalibratedSource(source.source, replace(source.calibration, array=array))
-    return CalibratedSource(source, declared(source.spec, array))
+    return CalibratedSource(source, declare_calibration(source.spec, array))
 
 
-def declared(spec: ArraySpec, array: ArraySpec) -> Calibration:
+def declare_calibration(spec: ArraySpec, array: ArraySpec) -> Calibration:
     """Make the calibration that only declares samples of one array to be of another."""
     device = re.sub(r"[^\w.:+-]+", "-", spec.name, flags=re.ASCII).strip(".-") or "device"
     return replace(Calibration.of(device, spec), array=array)

@@ -320,7 +320,7 @@ class Calibration:
             None if lacking.all() else lacking,
         )
 
-    def noted(self, line: str, **changes: Any) -> "Calibration":
+    def with_note(self, line: str, **changes: Any) -> "Calibration":
         """Return a copy with changed attributes, and one more line of history."""
         return replace(self, history=(*self.history, line)[-HISTORY:], **changes)
 

@@ -93,7 +93,9 @@ class RestLevels:
         self._levels: deque[_Level] = deque(maxlen=LEVELS)
         self._current: _Level | None = None  # None while the signal moves
 
-    def found(self, sample: Floats, known: NDArray[np.bool_], sigma: Floats, quiet: int) -> bool:
+    def confirm_rest(
+        self, sample: Floats, known: NDArray[np.bool_], sigma: Floats, quiet: int
+    ) -> bool:
         """Take one sample; return True if it confirms a level of rest.
 
         Args:

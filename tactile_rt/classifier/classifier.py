@@ -35,7 +35,7 @@ from tactile_rt.classifier.decision_rules import (
     fitting,
 )
 from tactile_rt.classifier.enrolment import identify
-from tactile_rt.classifier.model_card import decided, kind_columns, rated_noise
+from tactile_rt.classifier.model_card import choose_label, kind_columns, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.classifier.runtime import onnxruntime_names
@@ -393,11 +393,11 @@ class Classifier:
             self._stepper.reset(lane)
         logits = self._stepper.run()
         latency = time.perf_counter() - began
-        asked = self._lanes.asked(self._step)
+        asked = self._lanes.choose_lane(self._step)
         self._filled = 0
         self._step += 1
         self.stats.steps += 1
-        late = self._deadline.missed(t_ns, latency)
+        late = self._deadline.add_step(t_ns, latency)
         self.stats.late = self._deadline.late
         if self.skips.after_step(t_ns, latency):
             self._skip()
@@ -413,8 +413,8 @@ class Classifier:
             self._step, self._decided = 0, True
             self._stepper.begin(self._offset[self._order], self._sigma[self._order])
             return None
-        best = decided(self.card, probabilities, step)
-        final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
+        best = choose_label(self.card, probabilities, step)
+        final = step == self.card.steps or self._exit.may_end(best, float(probabilities[best]))
         # the rules were fitted on windows that begin at the onset
         rule = None if self._decided else self._set_rule
         left = rule.prediction_set(probabilities[: len(self.card.classes)], step) if rule else []

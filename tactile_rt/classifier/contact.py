@@ -168,7 +168,9 @@ class ContactDetector:
             self._quiet_for = 0 if (excess > RELEASE).any() else self._quiet_for + 1
             if self._quiet_for >= RELEASE_SAMPLES:
                 self.contact = False
-            elif self._rest.found(sample, valid & self.has_baseline, self._pooled, self._quiet):
+            elif self._rest.confirm_rest(
+                sample, valid & self.has_baseline, self._pooled, self._quiet
+            ):
                 self._restart_baseline(Drift())
             elif self._slope.add(self._now, sample, valid, self._pooled):
                 if self._slope.leads_to(self._middle(), self._level, self._pooled):

@@ -44,7 +44,7 @@ class OpenSetRule(msgspec.Struct, frozen=True):
 
     def fault(self, steps: int) -> str:
         """Return why the rule cannot be used for episodes of `steps` steps, or ""."""
-        if not named(self.score):
+        if not is_printable_name(self.score):
             return f"score must be 1 to {MAX_NAME} printable characters"
         if len(self.thresholds) not in (1, steps):
             return f"thresholds: {len(self.thresholds)} values, neither 1 nor one for {steps} steps"
@@ -81,7 +81,7 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
 
     def fault(self, steps: int) -> str:
         """Return why the rule cannot be used for episodes of `steps` steps, or ""."""
-        if not named(self.score):
+        if not is_printable_name(self.score):
             return f"score must be 1 to {MAX_NAME} printable characters"
         if len(self.quantiles) != steps:
             return f"quantiles: {len(self.quantiles)} values for {steps} steps"
@@ -122,7 +122,7 @@ def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
     return out
 
 
-def named(text: str) -> bool:
+def is_printable_name(text: str) -> bool:
     """Return whether a text can be a name on terminals, pages and in logs."""
     return 0 < len(text) <= MAX_NAME and text.isprintable()
 
@@ -156,7 +156,7 @@ class EarlyExit:
         """Begin an episode."""
         self._sure_for = 0
 
-    def reached(self, best: int, probability: float) -> bool:
+    def may_end(self, best: int, probability: float) -> bool:
         """Take a step's best class and probability; return whether the episode may end."""
         again = best == self._best
         self._best = best
@@ -173,7 +173,7 @@ class Lanes:
     A network with state can answer only for the window that began when its state was zero. With
     windows of n steps that begin every k steps, ceil(n / k) copies of the state run side by side,
     and each is zeroed when its window begins. `beginning` names the lane to zero before a step,
-    `asked` the lane that answers after it; steps are counted from 0.
+    `choose_lane` the lane that answers after it; steps are counted from 0.
 
     Args:
         every: steps from the beginning of one window to that of the next.
@@ -195,7 +195,7 @@ class Lanes:
         """Return the lane whose window begins with a step, or None."""
         return step // self.every % self.count if step % self.every == 0 else None
 
-    def asked(self, step: int) -> tuple[int, int] | None:
+    def choose_lane(self, step: int) -> tuple[int, int] | None:
         """Return the lane that answers after a step, with its own step; or None.
 
         A lane's steps are counted from 1. Until the first window is complete, its lane answers.
@@ -250,7 +250,7 @@ class Deadline:
         """Begin an episode, whose first late step may be reported."""
         self._reported = False
 
-    def missed(self, t_ns: int, took_s: float) -> bool:
+    def add_step(self, t_ns: int, took_s: float) -> bool:
         """Add a step to the backlog; return whether it is late.
 
         Args:

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.classifier.decision_rules import MAX_NAME, Count, Positive, Share, named
+from tactile_rt.classifier.decision_rules import MAX_NAME, Count, Positive, Share, is_printable_name
 
 NONE_OF_THESE = "none of these"  # the decision on an object that is not enrolled
 LOG_ODDS = "log odds"  # the score of an `IdentityRule`: of being the same object
@@ -156,7 +156,7 @@ def enrolment_fault(
     if not all(np.isfinite(one).all() for one in numbers):
         return "identity or enrolled: numbers that are none"
     names = [one.name for one in objects]
-    if len({*names, NONE_OF_THESE}) <= len(names) or not all(map(named, names)):
+    if len({*names, NONE_OF_THESE}) <= len(names) or not all(map(is_printable_name, names)):
         return f"names of enrolled objects repeat, are {NONE_OF_THESE!r}, or not printable"
     return ""
 

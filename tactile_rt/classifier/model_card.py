@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.calibration import declared
+from tactile_rt.calibration import declare_calibration
 from tactile_rt.classifier.decision_rules import (
     MAX_NAME,
     POSTERIOR,
@@ -24,7 +24,7 @@ from tactile_rt.classifier.decision_rules import (
     OpenSetRule,
     Positive,
     PredictionSetRule,
-    named,
+    is_printable_name,
 )
 from tactile_rt.classifier.enrolment import EnrolledObject, IdentityRule, enrolment_fault
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
@@ -194,7 +194,7 @@ def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp
     except SpecMismatch as error:
         do = "name a model of it"
         with suppress(SpecMismatch):
-            declared(spec, card.array)
+            declare_calibration(spec, card.array)
             do += f", or declare it as the model's: array={model}"
         raise SpecMismatch(
             f"{model} was made for another array than {spec.name!r}: {error}; {do}"
@@ -230,9 +230,9 @@ def parse_card(path: Path, text: str) -> ModelCard:
     if not card.labels or len(set(card.labels)) != len(card.labels):
         raise reject("labels are missing or repeat")
     # Decisions carry labels to terminals, pages and logs.
-    if not all(map(named, card.labels)):
+    if not all(map(is_printable_name, card.labels)):
         raise reject(f"labels must be 1 to {MAX_NAME} printable characters")
-    if card.license and not named(card.license):
+    if card.license and not is_printable_name(card.license):
         raise reject(f"a licence must be at most {MAX_NAME} printable characters")
     if not isinstance(card.provenance.get("unseen_objects", []), list):
         raise reject("unseen_objects of the provenance must be a list")
@@ -263,7 +263,7 @@ def parse_card(path: Path, text: str) -> ModelCard:
     for name, kinds in card.kinds.items():
         if name not in card.classes or not kinds or len(set(kinds)) != len(kinds):
             raise reject(f"kinds of {name[:MAX_NAME]!r}: it is no class, or they repeat")
-        if not all(map(named, kinds)):
+        if not all(map(is_printable_name, kinds)):
             raise reject(f"kinds must be 1 to {MAX_NAME} printable characters")
     if not card.names.keys() <= card.kinds.keys():
         raise reject("names have rules of a class without kinds")
@@ -282,7 +282,7 @@ def parse_card(path: Path, text: str) -> ModelCard:
     return card
 
 
-def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> int:
+def choose_label(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> int:
     """Return the index of the label that a model decides for.
 
     Args:

@@ -50,7 +50,7 @@ def fetch_recordings(
 ) -> None:
     """Download the needed part of published neural recordings."""
     from tactile_rt.alignment.datasets import find_dataset
-    from tactile_rt.alignment.datasets.fetching import counted, fetch, published_files
+    from tactile_rt.alignment.datasets.fetching import count_recorded, fetch, published_files
     from tactile_rt.alignment.selection import Selection
 
     dataset = find_dataset(name)
@@ -71,7 +71,7 @@ def fetch_recordings(
     with needing("align"):
         with share_bar("fetching") as tell:
             new, transferred = fetch(files, folder, tell)
-        mice, units, notes = counted([folder / file.name for file in files])
+        mice, units, notes = count_recorded([folder / file.name for file in files])
     for note in notes:
         typer.echo(note, err=True)
     size = sum(file.size for file in files)
@@ -113,7 +113,7 @@ def write_board(
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
     parts, models = list(dict.fromkeys(part or ["all"])), models or []
     with needing("train"):
-        from tactile_rt.alignment.board import joined, with_cells
+        from tactile_rt.alignment.board import join_boards, with_cells
         from tactile_rt.alignment.datasets import find_dataset
         from tactile_rt.alignment.loading import check_models, told_apart
         from tactile_rt.alignment.metrics import find_metric, metric_names
@@ -148,7 +148,7 @@ def write_board(
             with share_bar(f"scoring on {dataset.name}") as tell:
                 made = with_cells(rows, dataset, read.animals, parts, metrics, read.notes, tell)
             boards.append(made)
-        made = joined(boards)
+        made = join_boards(boards)
     if page:
         from tactile_rt.alignment.board_page import board_page
         from tactile_rt.alignment.html_page import write_page

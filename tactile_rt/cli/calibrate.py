@@ -57,7 +57,7 @@ def tare(
     new = {raw.spec.elements[i]: _round_row(measured.offset[i]) for i in tared}
     noise = {raw.spec.elements[i]: _round_row(measured.noise[i]) for i in tared}
     louder = [e for e in noise if _is_louder(noise[e], known.noise.get(e, ()))]
-    known = known.noted(
+    known = known.with_note(
         f"{_now()} tare: {measured.seconds:.3g} s, {measured.samples.max()} samples",
         tare={**known.tare, **new},
         noise={**known.noise, **noise},
@@ -215,7 +215,7 @@ def _add_fit(
             f"{table} has loads {', '.join(loads.axes)}; the other elements of {known.device} are "
             f"calibrated for {', '.join(known.output[0])}: give the same columns"
         )
-    return known.noted(
+    return known.with_note(
         f"{_now()} matrix of {element}: {len(loads.loads)} loads, condition {fit.condition:.3g}",
         output_channels=loads.axes,
         output_units=loads.units,

@@ -332,7 +332,7 @@ def _begin(folder: Path, source: "Source") -> "Lesson":
     else:
         typer.echo("going on without a rest: light touches will be missed")
     taught = FewShot(source.spec, measured_floor(chunks), measure_changes(chunks))
-    return Lesson.begun(folder, taught)
+    return Lesson.begin(folder, taught)
 
 
 def _record_rest(source: "Source") -> "list[Chunk]":

@@ -172,7 +172,7 @@ def whisk(
     pieces, described = {}, {}
     # The stimuli stand on the right of the head; for an array of the left side, on the left.
     left = all(w.base[0] < 0 for w in animal.whiskers)
-    head, mirror = (HEAD.mirrored(), np.array([-1.0, 1.0, 1.0])) if left else (HEAD, np.ones(3))
+    head, mirror = (HEAD.mirror(), np.array([-1.0, 1.0, 1.0])) if left else (HEAD, np.ones(3))
     if target is not None:
         thing = load_object(target, mesh)
         pieces[thing.name] = placing.place(thing, left)
@@ -184,7 +184,7 @@ def whisk(
         step = parse_point(spacing.step_mm, "step_mm")
         names = STIMULI if stimulus in (None, "all") else stimulus.split(",")
         for name in dict.fromkeys(n.strip() for n in names):
-            surface = Surface.named(name, step, spacing.radius_mm)
+            surface = Surface.make(name, step, spacing.radius_mm)
             pieces[name] = tuple(corners * mirror for corners in surface.pieces())
             described[name] = {
                 **asdict(surface),

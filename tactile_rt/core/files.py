@@ -125,7 +125,7 @@ def _raise_for(error: BaseException, hidden: Path, path: Path) -> None:
 
 
 @contextmanager
-def replaced(path: Path) -> Iterator[BinaryIO]:
+def replace_file(path: Path) -> Iterator[BinaryIO]:
     """Yield a file that is synced and takes its name when the block ends.
 
     Until then it is ``STEM.partial`` beside it, so that killed processes leave at most one; the

@@ -41,7 +41,7 @@ def added_names(group: str) -> tuple[str, ...]:
     return tuple(sorted(metadata.entry_points(group=group).names))
 
 
-def added(group: str, name: str) -> Any:
+def import_addition(group: str, name: str) -> Any:
     """Import what another package adds to a group by this name; None if none does.
 
     Raises:

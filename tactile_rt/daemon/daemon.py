@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.core.files import replaced
+from tactile_rt.core.files import replace_file
 from tactile_rt.core.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.admission import file_stamp, model_path
@@ -231,7 +231,7 @@ class Daemon:
         """Return UTC less monotonic time, now, ns."""
         return self._clock.utc_offset_ns()
 
-    def turned(self, name: str) -> None:
+    def note_turn(self, name: str) -> None:
         """Note a turn of a thread that is no part but must keep running."""
         self._turns.take(name)
 
@@ -305,11 +305,11 @@ class Daemon:
                 self.report(part.name, "abandoned", "it did not end in time", "error")
 
     def _watch(self) -> None:
-        self.turned("watch")
+        self.note_turn("watch")
         while not self._unwatch.wait(WATCH_S):
             self._report_starvation()
             self._renew_locks()
-            self.turned("watch")
+            self.note_turn("watch")
             for name, source in self._sources.copy().items():
                 on_it = [p for _, p in self._models.copy().values() if p.config.source == name]
                 sensor = next((p.sensor for p in on_it if p.sensor is not None), None)
@@ -354,7 +354,7 @@ class Daemon:
             return
         self._arrays = arrays
         try:
-            with replaced(self._memory) as file:
+            with replace_file(self._memory) as file:
                 file.write(msgspec.json.encode(arrays))
         except OSError as error:
             self.report("daemon", "memory", reason_of(error), "warning")

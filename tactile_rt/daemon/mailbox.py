@@ -95,7 +95,7 @@ class Hub:
         """Return the mailbox of this name, if any."""
         return self._boxes.get(name)
 
-    def wanted(self, kind: type) -> tuple[Mailbox, ...]:
+    def list_mailboxes(self, kind: type) -> tuple[Mailbox, ...]:
         """Return the mailboxes that want items of a class."""
         return self._by_type.get(kind, ())
 

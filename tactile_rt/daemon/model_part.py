@@ -316,7 +316,7 @@ class ModelPart(Part):
             self._set_contact(touching, t_ns, frame, offset)
         self._set_contact(classifier.detector.contact, newest, frame, offset)
         if not opened.stream.live:
-            for box in self._hub.wanted(Decision):
+            for box in self._hub.list_mailboxes(Decision):
                 box.wait_for_room(1.0)
 
     def _post(self, d: Classification, run: list[SourceChunk], opened: Opened, offset: int) -> None:

@@ -127,7 +127,7 @@ def _serve(
     reload: _Reload | None = None
     asked = False
     while True:
-        daemon.turned("main")
+        daemon.note_turn("main")
         if reload is not None and reload.hangs():
             daemon.refuse(f"{path}: {READ_S:g} s do not do to read it: does its disk answer?")
         if asked and (reload is None or reload.late or not reload.is_alive()):

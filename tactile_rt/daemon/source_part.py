@@ -339,7 +339,7 @@ class SourcePart(Part):
             self._device.tap(self._post_packet)
 
     def _post_packet(self, packet: Any, t_ns: int) -> None:
-        if self._hub.wanted(Packet) and not self._left:
+        if self._hub.list_mailboxes(Packet) and not self._left:
             self._hub.post(Packet(self.config.name, packet, t_ns))
 
     def _check_device(self, now: int) -> None:
@@ -366,7 +366,7 @@ class SourcePart(Part):
 
     def _await_room(self) -> None:
         """Wait for room in all mailboxes, for a source that waits for its reader."""
-        for box in self._hub.wanted(SourceChunk):
+        for box in self._hub.list_mailboxes(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))
 

@@ -289,7 +289,7 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
             return described
         found: type[Codec[Any]] = getattr(there, attribute)
         return found
-    theirs: type[Codec[Any]] | None = packages.added(packages.CODECS, f"{wire}.{name}")
+    theirs: type[Codec[Any]] | None = packages.import_addition(packages.CODECS, f"{wire}.{name}")
     if theirs is not None:
         return theirs
     known = {n for w, n in CODECS if w == wire}

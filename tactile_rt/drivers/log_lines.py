@@ -55,7 +55,7 @@ Found = tuple[str, Any, int | None] | None
 BESIDE: Final = ("", None, None)
 
 
-def of_candump(line: str) -> Found:
+def parse_candump(line: str) -> Found:
     """Read a line that candump printed or logged."""
     found = _CANDUMP.fullmatch(line)
     if found is None:
@@ -74,7 +74,7 @@ def of_candump(line: str) -> Found:
     return _to_frame(found["bus"], t_ns, number & _EXTENDED, extended, data, n, fd, remote)
 
 
-def of_gvret(line: str) -> Found:
+def parse_gvret(line: str) -> Found:
     """Read a line of a GVRET file, as saved by SavvyCAN."""
     if line.lower().startswith("time stamp,"):
         return BESIDE
@@ -232,7 +232,7 @@ class TrcLines:
         )  # fmt: skip
 
 
-def of_slcan(line: str) -> Found:
+def parse_slcan(line: str) -> Found:
     """Read a line that an slcan adapter sent."""
     if _SLCAN.fullmatch(line) is None:
         return None
@@ -240,7 +240,7 @@ def of_slcan(line: str) -> Found:
     return ("", frames, None) if frames else None
 
 
-def of_heard(line: str) -> Found:
+def parse_heard(line: str) -> Found:
     """Read a line that a terminal received and logged with its time."""
     found = _TERMINAL.fullmatch(line)
     if found is None:
@@ -250,7 +250,7 @@ def of_heard(line: str) -> Found:
     return None if t_ns is None else ("", f"{text}\n".encode(), t_ns)
 
 
-def of_hex(line: str) -> Found:
+def parse_hex(line: str) -> Found:
     """Read a line of hexadecimal bytes, such as of xxd or hexdump."""
     found = _HEX.fullmatch(line) or _XXD.fullmatch(line)
     if found is None:

@@ -50,8 +50,9 @@ DAY_NS: Final = 86_400 * NS_PER_S
 FALLING: Final = 0.2  # of the times of candump -td are less than the previous one
 
 LINES: Final[dict[str, Callable[[str], log_lines.Found]]] = {
-    "candump": log_lines.of_candump, "slcan": log_lines.of_slcan, "terminal": log_lines.of_heard,
-    "hex": log_lines.of_hex, "gvret": log_lines.of_gvret, "csv": log_lines.read_csv_line,
+    "candump": log_lines.parse_candump, "slcan": log_lines.parse_slcan,
+    "terminal": log_lines.parse_heard, "hex": log_lines.parse_hex, "gvret": log_lines.parse_gvret,
+    "csv": log_lines.read_csv_line,
 }  # fmt: skip
 Read = tuple[str, Any, int | None]  # bus, packet (empty for an error frame), time in ns
 
@@ -320,7 +321,9 @@ def _count_frames(parse: Callable[[str], log_lines.Found], lines: list[str]) -> 
 
 def _has_time_differences(path: Path) -> bool:
     """Return whether candump's times are differences (-td): they start at 0 and vary."""
-    found = [_try_parse(log_lines.of_candump, line)[0] for line in _split_lines(_read_head(path))]
+    found = [
+        _try_parse(log_lines.parse_candump, line)[0] for line in _split_lines(_read_head(path))
+    ]
     times = [one[2] for one in found if one is not None and one[2] is not None]
     if len(times) < 3 or times[0]:
         return False
@@ -356,7 +359,9 @@ def _guess_form(path: Path) -> str:
         if _count_frames(LINES[form], lines) >= most:
             return form
     # A table of two-digit numbers looks hexadecimal, too: only letters prove that it is bytes.
-    hexes = [x for x in (_try_parse(log_lines.of_hex, line)[0] for line in lines) if x is not None]
+    hexes = [
+        x for x in (_try_parse(log_lines.parse_hex, line)[0] for line in lines) if x is not None
+    ]
     data = b"".join(x[1] for x in hexes)
     letters = sum(b & 15 > 9 or b > 0x9F for b in data)
     right = len(hexes) >= most and len(data) >= 16 and letters > len(data) / 16

@@ -14,7 +14,7 @@ from tactile_rt.calibration import (
     CalibratedSource,
     Calibration,
     declare,
-    declared,
+    declare_calibration,
     load_calibration,
 )
 from tactile_rt.core.errors import ConfigError
@@ -39,7 +39,7 @@ class Prepared:
     open: Callable[[], Source]
     told: bool = False
 
-    def calibrated(self, calibration: Calibration) -> "Prepared":
+    def with_calibration(self, calibration: Calibration) -> "Prepared":
         """Return a copy whose samples are corrected by a calibration.
 
         Raises:
@@ -49,12 +49,12 @@ class Prepared:
         opened = self._open_then(lambda source: CalibratedSource(source, calibration))
         return Prepared(spec, opened, self.told)
 
-    def declared(self, array: ArraySpec) -> "Prepared":
+    def with_array(self, array: ArraySpec) -> "Prepared":
         """Return a copy that is a source of this array, see `calibration.declare`."""
         if self.told:
             return self
         known = self.spec
-        spec = declared(known, array).output_spec(known) if known else array
+        spec = declare_calibration(known, array).output_spec(known) if known else array
         return Prepared(spec, self._open_then(lambda source: declare(source, array)))
 
     def _open_then(self, change: Callable[[Source], Source]) -> Callable[[], Source]:
@@ -230,4 +230,4 @@ def _prepare(
     prepared = Prepared(codec.spec, opened, declared_array is not None)
     if not options.calibration:
         return prepared
-    return prepared.calibrated(load_calibration(options.calibration))
+    return prepared.with_calibration(load_calibration(options.calibration))

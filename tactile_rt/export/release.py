@@ -15,7 +15,7 @@ from tactile_rt.export.graph_forms import Precision
 from tactile_rt.export.identity import fit_identity
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.models.checkpoints import load_checkpoint, trained_on
-from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
+from tactile_rt.models.datasets import SweepSet, drawn_as, join_sets, relabel_set
 from tactile_rt.models.evaluation.measures import (
     Floats,
     Step,
@@ -53,11 +53,11 @@ def release(
     manifests = [manifest for _, manifest in there]
     known = join_manifests(manifests).categories
     sets = [  # with windows drawn as in training, also to fit the decision rules
-        drawn_as(relabelled(SweepSet.read_known(folder, manifest, "validation"), known), config)
+        drawn_as(relabel_set(SweepSet.read_known(folder, manifest, "validation"), known), config)
         for folder, manifest in there
         if manifest.split.get("validation")
     ]
-    validation = joined(sets)
+    validation = join_sets(sets)
     # Half clean, half at rated noise, as for the choice of the checkpoint.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)

@@ -311,7 +311,7 @@ def as_published(
     """
     if mirrored:
         frames = frames.flip(mirrored)
-    frames = turned(frames, turns)
+    frames = turn_images(frames, turns)
     if not reverse:
         return frames
     steps = frames.unflatten(2, (-1, channels))  # (batch, step, sub-step, channel, row, column)
@@ -319,7 +319,7 @@ def as_published(
     return back
 
 
-def turned(frames: Tensor, turns: int) -> Tensor:
+def turn_images(frames: Tensor, turns: int) -> Tensor:
     """Return images turned by quarters, counter-clockwise; what leaves the grid is lost."""
     if turns % 2 == 0:
         return frames.flip((-2, -1)) if turns % 4 else frames

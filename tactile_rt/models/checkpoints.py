@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
-from tactile_rt.core.files import check_no_pointer, open_regular, replaced
+from tactile_rt.core.files import check_no_pointer, open_regular, replace_file
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.ead_config import EADConfig
@@ -186,7 +186,7 @@ def load_checkpoint(path: Path) -> "tuple[TactileClassifier, dict[str, Any]]":
     describe_checkpoint(path)
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        model = untrained(saved)
+        model = build_untrained(saved)
         model.load_state_dict(saved["model"])
     except Exception as error:  # torch raises many unrelated types for a damaged file
         raise no_checkpoint(path, error) from None
@@ -244,7 +244,7 @@ def _name_rows(
     return [*labels, *names, *range(network["identity"])]
 
 
-def untrained(saved: dict[str, Any]) -> "TactileClassifier":
+def build_untrained(saved: dict[str, Any]) -> "TactileClassifier":
     """Make an untrained network as a checkpoint's, for the same channels."""
     from tactile_rt.models.ead import TactileClassifier
 
@@ -291,7 +291,7 @@ def save_whole(path: Path, state: dict[str, Any]) -> None:
     """
     import torch
 
-    with replaced(path) as file:
+    with replace_file(path) as file:
         try:
             torch.save(state, file)
         except RuntimeError as error:  # torch's own, raised after the file's

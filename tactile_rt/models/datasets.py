@@ -184,7 +184,7 @@ def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, Swee
     training, validating = [], []
     for folder, manifest in zip(folders, manifests, strict=True):
         names = ["train", *([OUTLIERS] if manifest.split.get(OUTLIERS) else [])]
-        splits = [joined([SweepSet.read_known(folder, manifest, name) for name in names])]
+        splits = [join_sets([SweepSet.read_known(folder, manifest, name) for name in names])]
         if manifest.split.get("validation") or len(folders) == 1:  # a further set may have none
             splits.append(SweepSet.read_known(folder, manifest, "validation"))
         check_sets(folder, splits)
@@ -192,10 +192,10 @@ def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, Swee
         validating += splits[1:]
     if not validating:
         raise RecordingError(f"{folders[0]} and the sets beside it have no validation objects")
-    return joined(training), relabelled(joined(validating), whole.categories)
+    return join_sets(training), relabel_set(join_sets(validating), whole.categories)
 
 
-def joined(sets: Sequence[SweepSet]) -> SweepSet:
+def join_sets(sets: Sequence[SweepSet]) -> SweepSet:
     """Join sets of one array, with all their categories and the faults of the first.
 
     Shorter sweeps repeat their rest before the touch, and their last sample after it.
@@ -207,7 +207,7 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
     parts = [
         (
             _pad_sweeps(one, manifest.lead, after),
-            relabelled(one, manifest.categories).sweeps.labels,
+            relabel_set(one, manifest.categories).sweeps.labels,
             one.sweeps.objects,
             one.recorded,
         )
@@ -229,7 +229,7 @@ def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
     return data.sweeps.values[:, np.concatenate([rest, touch])]
 
 
-def of_categories(data: SweepSet) -> SweepSet:
+def select_labelled(data: SweepSet) -> SweepSet:
     """Return the sweeps of its categories alone; training makes none of them implausible."""
     if not data.refusals:
         return data  # keeps the onsets that were found before
@@ -252,7 +252,7 @@ def with_faults(data: SweepSet, faults: SensorFaults) -> SweepSet:
     return replace(data, manifest=replace(data.manifest, recipe=recipe))
 
 
-def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
+def relabel_set(data: SweepSet, categories: Sequence[str]) -> SweepSet:
     """Return the set with labels among these categories, which include its own."""
     place = np.array([*(categories.index(c) for c in data.manifest.categories), -1])
     return replace(

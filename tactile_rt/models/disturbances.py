@@ -53,7 +53,7 @@ class Disturbance:
             if not getattr(self, name) >= 0:  # which NaN is not either
                 raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
 
-    def of_samples(self, values: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
+    def disturb_samples(self, values: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
         """Return sweeps as the contact detector receives them.
 
         Args:
@@ -87,7 +87,7 @@ class Disturbance:
             values = values + noise * data.noise * level[:, None, None, None]
         return values
 
-    def of_windows(self, samples: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
+    def disturb_windows(self, samples: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
         """Return windows (sweep, step, sub-step, element, channel), SI, with offset and drift."""
         steps, substeps = samples.shape[1:3]
         course = np.arange(1, steps * substeps + 1, dtype=np.float32) / (steps * substeps)

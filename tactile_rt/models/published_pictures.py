@@ -88,15 +88,17 @@ def as_drawn(frames: Tensor, done: Draw) -> Tensor:
     x = frames.unflatten(2, (-1, COLOURS))  # (batch, step, picture, colour, row, column)
     if done.mirrored:
         x = x.flip(-1)
-    x = jittered(x, done.order, done.by)
+    x = jitter_colours(x, done.order, done.by)
     if done.grey:
         x = grey(x).expand_as(x)
     if done.sigma:
-        x = blurred(x, done.sigma)
+        x = blur_pictures(x, done.sigma)
     return x.flatten(2, 3)
 
 
-def jittered(x: Tensor, order: Sequence[int], by: tuple[float, float, float, float]) -> Tensor:
+def jitter_colours(
+    x: Tensor, order: Sequence[int], by: tuple[float, float, float, float]
+) -> Tensor:
     """Change brightness, contrast, saturation and hue of pictures (..., colour, row, column)."""
     brightness, contrast, saturation, hue = by
     for what in order:
@@ -139,7 +141,7 @@ def with_hue(x: Tensor, by: float) -> Tensor:
     return choices.gather(-3, which.movedim(0, -3))
 
 
-def blurred(x: Tensor, sigma: float) -> Tensor:
+def blur_pictures(x: Tensor, sigma: float) -> Tensor:
     """Blur pictures (..., row, column) by a 3 x 3 Gaussian, mirrored at the edge."""
     at = torch.arange(-1.0, 2.0)
     kernel = torch.exp(-0.5 * (at / sigma) ** 2).to(x)

@@ -57,7 +57,7 @@ def read_budget(project: Project) -> Budget | None:
         budget = msgspec.json.decode(path.read_bytes(), type=Budget)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): {anew}") from None
-    if budget.described != described(project):
+    if budget.described != fingerprint_set(project):
         raise ConfigError(
             f"array.toml or sweeps.toml of {project.folder} has been changed since {project.build} "
             f"was begun: {anew}"
@@ -90,15 +90,17 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
     if not recipe.objects.generated:  # objects of a folder are all used, but swept less often
         chosen = recipe.objects
         most = max(1, int(sweeps / max(1, sum(map(len, objects.split.values())))))
-        return Budget(described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most))
+        return Budget(
+            fingerprint_set(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most)
+        )
     per_category = min(affordable, recipe.objects.per_category)
     test = max(round(TEST_SHARE * per_category), math.ceil(TEST_OBJECTS / kinds))
     test = max(1, min(test, per_category // 3))
     validation = max(1, round(VALIDATION_SHARE * per_category))
-    return Budget(described(project), per_category, validation, test, draws)
+    return Budget(fingerprint_set(project), per_category, validation, test, draws)
 
 
-def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
+def apply_budget(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
     """Return the recipe with the budget's numbers of objects and sweeps."""
     objects = recipe.objects
     if budget.test:
@@ -120,7 +122,7 @@ def _time_sweep(recipe: SweepRecipe) -> float:
     return float(np.mean(times[1:] or times))
 
 
-def described(project: Project) -> str:
+def fingerprint_set(project: Project) -> str:
     """Return a fingerprint of the files that define a project's sweep set."""
     digest = hashlib.sha256()
     for name in ("array.toml", "sweeps.toml"):

@@ -26,7 +26,7 @@ from tactile_rt.models.evaluation.records import Record, write
 from tactile_rt.models.training.config import Progress, TrainingConfig
 from tactile_rt.models.training.loop import train
 from tactile_rt.models.training.recipes import read_recipe
-from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
+from tactile_rt.project.budget import Budget, apply_budget, budget_sweeps, read_budget, write_budget
 from tactile_rt.project.folder import Project
 from tactile_rt.project.report import write_report
 from tactile_rt.sets.objects import read_skipped, write_skipped
@@ -143,7 +143,7 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
 def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tell) -> Path:
     """Make the sweep set, or as much as time permits; return its folder."""
     folder = project.build / "sweeps"
-    recipe = sized(project.recipe(), budget)
+    recipe = apply_budget(project.recipe(), budget)
     manifest = describe_set(recipe)
     left = manifest.names()
     total, finished = len(left), len(finished_objects(folder, left))

@@ -60,7 +60,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
         kinds=escape(", ".join(card.classes)),
         headlines=_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
         robust=_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
-        confused=_confusions(confused(table, card.classes)),
+        confused=_confusions(list_confusions(table, card.classes)),
         over_time=_picture(project.report / "accuracy_over_time.png"),
         confusion=_picture(project.report / "confusion.png"),
     )
@@ -69,7 +69,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
     return path
 
 
-def confused(
+def list_confusions(
     table: NDArray[np.int64], labels: Sequence[str], share: float = CONFUSED
 ) -> list[tuple[str, str, float]]:
     """Return (kind, kind it is taken for, share of its sweeps), worst first.

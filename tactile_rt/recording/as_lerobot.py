@@ -87,8 +87,8 @@ def write_dataset(
                     values.add(samples["values"], samples["valid"])
                     columns |= episode.columns(columns["frame_index"], fps)
                     file.write_table(_make_table(pa, schema, columns))
-            episode.statistics[STATE] = state.found()
-            episode.statistics[f"{TACTILE}.values"] = values.found(repeat=width)
+            episode.statistics[STATE] = state.compute()
+            episode.statistics[f"{TACTILE}.values"] = values.compute(repeat=width)
             for film in films:
                 episode.statistics[film.key] = meta.write_film(film, made, len(end), fps)
             beside = made / "meta" / "tactile_rt" / f"episode-{k:06d}.json"

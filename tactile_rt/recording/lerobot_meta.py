@@ -178,7 +178,7 @@ class Episode:
     first: int
     task: str
     task_index: int
-    # statistics of each feature, as `Statistics.found` gives them
+    # statistics of each feature, as `Statistics.compute` gives them
     statistics: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
 
     def columns(self, frame: NDArray[np.int64], fps: int) -> dict[str, NDArray[Any]]:
@@ -234,7 +234,7 @@ class Statistics:
         while len(self._kept) > MOST_KEPT:
             self._kept, self._every = self._kept[::2], 2 * self._every
 
-    def found(self, repeat: int = 0) -> dict[str, NDArray[Any]]:
+    def compute(self, repeat: int = 0) -> dict[str, NDArray[Any]]:
         """Return the statistics by LeRobot's names; 0 where no value was valid.
 
         Args:

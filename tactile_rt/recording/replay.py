@@ -117,7 +117,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
 
     prepared = Prepared(new_codec().spec, open_decoded)
     if about.calibration is not None:
-        prepared = prepared.calibrated(about.calibration)
+        prepared = prepared.with_calibration(about.calibration)
     # A device's own description is among the recorded packets.
     return replace(prepared, spec=about.spec) if same and not prepared.spec else prepared
 

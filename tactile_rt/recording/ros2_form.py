@@ -34,7 +34,7 @@ def name_channel(topic: str) -> str:
 def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes:
     """Convert a message of `layout` to its form in the file."""
     if name == layout.SAMPLES:
-        return messages.stamped(data, layout.last_ns(data) + utc_offset_ns, frame)
+        return messages.add_header(data, layout.last_ns(data) + utc_offset_ns, frame)
     if name == layout.DECISIONS:
         return messages.decision_message(data)
     return messages.event_message(data) if name in TEXTS else data
@@ -43,7 +43,7 @@ def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes
 def plain(name: str, data: bytes) -> bytes:
     """Convert a message back from its form in the file: the inverse of `put_in_form`."""
     if name == layout.SAMPLES:
-        return messages.unstamped(data)
+        return messages.strip_header(data)
     if name in TEXTS:
         return messages.json_of(
             messages.DECISION if name == layout.DECISIONS else messages.EVENT, data
@@ -63,6 +63,6 @@ def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
     if name == layout.WIRE:
         return len(data) >= 12 and data[:4] == CDR
     try:
-        return name != layout.SAMPLES or layout.is_samples(messages.unstamped(data), shape)
+        return name != layout.SAMPLES or layout.is_samples(messages.strip_header(data), shape)
     except ValueError:
         return False

@@ -76,7 +76,7 @@ class Surface:
             )
 
     @classmethod
-    def named(
+    def make(
         cls,
         name: str,
         step_mm: tuple[float, float, float] = (1.0, 1.0, 0.0),

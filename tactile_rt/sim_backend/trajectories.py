@@ -78,7 +78,7 @@ class Whisk:
         middle = (self.protraction_deg - self.retraction_deg) / 2
         amplitude = (self.protraction_deg + self.retraction_deg) / 2
         theta = np.radians(middle - amplitude * np.cos(phase)) * _ramp(t / self.ramp_s)
-        return coupled(np.repeat(theta, len(whiskers), axis=1), whiskers)
+        return couple_whiskers(np.repeat(theta, len(whiskers), axis=1), whiskers)
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def _ramp(x: Floats) -> Floats:
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def coupled(theta: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
+def couple_whiskers(theta: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
     """Add each row's elevation and torsion to protractions (n, whisker): (n, whisker, 3) rad."""
     slopes = np.array([[1.0, *_slopes(w.row)] for w in whiskers])
     turns: Floats = theta[:, :, None] * slopes

@@ -18,7 +18,7 @@ import numpy as np
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker
-from tactile_rt.sim_backend.trajectories import coupled
+from tactile_rt.sim_backend.trajectories import couple_whiskers
 
 LAG_S: Final = 0.04
 FASTEST_HZ: Final = 30.0  # a mouse explores at up to 25
@@ -147,7 +147,7 @@ class Drive:
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
         """Compute turns, see `Trajectory`; rows are coupled as in the rat."""
         theta = self.protraction(t_s)
-        return coupled(np.repeat(theta[:, None], len(whiskers), axis=1), whiskers)
+        return couple_whiskers(np.repeat(theta[:, None], len(whiskers), axis=1), whiskers)
 
 
 def _compute_angle(segment: _Segment, t_s: Floats) -> Floats:

@@ -139,7 +139,7 @@ class WhiskingSource(PacedSource):
             self._drive,
             profile,
             options.place(load_object(options.object, options), left) if options.object else (),
-            HEAD.mirrored() if left else HEAD,
+            HEAD.mirror() if left else HEAD,
         )
         steps = np.arange(round(SAMPLE_MS / profile.timestep_ms))
         self._steps_s = steps * (profile.timestep_ms * 1e-3)

@@ -90,8 +90,8 @@ def _prepare_source(url: str, calibration: str, array: str, check: bool) -> Prep
     spec = read_array(Path(file)) if file else None
     prepared = _prepare_scheme(url, scheme, target, fields, spec, check)
     if calibration:
-        prepared = prepared.calibrated(load_calibration(calibration))
-    return prepared if spec is None else prepared.declared(spec)
+        prepared = prepared.with_calibration(load_calibration(calibration))
+    return prepared if spec is None else prepared.with_array(spec)
 
 
 def _prepare_scheme(
@@ -116,7 +116,7 @@ def _prepare_scheme(
 
 
 def _find_added_source(url: str, scheme: str) -> Any:
-    found = packages.added(packages.SOURCES, scheme)
+    found = packages.import_addition(packages.SOURCES, scheme)
     if found is not None:
         return found
     known = sorted(f"{s}:" for s in {*SCHEMES, *packages.added_names(packages.SOURCES)})

@@ -42,7 +42,7 @@ class FeatureNetwork:
     thresholds: Floats  # (kernel,) output of a kernel above which it counts as high
 
     @classmethod
-    def drawn(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":
+    def draw(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":
         """Draw the network of an array from a seed, the same on every machine."""
         rng = np.random.default_rng(seed)
         signals = sum(cls._count_signals(spec, unit) for unit in dict.fromkeys(spec.units))

@@ -68,7 +68,7 @@ class Lesson:
     _largest: list[NDArray[np.float32]] = field(default_factory=list)  # of each listener
 
     @classmethod
-    def begun(cls, folder: Path, taught: FewShot) -> "Lesson":
+    def begin(cls, folder: Path, taught: FewShot) -> "Lesson":
         """Begin a few-shot lesson in a folder, which is created if missing."""
         _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)

@@ -67,7 +67,7 @@ class FewShot:
     @property
     def network(self) -> FeatureNetwork:
         """The network that computes the features."""
-        return FeatureNetwork.drawn(self.spec, self.timing.substeps, self.timing.steps)
+        return FeatureNetwork.draw(self.spec, self.timing.substeps, self.timing.steps)
 
     def describe(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
         """Return a touch's features (step, feature), from decisions of `write_features`' model."""
@@ -270,4 +270,4 @@ def _list_versions() -> dict[str, str]:
 
 
 def _serialise(graph: OnnxGraph, card: ModelCard) -> bytes:
-    return graph.serialised(card.name, {METADATA_KEY: msgspec.json.encode(card).decode()})
+    return graph.serialise(card.name, {METADATA_KEY: msgspec.json.encode(card).decode()})

@@ -110,7 +110,7 @@ class OnnxGraph:
         self._node(operator, inputs, [name], attributes)
         return name
 
-    def serialised(self, name: str, metadata: Mapping[str, str]) -> bytes:
+    def serialise(self, name: str, metadata: Mapping[str, str]) -> bytes:
         """Return the bytes of the file."""
         graph = b"".join(self.parts) + _bytes(2, name)
         pairs = (_bytes(14, _bytes(1, key) + _bytes(2, text)) for key, text in metadata.items())

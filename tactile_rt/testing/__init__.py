@@ -2,7 +2,7 @@
 emulated devices on real lines.
 
 spec = small_spec()
-source = ArraySource(spec, cut(signal, spec.rate_hz))
+source = ArraySource(spec, cut_chunks(signal, spec.rate_hz))
 
 with FakeSerial(signal, "native", spec=spec) as device, open_source(device.url) as source:
     chunk = source.read(timeout=1.0)
@@ -41,7 +41,9 @@ def small_spec(elements: int = 3, rate_hz: float = 1000.0) -> ArraySpec:
     )
 
 
-def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) -> list[Chunk]:
+def cut_chunks(
+    values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0
+) -> list[Chunk]:
     """Cut a signal into chunks of evenly spaced samples that are all valid.
 
     Args:
@@ -135,4 +137,4 @@ def _make_source(
     elements, channels = values.shape[1:]
     spec = spec or make_codec(wire, codec, dict(further.get("options") or {})).spec
     spec = spec or synthetic_spec(elements, channels, 1000.0)
-    return ArraySource(spec, cut(values, spec.rate_hz))
+    return ArraySource(spec, cut_chunks(values, spec.rate_hz))

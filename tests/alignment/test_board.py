@@ -10,7 +10,7 @@ from tactile_rt.alignment import board as boards
 from tactile_rt.alignment.board import (
     ANOTHER,
     BoardRow,
-    joined,
+    join_boards,
     traces_of,
     traces_of_stimuli,
     with_cells,
@@ -100,7 +100,7 @@ def test_what_cannot_be_had_is_empty(made):
 
 def test_boards_stand_side_by_side(made):
     board = made[0]
-    both = joined([board, board])
+    both = join_boards([board, board])
     assert len(both.columns) == 8 and len(both.datasets) == 2
     assert both.cells[0] == board.cells[0] * 2
 

@@ -13,7 +13,7 @@ from tactile_rt.alignment.example import Brain
 from tactile_rt.alignment.neural import Animal, NeuralSession, pad, published_layout
 from tactile_rt.alignment.paper_code import freeze_paper_code
 from tactile_rt.alignment.scoring import score, score_rdms
-from tactile_rt.alignment.strict import canonical, divided, freeze_strict
+from tactile_rt.alignment.strict import canonical, divide_trials, freeze_strict
 from tactile_rt.core.errors import ConfigError
 from tests.helpers.brains import animals, geometry, loop, padded, responses, session
 from tests.helpers.refusals import refusal
@@ -68,7 +68,7 @@ def test_a_division_is_of_all_trials_and_none_twice():
     trials = 9
     rates = np.tile(2.0 ** np.arange(trials), 6)[:, None]
     one = NeuralSession("mouse", "s", rates, np.repeat(np.arange(6), trials))
-    made = divided(one, 50, np.random.default_rng(0))
+    made = divide_trials(one, 50, np.random.default_rng(0))
     sizes = np.array([4, 5])[:, None, None]
     halves = np.round(made.halves * sizes).astype(int)
     assert (halves.sum(axis=1) == 2**trials - 1).all()
@@ -86,7 +86,7 @@ def test_a_unit_is_reliable_by_analysis_of_variance():
     marked = replace(one, rates=np.column_stack([one.rates, np.zeros(len(one.stimulus))]))
     for stimulus in range(6):
         marked.rates[marked.stimulus == stimulus, -1] = key
-    made = divided(marked, 10, np.random.default_rng(1))
+    made = divide_trials(marked, 10, np.random.default_rng(1))
     seen = set()
     for halves, reliable in zip(made.halves, made.reliable, strict=True):
         for mean, found in zip(halves, reliable, strict=True):
@@ -110,7 +110,7 @@ def test_a_score_is_the_mean_over_halves_of_units_chosen_on_the_other():
     (target,) = freeze_strict([animal], 30).targets
     model = responses(rng, shared, 50)
     made = [
-        divided(s, 30, np.random.default_rng([1234, key]))
+        divide_trials(s, 30, np.random.default_rng([1234, key]))
         for s, key in sorted((canonical(s) for s in animal.sessions), key=lambda pair: pair[1])
     ]
 

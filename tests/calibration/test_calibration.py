@@ -25,7 +25,7 @@ from tactile_rt.calibration import (
 )
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
 from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, SourceStats
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.refusals import refusal
 
 AXES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -42,7 +42,7 @@ def gauge_spec(elements: int = 3, channels: tuple[str, ...] = GAUGES) -> ArraySp
 
 
 def chunk_of(values: np.ndarray, valid: np.ndarray | None = None) -> Chunk:
-    (whole,) = cut(values, 1000.0, samples=len(values))
+    (whole,) = cut_chunks(values, 1000.0, samples=len(values))
     return whole if valid is None else replace(whole, valid=valid)
 
 
@@ -297,7 +297,7 @@ class Talkative(ArraySource):
 
 def test_a_calibrated_source_is_the_source_but_for_its_samples() -> None:
     spec = small_spec()
-    raw = Talkative(spec, cut(np.ones((20, *spec.shape)), spec.rate_hz), live=True)
+    raw = Talkative(spec, cut_chunks(np.ones((20, *spec.shape)), spec.rate_hz), live=True)
     calibration = replace(Calibration.of("d", spec), gain=(2.0, 3.0), mapping={"C1": "A1"})
     with CalibratedSource(raw, calibration) as source:
         assert source.live
@@ -485,7 +485,7 @@ def source_of(values: np.ndarray, valid: np.ndarray | None = None) -> ArraySourc
     spec = gauge_spec(values.shape[1])
     if valid is not None:
         return ArraySource(spec, [chunk_of(values, valid)])
-    return ArraySource(spec, cut(values, spec.rate_hz))
+    return ArraySource(spec, cut_chunks(values, spec.rate_hz))
 
 
 def test_a_tare_is_the_median_and_its_noise_the_standard_deviation() -> None:
@@ -699,7 +699,7 @@ def test_a_table_of_times_takes_medians_of_valid_samples(tmp_path) -> None:
     valid = np.ones((250, 2), dtype=np.bool_)
     valid[100:130] = False
     values[100:130] = np.nan
-    (whole,) = cut(values, 1000.0, samples=250, start_ns=10**15)
+    (whole,) = cut_chunks(values, 1000.0, samples=250, start_ns=10**15)
     recorded = replace(whole, valid=valid)
     assert raw_readings(table, recorded, small_spec(2), "A1").tolist() == [[1, 2], [3, 4]]
     with pytest.raises(ConfigError, match="no element 'B1'; there are A0, A1"):

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.calibration import CalibratedSource, Calibration, declare, declared
+from tactile_rt.calibration import CalibratedSource, Calibration, declare, declare_calibration
 from tactile_rt.core.errors import SpecMismatch
 from tactile_rt.core.stream import ArraySpec, Source
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 
 CHANNELS = (("bx", "T"), ("by", "T"), ("bz", "T"), ("temperature", "K"), ("fx", "N"))
 ROBOT = replace(
@@ -48,7 +48,7 @@ def test_channels_are_picked_by_name_and_elements_taken_in_order(shown, wanted, 
     names, units = zip(*wanted, strict=True)
     array = replace(ROBOT, channels=names, units=units)
     values = rng.normal(size=(20, *spec.shape)).astype(np.float32)
-    source = declare(ArraySource(spec, cut(values, 1000.0)), array)
+    source = declare(ArraySource(spec, cut_chunks(values, 1000.0)), array)
     assert source.spec == replace(array, rate_hz=spec.rate_hz)
     got, valid = streamed(source)
     assert np.array_equal(got, values[..., [shown.index(c) for c in wanted]])
@@ -59,7 +59,7 @@ def test_what_is_not_asked_for_need_be_no_number() -> None:
     values = np.ones((5, 3, 4), np.float32)
     values[:, 1, 3] = np.nan  # the temperature
     values[2, 0, 1] = np.inf  # by
-    got, valid = streamed(declare(ArraySource(device(), cut(values, 1000.0)), ROBOT))
+    got, valid = streamed(declare(ArraySource(device(), cut_chunks(values, 1000.0)), ROBOT))
     assert valid.sum() == valid.size - 1 and not valid[2, 0]
     assert (got[valid] == 1).all()
 
@@ -68,7 +68,7 @@ def test_elements_of_the_same_names_are_not_mixed_up() -> None:
     """A device that names its elements as the array does is believed, whatever the order."""
     array = replace(ROBOT, elements=("A2", "A0", "A1"))
     values = np.arange(3.0)[None, :, None] * np.ones((4, 3, 4))
-    got, _ = streamed(declare(ArraySource(device(), cut(values, 1000.0)), array))
+    got, _ = streamed(declare(ArraySource(device(), cut_chunks(values, 1000.0)), array))
     assert (got[0, :, 0] == [2.0, 0.0, 1.0]).all()
 
 
@@ -87,7 +87,7 @@ def test_the_declaration_is_of_what_the_calibration_makes() -> None:
     )  # fmt: skip
     array = replace(small_spec(2), name="pads", channels=("fy",), units=("N",))
     values = rng.normal(size=(9, 3, 3))
-    calibrated = CalibratedSource(ArraySource(raw, cut(values, 1000.0)), calibration)
+    calibrated = CalibratedSource(ArraySource(raw, cut_chunks(values, 1000.0)), calibration)
     source = declare(calibrated, array)
     assert isinstance(source, CalibratedSource) and source.source is calibrated.source  # one alone
     got, _ = streamed(source)
@@ -130,4 +130,4 @@ def test_what_it_cannot_be_is_said_exactly(spec: ArraySpec, said: str) -> None:
 @pytest.mark.parametrize("name", ["AnySkin (5X)", "  ", "-", ".hidden", "päd", "a/b"])
 def test_whatever_an_array_is_called_it_can_be_declared(name: str) -> None:
     spec = replace(device(), name=name)
-    assert declared(spec, ROBOT).output_spec(spec).name == "robot"
+    assert declare_calibration(spec, ROBOT).output_spec(spec).name == "robot"

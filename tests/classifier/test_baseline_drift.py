@@ -85,7 +85,7 @@ def returns(levels: RestLevels, away: float, quiet: int, first: float = 0.0) -> 
         for value in (level, 1e3):
             for k in range(20):
                 sample = np.full((2, 1), value * (1 + k * (value == 1e3)), dtype=np.float32)
-                found = levels.found(sample, BOTH, SIGMA, quiet)
+                found = levels.confirm_rest(sample, BOTH, SIGMA, quiet)
                 assert not found or k == 19
             said.append(found)
     return said
@@ -107,7 +107,7 @@ def test_so_many_samples_of_a_still_stretch_may_be_wild(wild, rests):
     for k in range(200):
         moves = (k // 20) % 2
         value = 1e3 * k if moves else far * (k % 20 < wild)
-        said.append(levels.found(np.full((2, 1), value, np.float32), BOTH, SIGMA, 0))
+        said.append(levels.confirm_rest(np.full((2, 1), value, np.float32), BOTH, SIGMA, 0))
     assert any(said) == rests
 
 
@@ -115,6 +115,6 @@ def test_an_element_that_is_not_trusted_throughout_a_stretch_says_nothing_of_it(
     levels, nothing, said = RestLevels(), RestLevels(), []
     for k in range(100):
         values = np.array([[1e3 * k * ((k // 20) % 2)], [1e3 * k]], dtype=np.float32)
-        said.append(levels.found(values, np.array([True, k % 20 == 0]), SIGMA, 0))
+        said.append(levels.confirm_rest(values, np.array([True, k % 20 == 0]), SIGMA, 0))
     assert said == [k == 99 for k in range(100)]
-    assert not any(nothing.found(SIGMA, ~BOTH, SIGMA, 0) for _ in range(100))
+    assert not any(nothing.confirm_rest(SIGMA, ~BOTH, SIGMA, 0) for _ in range(100))

@@ -16,10 +16,10 @@ from tactile_rt.classifier.decision_rules import (
     OpenSetRule,
     PredictionSetRule,
 )
-from tactile_rt.classifier.model_card import decided, rated_noise
+from tactile_rt.classifier.model_card import choose_label, rated_noise
 from tactile_rt.core.errors import SpecMismatch
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 from tests.helpers.tiny_model import (
     CARD,
     LABELS,
@@ -201,7 +201,7 @@ def test_another_rate_is_adapted_to(model: Path, rate_hz: float) -> None:
     values[:, :, 0] = 0.25
     values[touch:, 0, 0] = 0.35
     spec = small_spec(rate_hz=rate_hz)
-    decisions = push_all(Classifier(model, spec), cut(values, rate_hz))
+    decisions = push_all(Classifier(model, spec), cut_chunks(values, rate_hz))
     assert [d.step for d in decisions] == [1, 2, 3, 4]
     assert abs(decisions[0].onset_ns - 2 * NS_PER_S) <= 2 * max(PERIOD_NS, NS_PER_S / rate_hz)
     for a, b in itertools.pairwise(decisions):
@@ -219,7 +219,7 @@ def test_the_same_touch_at_the_model_s_rate_and_at_1_khz_gives_the_same_decision
     """The resampler's output is fed to a second classifier, as a sensor of the model's rate."""
     from tactile_rt.classifier.resampler import Resampler
 
-    fast = cut(signal([(1500, 3000, 0.1)], 3000), SPEC.rate_hz)
+    fast = cut_chunks(signal([(1500, 3000, 0.1)], 3000), SPEC.rate_hz)
     resampler = Resampler(PERIOD_NS, SPEC.rate_hz)
     slow = [out for chunk in fast if (out := resampler.push(chunk)) is not None]
     a = push_all(Classifier(model, SPEC), fast)
@@ -359,11 +359,11 @@ def test_below_its_threshold_unknown_is_not_decided_however_probable(tmp_path: P
     names = ("cup", UNKNOWN)
     card = {"unknown": OpenSetRule(POSTERIOR, "logits", (0.9,))}
     card = msgspec.structs.replace(CARD, labels=names, refusals=(UNKNOWN,), **card)
-    assert decided(card, np.array([0.2, 0.8], dtype=np.float32), 1) == 0
-    assert decided(card, np.array([0.05, 0.95], dtype=np.float32), 1) == 1
+    assert choose_label(card, np.array([0.2, 0.8], dtype=np.float32), 1) == 0
+    assert choose_label(card, np.array([0.05, 0.95], dtype=np.float32), 1) == 1
     # a score that this release does not know cannot be applied
     other = msgspec.structs.replace(card, unknown=OpenSetRule("entropy", "logits", (0.1,)))
-    assert decided(other, np.array([0.8, 0.2], dtype=np.float32), 1) == 0
+    assert choose_label(other, np.array([0.8, 0.2], dtype=np.float32), 1) == 0
 
 
 def test_the_prediction_set_is_that_of_the_rule_for_the_noise_that_is_measured(

@@ -11,7 +11,7 @@ from tactile_rt.classifier.decision_rules import Lanes
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import NS_PER_S, Chunk
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.refusals import refusal
 from tests.helpers.tiny_model import GRAPH, PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
 from tests.helpers.touch_streams import (
@@ -41,7 +41,7 @@ def test_each_window_has_a_lane_of_its_own_from_its_beginning_to_its_end(steps: 
         for step in range(5 * steps):
             if (lane := lanes.beginning(step)) is not None:
                 begun[lane] = step
-            asked = lanes.asked(step)
+            asked = lanes.choose_lane(step)
             if asked is None:
                 continue
             lane, own = asked
@@ -100,7 +100,7 @@ def test_the_shipped_model_slides_as_it_decides_episodes() -> None:
     values = (rng.normal(size=(400, *spec.shape)) * card.floor).astype(np.float32)
     values[150:] += (rng.normal(size=(250, *spec.shape)) * np.array(card.scale)).astype(np.float32)
     classifier = Classifier(shipped_model(), spec, mode="sliding", every=5)
-    decisions = push_all(classifier, cut(values, spec.rate_hz, 11))
+    decisions = push_all(classifier, cut_chunks(values, spec.rate_hz, 11))
     offset, sigma = classifier.detector.offset, classifier.detector.sigma  # contact lasts
     names = [o.name for o in session.get_outputs()]
     finals = [d for d in decisions if d.final]

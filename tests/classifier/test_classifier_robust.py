@@ -20,7 +20,7 @@ from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.skips import Skip
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 from tests.helpers.tiny_model import CARD, GRAPH, PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, fed_logits, push_all, same, signal, stream
 
@@ -222,7 +222,7 @@ def test_no_decision_is_ever_no_number(rate_hz: float) -> None:
     values[hit] = rng.choice([np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e9], hit.sum())[:, None]
     values[round(0.7 * n) : round(0.72 * n)] = np.nan
     classifier = Classifier(shipped_model(), spec, mode="sliding", every=8)
-    decisions = push_all(classifier, cut(values, rate_hz))
+    decisions = push_all(classifier, cut_chunks(values, rate_hz))
     assert decisions
     assert classifier.stats.bad_samples > 0.04 * values[..., 0].size
     assert classifier.stats.bad_steps == 0
@@ -265,7 +265,7 @@ def uncut(sliding: bool) -> tuple[Chunk, list[Classification]]:
     """A stream of the shipped array in one chunk, and what is decided of it."""
     values = loads(1200)
     values[500:540] = np.nan
-    whole = concatenate(cut(values, FAST.rate_hz))
+    whole = concatenate(cut_chunks(values, FAST.rate_hz))
     options = {"mode": "sliding", "every": 11} if sliding else {}
     return whole, push_all(Classifier(shipped_model(), FAST, **options), [whole])
 
@@ -362,7 +362,7 @@ def test_memory_does_not_grow(tmp_path: Path) -> None:
 def test_late_is_what_would_have_been_late_live() -> None:
     def missed(limit_ms: float, took_ms: float, period_ms: int = 45) -> list[bool]:
         deadline = Deadline(limit_ms / 1e3)
-        return [deadline.missed(k * period_ms * 1_000_000, took_ms / 1e3) for k in range(8)]
+        return [deadline.add_step(k * period_ms * 1_000_000, took_ms / 1e3) for k in range(8)]
 
     assert not any(missed(45, 44))
     assert all(missed(45, 46))
@@ -374,11 +374,11 @@ def test_late_is_what_would_have_been_late_live() -> None:
 def test_a_pause_makes_up_for_what_was_late() -> None:
     deadline = Deadline(0.1)
     ms = 1_000_000
-    assert not deadline.missed(0, 0.05)
-    assert deadline.missed(45 * ms, 0.3)
-    assert deadline.missed(90 * ms, 0.001)
+    assert not deadline.add_step(0, 0.05)
+    assert deadline.add_step(45 * ms, 0.3)
+    assert deadline.add_step(90 * ms, 0.001)
     assert deadline.behind_s == pytest.approx(0.05 - 0.045 + 0.3 - 0.045 + 0.001)
-    assert not deadline.missed(1000 * ms, 0.001)
+    assert not deadline.add_step(1000 * ms, 0.001)
     assert (deadline.behind_s, deadline.late) == (pytest.approx(0.001), 2)
 
 

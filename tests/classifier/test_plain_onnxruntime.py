@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.classifier.model_card import decided
+from tactile_rt.classifier.model_card import choose_label
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 
@@ -40,7 +40,7 @@ def ours() -> list[str]:
         evidence = stepper.run()[0] / card.temperature
         posterior = np.exp(evidence - evidence.max())
         posterior /= posterior.sum()
-        best = decided(card, posterior, step + 1)
+        best = choose_label(card, posterior, step + 1)
         lines.append(f"step {step + 1:2d}: {card.labels[best]} {posterior[best]:.2f}")
     return lines
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.classifier.resampler import Resampler
 from tactile_rt.core.stream import NS_PER_S, Chunk, concatenate
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 
 PERIOD_NS = 9_000_000
 MS = 1_000_000
@@ -186,7 +186,7 @@ def test_a_stream_of_the_output_s_period_passes_unchanged(period_ns: int) -> Non
 
 def test_the_delay_is_one_output_period() -> None:
     resampler = Resampler(PERIOD_NS, 1000.0)
-    for chunk in cut(np.zeros((60, *SHAPE)), 1000.0, samples=1):
+    for chunk in cut_chunks(np.zeros((60, *SHAPE)), 1000.0, samples=1):
         out = resampler.push(chunk)
         if out is not None:
             assert chunk.t_ns[0] - out.t_ns.tolist() == [PERIOD_NS]

@@ -8,11 +8,13 @@ import pytest
 from tactile_rt.classifier.session import Session
 from tactile_rt.core.errors import SourceError
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
-CHUNKS = cut(np.random.default_rng(0).normal(size=(400, *SPEC.shape)), SPEC.rate_hz, samples=4)
+CHUNKS = cut_chunks(
+    np.random.default_rng(0).normal(size=(400, *SPEC.shape)), SPEC.rate_hz, samples=4
+)
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 

@@ -122,9 +122,9 @@ def test_one_slow_step_does_not_silence_a_model_for_ever() -> None:
 
 
 def test_age_makes_a_step_late_as_work_does() -> None:
-    assert not Deadline(0.1, age=lambda t_ns: 0.1).missed(0, 0.01)
-    assert Deadline(0.1, age=lambda t_ns: 0.1001).missed(0, 0.01)
-    assert Deadline(0.1, age=lambda t_ns: 0.0).missed(0, 0.1001)
+    assert not Deadline(0.1, age=lambda t_ns: 0.1).add_step(0, 0.01)
+    assert Deadline(0.1, age=lambda t_ns: 0.1001).add_step(0, 0.01)
+    assert Deadline(0.1, age=lambda t_ns: 0.0).add_step(0, 0.1001)
 
 
 def test_an_unknown_way_to_catch_up_is_refused(model: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from tactile_rt.calibration import CalibratedSource, Calibration, load_calibration, save_calibration
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.sources import opening as sources
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 
 SPEC = replace(small_spec(2), channels=("s0", "s1"), units=("1", "1"))
 CROSS = np.array([[0.02, 0.001], [-0.0003, 0.004]])  # N and N m per count
@@ -33,7 +33,7 @@ def device(monkeypatch):
         def open(self, url: str):
             if url != "gauges:":
                 raise ConfigError(f"unknown source {url!r}")
-            source = ArraySource(SPEC, cut(self.values, SPEC.rate_hz))
+            source = ArraySource(SPEC, cut_chunks(self.values, SPEC.rate_hz))
             if self.device_id:
                 source.device_id = self.device_id
             return CalibratedSource(source, self.calibration) if self.calibration else source
@@ -164,7 +164,7 @@ def test_a_known_device_s_element_gets_its_matrix(call, done, device, tmp_path, 
     assert stored.channels == ("s0", "s1"), "the device's order, not the table's"
     assert len(stored.history) == 3
     raw = np.stack([loads @ np.linalg.inv(CROSS).T + o for o in OFFSET], axis=1)
-    source = CalibratedSource(ArraySource(SPEC, cut(raw, 1000.0)), stored)
+    source = CalibratedSource(ArraySource(SPEC, cut_chunks(raw, 1000.0)), stored)
     assert source.spec.units == ("N", "N m")
     made = np.concatenate([c.values for c in source])
     np.testing.assert_allclose(made, np.stack([loads, loads], axis=1), atol=1e-4)
@@ -192,7 +192,7 @@ def test_samples_that_were_calibrated_as_they_were_recorded_are_no_readings(refu
     from tactile_rt.recording.description import Description
     from tactile_rt.recording.importing.report import Import, write_chunks
 
-    (chunk,) = cut(np.zeros((50, 2, 2)), SPEC.rate_hz, 50)
+    (chunk,) = cut_chunks(np.zeros((50, 2, 2)), SPEC.rate_hz, 50)
     about = Description(SPEC, 0, "", calibration=Calibration.of("cell", SPEC))
     write_chunks(tmp_path / "run.mcap", about, chunk, Import(), "run")
     (tmp_path / "loads.csv").write_text("start_s,end_s,fy,mz\n0,0.1,1,0\n")

@@ -16,7 +16,7 @@ from tactile_rt.cli import demo as demo_module
 from tactile_rt.cli.demo import Demonstration, draw, watch
 from tactile_rt.core.packages import install_extra
 from tactile_rt.recording.replay import DEMO
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 
 simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
 
@@ -91,7 +91,7 @@ def test_only_the_first_episode_of_each_pass_is_scored():
         decision(210, 310, "cup"),  # ends while the next object is on its way
         decision(340, 390, "block"),
     ]
-    (sample,) = cut(np.zeros((1, 1, 1)), 1000.0)
+    (sample,) = cut_chunks(np.zeros((1, 1, 1)), 1000.0)
     demo._session = [(sample, [d]) for d in decisions]
     settled = [outcome.said for outcomes in demo.run() for outcome in outcomes]
     assert settled == [None, "cup", "cup", "block", None, None]

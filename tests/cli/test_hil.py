@@ -10,7 +10,7 @@ import pytest
 
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.tiny_model import write_model
 
 SPEC = small_spec()
@@ -63,7 +63,7 @@ def test_a_mistake_is_one_line(refused, arguments, said) -> None:
 def test_a_difference_is_exit_code_1(call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = write_model(tmp_path / "tiny.onnx")
     noise = np.random.default_rng(0).normal(size=(1000, *SPEC.shape)) * 2e-3
-    source = ArraySource(SPEC, cut(noise, SPEC.rate_hz))
+    source = ArraySource(SPEC, cut_chunks(noise, SPEC.rate_hz))
     monkeypatch.setattr("tactile_rt.sources.opening.open_source", lambda url: source)
     code, out, err = call("hil", "--source", "synthetic:3x2", "--model", model)
     assert code == 1 and "0 direct, 0 through the driver" in out

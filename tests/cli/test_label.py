@@ -12,7 +12,7 @@ import pytest
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.models.datasets import SweepSet, joined
+from tactile_rt.models.datasets import SweepSet, join_sets
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation.measures import cut_windows, run_over
 from tactile_rt.models.training.batches import TrainingBatches
@@ -145,18 +145,18 @@ def test_training_gets_what_a_classifier_feeds_its_network(here, night, call, mo
 def test_no_noise_is_added_to_recorded_sweeps_but_what_is_lacking(night):
     data = SweepSet.read(night, "train")
     values, rng = data.sweeps.values, np.random.default_rng(0)
-    assert Disturbance(noise=1.0).of_samples(values, data, rng) == pytest.approx(
+    assert Disturbance(noise=1.0).disturb_samples(values, data, rng) == pytest.approx(
         values - values[:, :200].mean(axis=1, keepdims=True), abs=1e-9
     )
-    twice = Disturbance(noise=2.0).of_samples(values, data, rng)
+    twice = Disturbance(noise=2.0).disturb_samples(values, data, rng)
     added = twice - values + values[:, :200].mean(axis=1, keepdims=True)
     assert added.std(axis=(0, 1, 2)) == pytest.approx(3**0.5 * data.noise, rel=0.05)
-    assert CLEAN.of_samples(values, data, rng) is values
+    assert CLEAN.disturb_samples(values, data, rng) is values
 
 
 def test_a_simulated_and_a_recorded_set_train_together_each_in_its_way(here, night):
     sets = [SweepSet.read(folder, "train") for folder in (here / "data" / "robot", night)]
-    both = joined(sets)
+    both = join_sets(sets)
     assert both.sweeps.values.shape[1] == 200 + max(110, SAMPLES - LEAD)
     simulated = ~both.recorded
     assert simulated.sum() == len(sets[0].sweeps)
@@ -234,9 +234,9 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
 
 
 def test_a_quiet_recording_holds_no_touch(tmp_path, refused):
-    from tactile_rt.testing import cut
+    from tactile_rt.testing import cut_chunks
     from tests.helpers.recordings import write
 
-    path = write(tmp_path / "mug.mcap", cut(touched(["mug"])[:500], 250.0), ARRAY)
+    path = write(tmp_path / "mug.mcap", cut_chunks(touched(["mug"])[:500], 250.0), ARRAY)
     err = refused("label", path, tmp_path / "set", "--by-name")
     assert "no touch can be used: intervals in which no touch begins: 1" in err

@@ -25,7 +25,7 @@ from tactile_rt.teaching.lesson import Lesson
 from tactile_rt.teaching.model import FewShot
 from tactile_rt.teaching.page import TeachingPage
 from tactile_rt.teaching.teacher import Teacher
-from tactile_rt.testing import ArraySource, FakeSerial, cut
+from tactile_rt.testing import ArraySource, FakeSerial, cut_chunks
 from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, wrench_spec
 from tests.helpers.processes import run_program, start_program
 from tests.helpers.source_tree import ROOT
@@ -238,12 +238,12 @@ def test_a_device_that_falls_silent_is_told(tmp_path):
 def tapped(live):  # for 0.1 s, which is looked at for 0.9 s
     values = NOISE * np.random.default_rng(0).normal(size=(700, 1, 6))
     values[400:410, 0, 2] += 4
-    return ArraySource(wrench_spec(), cut(values, RATE_HZ), live)
+    return ArraySource(wrench_spec(), cut_chunks(values, RATE_HZ), live)
 
 
 def taught_tap(folder, source, say):
     teacher = Teacher(
-        Lesson.begun(folder, FewShot(source.spec, np.float32(0.3 * NOISE))), ["tap"], 9
+        Lesson.begin(folder, FewShot(source.spec, np.float32(0.3 * NOISE))), ["tap"], 9
     )
     _teach(teacher, source, "", SimpleNamespace(listen=lambda: None, next=say))
     return teacher

@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from tactile_rt.core.files import replaced, whole_folder, write_whole
+from tactile_rt.core.files import replace_file, whole_folder, write_whole
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def test_what_cannot_be_written_is_named_by_its_own_name(read_only):
     path = read_only / "mine.txt"
     with pytest.raises(OSError) as whole:
         write_whole(path, lambda file: file.write(b"x"))
-    with pytest.raises(OSError) as slow, replaced(path):
+    with pytest.raises(OSError) as slow, replace_file(path):
         pass
     with pytest.raises(OSError) as folder, whole_folder(path):
         pass

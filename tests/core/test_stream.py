@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tactile_rt.core import stream
 from tactile_rt.core.errors import ConfigError, TactileError
 from tactile_rt.core.stream import ArraySpec, Chunk, EndOfStream, Source, Timing, concatenate
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 
 SPEC = small_spec()
 
@@ -184,7 +184,7 @@ def test_a_chunk_whose_parts_disagree_is_refused(parts: dict) -> None:
 
 def test_concatenated_chunks_are_the_stream_and_a_copy_of_it() -> None:
     values = np.random.default_rng(0).normal(size=(20, *SPEC.shape)).astype(np.float32)
-    pieces = cut(values, SPEC.rate_hz, samples=3)
+    pieces = cut_chunks(values, SPEC.rate_hz, samples=3)
     whole = concatenate(pieces)
     assert len(whole) == 20
     assert np.array_equal(whole.values, values)
@@ -206,7 +206,7 @@ def test_every_error_a_caller_may_handle_is_a_tactile_error() -> None:
 
 def test_an_array_source_refuses_chunks_of_another_shape() -> None:
     with pytest.raises(ValueError, match=r"chunk of shape \(9, 4, 2\)"):
-        ArraySource(SPEC, cut(np.zeros((9, 4, 2)), 1000.0))
+        ArraySource(SPEC, cut_chunks(np.zeros((9, 4, 2)), 1000.0))
 
 
 class Given(Source):
@@ -225,7 +225,7 @@ class Given(Source):
 
 
 def test_what_does_not_come_in_time_is_no_chunk_of_a_stream() -> None:
-    first, second = cut(np.zeros((4, *SPEC.shape), dtype=np.float32), 1000.0, samples=2)
+    first, second = cut_chunks(np.zeros((4, *SPEC.shape), dtype=np.float32), 1000.0, samples=2)
     assert list(Given(None, first, None, None, second)) == [first, second]
 
 

@@ -11,7 +11,7 @@ from tactile_rt.daemon import admission as module
 from tactile_rt.daemon.admission import Admission, file_stamp
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
-from tactile_rt.testing import ArraySource, cut
+from tactile_rt.testing import ArraySource, cut_chunks
 from tests.helpers.tiny_model import CARD, STEPS, force_rule, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, pushes, signal, stream
 from tests.helpers.waiting import PATIENCE_S
@@ -41,7 +41,7 @@ def model(tmp_path):
 
 
 def opened(live=True):
-    source = ArraySource(SAME_RATE, cut(np.zeros((1, *SAME_RATE.shape), np.float32), 100.0))
+    source = ArraySource(SAME_RATE, cut_chunks(np.zeros((1, *SAME_RATE.shape), np.float32), 100.0))
     source.live = live
     return Opened("a", SAME_RATE, "url", source, 1, 0, ())
 

@@ -37,7 +37,7 @@ from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.metrics import exposition
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+from tactile_rt.testing import ArraySource, FakeSerial, cut_chunks, small_spec
 from tests.helpers.tiny_model import force_rule, write_model
 from tests.helpers.touch_streams import same
 from tests.helpers.waiting import PATIENCE_S, until
@@ -247,7 +247,7 @@ def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):
 
 def test_decisions_are_those_of_the_classifier_alone(robot, tmp_path, monkeypatch):
     model = write_model(tmp_path / "m.onnx")
-    chunks = cut(touching(3000), SPEC.rate_hz, samples=7)
+    chunks = cut_chunks(touching(3000), SPEC.rate_hz, samples=7)
     alone = Classifier(model, SPEC)
     expected = [d for chunk in chunks for d in alone.push(chunk)]
     monkeypatch.setattr(OPEN_SOURCE, lambda url, **more: ArraySource(SPEC, chunks))
@@ -298,7 +298,7 @@ def test_a_source_that_breaks_is_opened_again_and_its_counts_add_up(robot, monke
     def open_it(url, **more):
         if len(opened) == 3:
             raise SourceError("no such port")
-        opened.append(Breaking(SPEC, cut(touching(100), 1000.0)))
+        opened.append(Breaking(SPEC, cut_chunks(touching(100), 1000.0)))
         return opened[-1]
 
     monkeypatch.setattr(OPEN_SOURCE, open_it)

@@ -29,7 +29,7 @@ from tactile_rt.daemon.states import (
 )
 from tactile_rt.daemon.stuck_at import StuckAtDetector, derive_stuck_at_s
 from tactile_rt.drivers.health import Health, State
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 
 NOW = 1_000_000_000_000
 S = 1_000_000_000
@@ -298,7 +298,7 @@ def test_whoever_looks_often_does_not_fill_the_window():
 
 
 def chunks(values):
-    return cut(np.asarray(values, np.float32), 1000.0, 7)
+    return cut_chunks(np.asarray(values, np.float32), 1000.0, 7)
 
 
 def detector(after_s):
@@ -361,7 +361,7 @@ def test_an_element_that_does_not_change_while_others_do_is_named():
 def test_another_array_is_not_stuck():
     judge = detector(0.005)
     for at, elements in ((0, 3), (1, 4)):
-        chunk = cut(np.zeros((9, elements, 2), np.float32), 1000.0, 9)[0]
+        chunk = cut_chunks(np.zeros((9, elements, 2), np.float32), 1000.0, 9)[0]
         judge.add(replace(chunk, t_ns=chunk.t_ns + at * 9_000_000))
         assert judge.seconds == pytest.approx(0.008)
 
@@ -377,7 +377,7 @@ def test_nothing_is_stuck_in_an_hour_of_rest_until_noise_stops(rate, shape, nois
     wander = np.cumsum(rng.normal(scale=drift / np.sqrt(rate), size=size), axis=0)
     rounded = np.round(rng.normal(scale=noise, size=size) + wander).astype(np.float32)
     spec, judge = small_spec(shape[0], rate_hz=rate), StuckAtDetector(rate)
-    for chunk in cut(np.concatenate([rounded, rounded[-1:].repeat(4 * rate, 0)]), rate, 20):
+    for chunk in cut_chunks(np.concatenate([rounded, rounded[-1:].repeat(4 * rate, 0)]), rate, 20):
         judge.expect(spec, None, changes=0.9 * fine)
         judge.add(chunk)
         assert not (judge.seconds or judge.elements) or (fine and chunk.seq[-1] > len(rounded))
@@ -402,18 +402,18 @@ def test_readings_that_differ_in_three_of_four_of_a_whole_window_are_noise(chang
     judge = StuckAtDetector(1.0)  # a window of 2000 samples
     values = np.cumsum(np.arange(6000) % 2000 < np.repeat((2000, changing, 2000), 2000))
     said = []
-    for chunk in cut(values.astype(np.float32)[:, None, None], 1.0, 1):
+    for chunk in cut_chunks(values.astype(np.float32)[:, None, None], 1.0, 1):
         judge.add(chunk)
         said.append(judge.noisy)
     assert said == [2000 <= k < 4000 or (noisy and k >= 4000) for k in range(1, 6001)]
     judge = StuckAtDetector()
-    judge.add(*cut(np.arange(30_000, dtype=np.float32)[:, None, None], 1000.0, 10_000))
+    judge.add(*cut_chunks(np.arange(30_000, dtype=np.float32)[:, None, None], 1000.0, 10_000))
     assert judge.noisy
 
 
 def test_a_device_that_gives_nothing_but_zeros_is_told_after_two_seconds():
     judge, later = StuckAtDetector(), StuckAtDetector()
-    zeros = cut(np.zeros((2002, 3, 2), np.float32), 1000.0, 1)
+    zeros = cut_chunks(np.zeros((2002, 3, 2), np.float32), 1000.0, 1)
     told = [judge.zeros] + [judge.add(chunk) or judge.zeros for chunk in zeros]
     assert told == [False] * 2002 + [True]
     zeros[0].values[:] = 1.0  # it has said something

@@ -23,7 +23,7 @@ from tactile_rt.daemon.page import feed as feed_module
 from tactile_rt.daemon.page.feed import Feed, map_axes
 from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, Guard, PageClient
 from tactile_rt.daemon.states import Snapshot
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
@@ -37,7 +37,7 @@ def opened(spec=SPEC, name="a"):
 
 
 def samples(values, name="a", valid=None):
-    chunk = cut(np.asarray(values, np.float32), 1000.0, samples=len(values))[0]
+    chunk = cut_chunks(np.asarray(values, np.float32), 1000.0, samples=len(values))[0]
     if valid is not None:
         chunk = replace(chunk, valid=np.asarray(valid))
     return SourceChunk(name, SPEC, chunk, 5, 0)

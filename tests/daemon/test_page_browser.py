@@ -20,7 +20,7 @@ from tactile_rt.daemon.config import PageConfig
 from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.states import Diagnostic, ModelState, PartState, Snapshot, SourceState
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.daemons import load_checked, running_daemon
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -197,7 +197,9 @@ class Fed:
         p = np.array([0.9, 0.1], np.float32)
         while not self.over.wait(0.03):
             now = time.monotonic_ns()
-            (chunk,) = cut(np.random.default_rng(0).normal(size=(9, 3, 2)), 300.0, start_ns=now)
+            (chunk,) = cut_chunks(
+                np.random.default_rng(0).normal(size=(9, 3, 2)), 300.0, start_ns=now
+            )
             made = Classification(
                 now - 10**8, now, 2, False, EVIL, (EVIL, "y"), p, 0.001, (EVIL, "y"), 0.9
             )

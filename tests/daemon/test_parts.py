@@ -36,7 +36,7 @@ from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.daemon.states import EDGES_S, LatencyMeter
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -47,7 +47,7 @@ pytestmark = pytest.mark.usefixtures("no_thread_left")
 
 
 def samples(n=1, source="a", seq=0):
-    chunk = cut(np.arange(n * 6).reshape(n, 3, 2), 1000.0, samples=n)[0]
+    chunk = cut_chunks(np.arange(n * 6).reshape(n, 3, 2), 1000.0, samples=n)[0]
     chunk = Chunk(chunk.seq + seq, chunk.t_ns, chunk.values, chunk.valid)
     return SourceChunk(source, SPEC, chunk, 5, OFFSET_NS)
 

@@ -12,7 +12,7 @@ from tactile_rt.daemon.items import Closed, Contact, Control, Decision, Event, P
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import FakeSerial, cut
+from tactile_rt.testing import FakeSerial, cut_chunks
 from tests.helpers.recorder_by_hand import (
     SPEC,
     UTC,
@@ -54,7 +54,7 @@ def same(path, chunks):
 
 
 def test_all_that_happens_is_in_the_file(daemon, tmp_path):
-    made, chunks = begun(daemon, tmp_path / "new", min_free_mb=0), cut(VALUES, 1000.0)
+    made, chunks = begun(daemon, tmp_path / "new", min_free_mb=0), cut_chunks(VALUES, 1000.0)
     made.handle([opened()])
     made.handle([samples(c) for c in chunks[:5]] + [decision(), event()])
     made.handle([samples(c) for c in chunks[5:]])
@@ -74,7 +74,7 @@ def test_all_that_happens_is_in_the_file(daemon, tmp_path):
 def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path, monkeypatch):
     monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 10**15)
     made = begun(daemon, tmp_path, min_free_mb=0, rotate_s=1e-3)
-    made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", 0)])
+    made.handle([opened(), samples(cut_chunks(VALUES, 1000.0)[0]), Closed("whiskers", 0)])
     look(made)  # no next file would ever begin
     made.handle([decision()])
     (path,) = files(tmp_path)
@@ -87,7 +87,7 @@ def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path,
 
 
 def test_each_source_has_its_own_file(daemon, tmp_path):
-    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
+    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut_chunks(VALUES, 1000.0)
     made.handle([opened("left"), opened("right")])
     made.handle([samples(chunks[0], "left"), samples(chunks[1], "right"), samples(chunks[2], "no")])
     made.handle([Closed("left", 0)])
@@ -135,7 +135,7 @@ def test_a_device_s_packets_decode_again_from_every_rotated_file(daemon, tmp_pat
 @pytest.mark.parametrize("config", [{"rotate_mb": 0.001}, {"rotate_s": 0.02}])
 def test_files_are_rotated_by_size_and_time_and_nothing_is_lost_between(config, daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0, **config)
-    chunks = cut(VALUES, 1000.0)
+    chunks = cut_chunks(VALUES, 1000.0)
     made.handle([opened()])
     for chunk in chunks:
         made.handle([samples(chunk)])
@@ -150,7 +150,7 @@ def test_files_are_rotated_by_size_and_time_and_nothing_is_lost_between(config, 
 
 def test_a_trigger_keeps_what_came_before_it_and_after(daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger", before_s=100, after_s=1000)
-    chunks = cut(VALUES, 1000.0)
+    chunks = cut_chunks(VALUES, 1000.0)
     made.handle([opened()])
     now = time.monotonic_ns()
     early = [samples(c, at=now - 10**12) for c in chunks[:2]]  # too long before
@@ -171,7 +171,7 @@ def test_a_trigger_keeps_what_came_before_it_and_after(daemon, tmp_path):
 
 
 def test_stop_and_start_by_hand(daemon, tmp_path):
-    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
+    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut_chunks(VALUES, 1000.0)
     made.handle([opened(), samples(chunks[0]), Control("stop"), samples(chunks[1])])
     look(made)
     assert made.details()["state"] == "off"
@@ -182,7 +182,7 @@ def test_stop_and_start_by_hand(daemon, tmp_path):
 
 
 def test_without_room_it_says_so_counts_and_goes_on_when_there_is(daemon, tmp_path, monkeypatch):
-    made, chunks = begun(daemon, tmp_path, min_free_mb=100), cut(VALUES, 1000.0)
+    made, chunks = begun(daemon, tmp_path, min_free_mb=100), cut_chunks(VALUES, 1000.0)
     free = [10e9]
     usage = type("usage", (), {"free": property(lambda _: free[0])})
     monkeypatch.setattr("tactile_rt.daemon.recordings_folder.shutil.disk_usage", lambda _: usage())
@@ -203,7 +203,7 @@ def test_without_room_it_says_so_counts_and_goes_on_when_there_is(daemon, tmp_pa
 
 
 def test_what_a_killed_recorder_left_is_named_and_can_be_recovered(daemon, tmp_path):
-    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
+    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut_chunks(VALUES, 1000.0)
     made.handle([opened(), *(samples(c) for c in chunks)])
     look(made)
     (path,) = files(tmp_path)
@@ -248,7 +248,7 @@ def test_what_was_told_before_the_first_sample_is_in_the_file(daemon, tmp_path, 
     made.handle([opened(), event("warning"), event("error")])
     look(made)
     assert not list(tmp_path.iterdir())
-    (chunk,) = cut(VALUES[:9], 1000.0)
+    (chunk,) = cut_chunks(VALUES[:9], 1000.0)
     made.handle([samples(chunk)])
     made.close()
     (path,) = files(tmp_path)

@@ -18,7 +18,7 @@ from tactile_rt.daemon import recordings_folder
 from tactile_rt.daemon.items import Closed, Contact, Control
 from tactile_rt.daemon.recordings_folder import RecordingsFolder
 from tactile_rt.recording import Recording, recover
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.recorder_by_hand import (
     SPEC,
     UTC,
@@ -32,7 +32,7 @@ from tests.helpers.recorder_by_hand import (
 from tests.helpers.waiting import PATIENCE_S, until
 
 VALUES = np.random.default_rng(0).normal(size=(400, *SPEC.shape)).astype(np.float32)
-CHUNKS = cut(VALUES, 1000.0, samples=10)
+CHUNKS = cut_chunks(VALUES, 1000.0, samples=10)
 NOBODY = 65534
 
 

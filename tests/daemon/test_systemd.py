@@ -221,14 +221,14 @@ def test_a_source_that_hangs_starves_the_watchdog_and_is_told_once(watched, tmp_
 
 def test_a_main_loop_that_hangs_starves_the_watchdog(watched, tmp_path):
     daemon, notifies, _ = watched('[[source]]\nname = "a"\nurl = "synthetic:2x2"\n')
-    daemon.turned("main")
+    daemon.note_turn("main")
     until(lambda: notifies.details()["withheld"] > 0)
     until(lambda: lines_of(tmp_path / "log", "systemd withheld", "main: not a turn"))
     pings = notifies.details()["pings"]
     before = daemon.silent()["main"]
     _serve(daemon, tmp_path, (), SimpleQueue(), 0.6)  # the main loop tells that it turns
     assert daemon.silent()["main"] < before
-    until(lambda: daemon.turned("main") or notifies.details()["pings"] > pings)
+    until(lambda: daemon.note_turn("main") or notifies.details()["pings"] > pings)
 
 
 def test_a_device_that_is_not_there_or_silent_does_not(watched, tmp_path):

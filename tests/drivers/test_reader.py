@@ -13,7 +13,7 @@ from tactile_rt.drivers.health import State
 from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.asynchronous import chunks
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+from tactile_rt.testing import ArraySource, FakeSerial, cut_chunks, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
@@ -82,7 +82,7 @@ def test_a_line_that_is_lost_comes_again_and_holds_up_nobody(tmp_path):
 
 def test_a_source_without_a_line_is_read_too_and_ends():
     one, other = values(3), values(4)
-    sources = [ArraySource(SPEC, cut(v, 1000.0, 50)) for v in (one, other)]
+    sources = [ArraySource(SPEC, cut_chunks(v, 1000.0, 50)) for v in (one, other)]
     reader = Reader(sources)
     found = list(reader)
     for source, expected in zip(sources, (one, other), strict=True):
@@ -102,7 +102,7 @@ class Broken(Source):
 
 
 def test_one_that_breaks_is_told_and_the_others_go_on():
-    good = ArraySource(SPEC, cut(values(), 1000.0, 50))
+    good = ArraySource(SPEC, cut_chunks(values(), 1000.0, 50))
     broken = Broken()
     reader = Reader([broken, good])
     with pytest.raises(SourceError, match="it burns"):
@@ -112,7 +112,7 @@ def test_one_that_breaks_is_told_and_the_others_go_on():
 
 
 def test_one_may_come_later_and_be_taken_away():
-    first, second = (ArraySource(SPEC, cut(values(k), 1000.0, 50)) for k in range(2))
+    first, second = (ArraySource(SPEC, cut_chunks(values(k), 1000.0, 50)) for k in range(2))
     reader = Reader([first])
     assert [s for s, _ in reader.read()] == [first]
     reader.add(second)
@@ -156,7 +156,7 @@ def test_in_an_event_loop_samples_come_beside_other_work():
 
 def test_in_an_event_loop_a_source_without_a_line_is_read_and_ends():
     async def run():
-        source = ArraySource(SPEC, cut(values(), 1000.0, 50))
+        source = ArraySource(SPEC, cut_chunks(values(), 1000.0, 50))
         return [chunk async for chunk in chunks(source)], source
 
     found, source = asyncio.run(run())

@@ -39,7 +39,7 @@ from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig, TactileClassifier
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sets.manifest import SweepManifest
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.tiny_sweeps import tiny_array
 
 STEPS, SUBSTEPS = MOUSE.steps, MOUSE.substeps
@@ -267,7 +267,7 @@ def test_the_robot_decides_as_training_saw_it(exported: SimpleNamespace) -> None
     expected = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
 
     rate_hz = 1e9 / PERIOD_NS
-    live = cut(np.concatenate([values[:1], values, values[-1:]]), rate_hz, 7)  # none is lost
+    live = cut_chunks(np.concatenate([values[:1], values, values[-1:]]), rate_hz, 7)  # none is lost
     classifier = Classifier(exported.path, SPEC.__class__(**{**asdict(SPEC), "rate_hz": rate_hz}))
     decisions = [d for chunk in live for d in classifier.push(chunk)]
     assert [d.step for d in decisions] == list(range(1, STEPS + 1))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.core.stream import ArraySpec, Chunk
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.recordings import write
 from tests.helpers.tiny_sweeps import plate
 
@@ -40,7 +40,7 @@ def touched(
 def chunks_of_touches(kinds: list[str], start_ns: int = 10**9, **how) -> list[Chunk]:
     """The same as a stream that began at `start_ns`."""
     spec = how.get("spec", ARRAY)
-    return cut(touched(kinds, **how), spec.rate_hz, 5, start_ns)
+    return cut_chunks(touched(kinds, **how), spec.rate_hz, 5, start_ns)
 
 
 def record_touches(path: Path, kinds: list[str], **how) -> Path:

@@ -11,7 +11,7 @@ from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.waiting import PATIENCE_S
 
 SPEC = small_spec()
@@ -31,7 +31,7 @@ def noise(n, shape=SPEC.shape, seed=0):
 
 def odd_chunks():
     """Chunks with gaps, lost elements, all kinds of NaN, -0, the least and largest numbers."""
-    chunks = cut(noise(60), 1000.0, samples=7, start_ns=123_456_789)
+    chunks = cut_chunks(noise(60), 1000.0, samples=7, start_ns=123_456_789)
     values, valid = chunks[1].values.copy(), chunks[1].valid.copy()
     values[0, 0], values[1, 1] = np.nan, -0.0
     values[2, 2] = np.float32(1e-45), np.finfo(np.float32).max

@@ -9,7 +9,7 @@ import pytest
 
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 from tests.helpers.tiny_model import CARD, PERIOD_NS, SUBSTEPS
 
 SPEC = small_spec()
@@ -35,7 +35,7 @@ def signal(touches: list[tuple[int, int, float]], n: int, seed: int = 0) -> np.n
 
 def stream(values: np.ndarray, samples: int = 7) -> list[Chunk]:
     """Chunks at the model's own rate: they pass the resampler unchanged, but for the first."""
-    return cut(values, SAME_RATE.rate_hz, samples)
+    return cut_chunks(values, SAME_RATE.rate_hz, samples)
 
 
 def pushes(sizes: Sequence[float], seed: int = 0) -> list[Chunk]:

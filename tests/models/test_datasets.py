@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import MOUSE
-from tactile_rt.models.datasets import SweepSet, drawn_as, joined, windows
+from tactile_rt.models.datasets import SweepSet, drawn_as, join_sets, windows
 from tactile_rt.models.evaluation.measures import cut_windows
 from tactile_rt.models.training.batches import TrainingBatches, partners
 from tactile_rt.sets.manifest import SweepManifest
@@ -228,14 +228,14 @@ def test_sets_are_joined_by_the_names_of_their_categories() -> None:
         sweeps=Sweeps(other.sweeps.values, np.array([0, -1]), np.array(["cup-0", "x-1"])),
     )
     one = replace(one, sweeps=replace(one.sweeps, labels=np.zeros(3, dtype=np.int64)))
-    both = joined([one, there])
+    both = join_sets([one, there])
     assert both.manifest.categories == ("mug", "cup")
     assert both.sweeps.labels.tolist() == [0, 0, 0, 1, -1]
     assert both.manifest.split["train"] == ("mug-0", "mug-1", "mug-2", "cup-0", "mug-9")
     assert np.array_equal(both.sweeps.values, np.concatenate([touches(3), touches(2)]))
     fast = replace(there, manifest=replace(manifest, period_ns=1_000_000))
     with pytest.raises(ConfigError, match="cannot be joined: the period of their samples"):
-        joined([one, fast])
+        join_sets([one, fast])
 
 
 def test_faults_rise_to_what_is_said_in_the_easy_epochs() -> None:

@@ -244,7 +244,7 @@ def test_noise_is_the_rated_one_and_repeats_with_its_seed() -> None:
     values = np.zeros((40, 150, ELEMENTS, 6), dtype=np.float32)
     rng = [np.random.default_rng(k) for k in (0, 0, 1)]
     data = a_set(values)
-    noisy = [Disturbance(noise=2.0).of_samples(values, data, r) for r in rng]
+    noisy = [Disturbance(noise=2.0).disturb_samples(values, data, r) for r in rng]
     assert np.allclose(noisy[0].std(axis=(0, 1, 2)), 2 * NOISE, rtol=0.02)
     assert np.array_equal(noisy[0], noisy[1])
     assert not np.array_equal(noisy[0], noisy[2])

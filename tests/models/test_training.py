@@ -18,7 +18,7 @@ from tactile_rt.core.errors import ConfigError, ModelError
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.datasets import SweepSet, read_splits
 from tactile_rt.models.evaluation.measures import hits, predict, run_on
-from tactile_rt.models.training.batches import TrainingBatches, prefetched
+from tactile_rt.models.training.batches import TrainingBatches, prefetch_items
 from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 from tactile_rt.models.training.loop import initialise, train
 from tactile_rt.models.training.objectives import build_objective
@@ -28,8 +28,8 @@ from tactile_rt.models.training.updates import (
     LARS,
     build_optimizer,
     build_schedule,
+    capture_loss,
     parameter_groups,
-    replayed,
 )
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object
@@ -236,7 +236,7 @@ def test_batches_come_in_order_and_what_goes_wrong_comes_too(no_thread_left):
 
     found = []
     with pytest.raises(ConfigError, match="no more"):
-        for item in prefetched(draw):
+        for item in prefetch_items(draw):
             found.append(item)
     assert found == list(range(5))
 
@@ -249,7 +249,7 @@ def test_only_so_many_batches_are_drawn_ahead(no_thread_left):
             drawn.append(k)
             yield k
 
-    batches = prefetched(draw, ahead=2)
+    batches = prefetch_items(draw, ahead=2)
     assert next(batches) == 0
     batches.close()
     assert len(drawn) <= 5
@@ -312,7 +312,7 @@ def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(
             if hasattr(module, "p"):
                 module.p = 0.0
     before = {name: buffer.clone() for name, buffer in learning.named_buffers()}
-    loss_of = replayed(learning, seen, labels, bf16=False)
+    loss_of = capture_loss(learning, seen, labels, bf16=False)
     assert loss_of is not None
     assert all(torch.equal(b, before[name]) for name, b in learning.named_buffers())
     losses, gradients = [], []
@@ -338,7 +338,7 @@ def test_an_update_that_is_no_graph_is_told_and_leaves_the_objective(tiny, monke
         raise RuntimeError("operation not permitted when stream is capturing\nCompile with ...")
 
     monkeypatch.setattr(torch.cuda, "make_graphed_callables", tried)
-    assert replayed(learning, seen, labels, bf16=False) is None
+    assert capture_loss(learning, seen, labels, bf16=False) is None
     (said,) = caplog.messages
     assert "(operation not permitted when stream is capturing)" in said
     assert all(torch.equal(b, before[name]) for name, b in learning.named_buffers())

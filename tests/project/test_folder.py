@@ -14,10 +14,10 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.project import folder as folder_module
-from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
+from tactile_rt.project.budget import Budget, apply_budget, budget_sweeps, read_budget, write_budget
 from tactile_rt.project.folder import KINDS, Project, new_project
 from tactile_rt.project.making import make
-from tactile_rt.project.report import confused
+from tactile_rt.project.report import list_confusions
 from tactile_rt.sim_backend.arrays.files import ROBOTS, load_array, robot_text
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.transducer import device_spec
@@ -133,7 +133,7 @@ def test_one_s_own_meshes_are_swept_by_the_device_too(project: Project) -> None:
     sweeps = project.folder / "sweeps.toml"
     text = sweeps.read_text().replace('"shapes"', '"things"').replace("per_category = 200", "")
     sweeps.write_text(re.sub(r"categories = .*", 'categories = ["box", "slab"]', text))
-    recipe = sized(project.recipe(), budget_sweeps(project, 60))
+    recipe = apply_budget(project.recipe(), budget_sweeps(project, 60))
     assert len(describe_set(recipe).names()) == 8
     unseen = project.unseen()
     assert len(unseen) == 2 and all(Path(file).is_file() for file in unseen)
@@ -190,9 +190,9 @@ def test_a_project_that_was_changed_is_not_gone_on_with(project: Project) -> Non
 
 def test_what_is_taken_for_what_worst_first() -> None:
     table = np.array([[18, 2, 0], [5, 15, 0], [0, 0, 0]])
-    assert confused(table, ("a", "b", "c")) == [("b", "a", 0.25), ("a", "b", 0.1)]
-    assert confused(table, ("a", "b", "c"), 0.2) == [("b", "a", 0.25)]
-    assert confused(np.eye(3, dtype=np.int64), ("a", "b", "c")) == []
+    assert list_confusions(table, ("a", "b", "c")) == [("b", "a", 0.25), ("a", "b", 0.1)]
+    assert list_confusions(table, ("a", "b", "c"), 0.2) == [("b", "a", 0.25)]
+    assert list_confusions(np.eye(3, dtype=np.int64), ("a", "b", "c")) == []
 
 
 @pytest.mark.parametrize("name", ["my arm", 'the "arm"', "100%41", "arm?#&=+", "a\\b", "größe"])

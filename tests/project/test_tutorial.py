@@ -15,7 +15,7 @@ from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.models.training.config import EMBEDDED
-from tactile_rt.project.budget import Budget, described, write_budget
+from tactile_rt.project.budget import Budget, fingerprint_set, write_budget
 from tactile_rt.project.folder import KINDS, Project
 from tactile_rt.project.making import make
 from tactile_rt.sets.manifest import SweepManifest
@@ -51,7 +51,7 @@ def folder(tmp_path_factory) -> Path:
     robot = project.folder / "robot.toml"
     robot.write_text(robot.read_text().replace("/tmp/whiskers", str(here / "device")))
     # All that is not as on the page: so many objects take a minute, not an hour.
-    write_budget(project, Budget(described(project), 5, 1, 2, 2, updates=40))
+    write_budget(project, Budget(fingerprint_set(project), 5, 1, 2, 2, updates=40))
     done(here, commands()["make"])
     return here
 

@@ -16,7 +16,7 @@ from tactile_rt.core.packages import install_extra
 from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.conversion import convert
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 from tests.helpers.recordings import odd_chunks, write_as_daemon
 
 h5py = pytest.importorskip("h5py")
@@ -74,7 +74,9 @@ def test_arrays_hold_samples_and_messages_bit_for_bit(form, path, tmp_path):
 
 
 def test_an_array_of_many_blocks_is_whole_in_hdf5(tmp_path):
-    (whole,) = cut(np.random.default_rng(2).normal(size=(60_000, 3, 2)), 1000.0, samples=60_000)
+    (whole,) = cut_chunks(
+        np.random.default_rng(2).normal(size=(60_000, 3, 2)), 1000.0, samples=60_000
+    )
     columns = [np.split(getattr(whole, n), 30) for n in ("seq", "t_ns", "values", "valid")]
     path = write(tmp_path / "run.mcap", [Chunk(*c) for c in zip(*columns, strict=True)])
     convert(path, tmp_path / "x.h5")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tactile_rt.core.stream import Chunk
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.recording.layout import decode_packet, decode_samples, encode_packet, encode_samples
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.recordings import noise, parts
 
 
@@ -61,7 +61,7 @@ def test_packets_come_back(frames, data):
 @given(data=st.binary(max_size=80), keep=st.integers(0, 60))
 def test_what_is_no_message_is_refused_or_reads_as_one(data, keep):
     """Whatever is decoded is what its encoding says: nothing is guessed."""
-    chunk = cut(noise(1, (1, 2)), 1000.0)[0]
+    chunk = cut_chunks(noise(1, (1, 2)), 1000.0)[0]
     for made in (encode_samples(chunk)[:keep] + data, data):
         try:
             assert encode_samples(decode_samples(made, (1, 2)))[12:20] == made[12:20]

@@ -16,7 +16,7 @@ from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_lerobot import write_dataset
 from tactile_rt.recording.lerobot_meta import Statistics, film_of
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 from tests.helpers.recordings import noise, write_as_daemon
 
 SPEC = small_spec()
@@ -24,7 +24,7 @@ SPEC = small_spec()
 
 def odd_chunks(n=1000):
     """A second at 1 kHz with a gap, elements that are lost, and all kinds of NaN."""
-    chunks = cut(noise(n), 1000.0, samples=9, start_ns=123_456_789)
+    chunks = cut_chunks(noise(n), 1000.0, samples=9, start_ns=123_456_789)
     values, valid = chunks[1].values.copy(), chunks[1].valid.copy()
     values.view(np.uint32)[4, 2] = 0xFFC01234, 0x7F800001  # NaN that carry something
     values[0, 0], values[1, 1] = np.inf, -0.0
@@ -96,7 +96,7 @@ def test_a_row_has_every_sample_since_the_one_before_and_none_after_it(recording
 
 
 def test_the_state_is_the_newest_value_that_can_be_trusted(tmp_path):
-    (chunk,) = cut(np.arange(60.0, dtype=np.float32).reshape(10, 3, 2), 25.0, samples=10)
+    (chunk,) = cut_chunks(np.arange(60.0, dtype=np.float32).reshape(10, 3, 2), 25.0, samples=10)
     valid = chunk.valid.copy()
     valid[:2, 0] = valid[5:, 1] = False
     made = write(tmp_path / "x.mcap", [replace(chunk, valid=valid)])
@@ -145,7 +145,7 @@ def test_what_lerobot_reads_first_is_there_and_agrees(recording, tmp_path):
 
 def test_statistics_are_of_what_can_be_trusted(tmp_path):
     values = noise(700) * np.array([1, 1e-3], np.float32) + np.array([5, 0], np.float32)
-    (chunk,) = cut(values, 1000.0, samples=700)
+    (chunk,) = cut_chunks(values, 1000.0, samples=700)
     valid = chunk.valid.copy()
     valid[::3, 1] = False
     broken = chunk.values.copy()
@@ -170,23 +170,23 @@ def test_statistics_of_much_keep_little_and_of_nothing_are_zero():
     rows = np.random.default_rng(3).normal(size=(60_000, 1)).astype(np.float32)
     for begin in range(0, len(rows), 7001):
         one.add(rows[begin : begin + 7001])
-    found = one.found()
+    found = one.compute()
     assert len(one._kept) <= 10_000
     assert one._every == 8 and np.array_equal(one._kept, rows[::8])
     np.testing.assert_allclose(found["q90"], np.quantile(rows[::8], 0.9))
     np.testing.assert_allclose(found["std"], rows.std(), rtol=1e-5)
     none = Statistics()
     none.add(np.full((3, 2), np.nan, np.float32))
-    assert not any(v.any() for k, v in none.found().items() if k != "count")
+    assert not any(v.any() for k, v in none.compute().items() if k != "count")
 
 
 def test_samples_that_no_rows_can_hold_are_refused(tmp_path):
-    (chunk,) = cut(noise(100), 1000.0, samples=100)
+    (chunk,) = cut_chunks(noise(100), 1000.0, samples=100)
     away = replace(chunk, t_ns=chunk.t_ns + (2**60) * (np.arange(100) > 50))
     made = write(tmp_path / "x.mcap", [away])
     with pytest.raises(RecordingError, match=r"100 samples are spread over .* too unevenly"):
         write_dataset([made], tmp_path / "set")
-    bunch = cut(noise(3000), 1000.0, samples=3000)[0]
+    bunch = cut_chunks(noise(3000), 1000.0, samples=3000)[0]
     t_ns = np.where(np.arange(3000) < 2000, 0, 3600 * 10**9)
     with pytest.raises(RecordingError, match="too unevenly"):
         write_dataset([write(tmp_path / "y.mcap", [replace(bunch, t_ns=t_ns)])], tmp_path / "set")
@@ -194,7 +194,7 @@ def test_samples_that_no_rows_can_hold_are_refused(tmp_path):
 
 
 def test_time_that_goes_back_keeps_the_order_of_samples(tmp_path):
-    chunks = cut(noise(300), 1000.0, samples=100)
+    chunks = cut_chunks(noise(300), 1000.0, samples=100)
     chunks[1] = replace(chunks[1], t_ns=chunks[1].t_ns - 150_000_000)
     made = write(tmp_path / "x.mcap", chunks)
     write_dataset([made], tmp_path / "set")
@@ -202,7 +202,7 @@ def test_time_that_goes_back_keeps_the_order_of_samples(tmp_path):
 
 
 def test_what_cannot_be_a_dataset_is_named(recording, tmp_path):
-    other = write(tmp_path / "o.mcap", cut(noise(9, (2, 2)), 1000.0), small_spec(2))
+    other = write(tmp_path / "o.mcap", cut_chunks(noise(9, (2, 2)), 1000.0), small_spec(2))
     with pytest.raises(SpecMismatch, match=r"o\.mcap is of another array"):
         write_dataset([recording, other], tmp_path / "set")
     with pytest.raises(RecordingError, match="has no samples"):

@@ -10,7 +10,7 @@ from mcap.writer import Writer
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.hostile_files import MCAPS
 from tests.helpers.measured import measured
 from tests.helpers.recordings import SPEC, all_parts, noise, odd_chunks, write
@@ -72,7 +72,7 @@ def test_what_is_no_recording_is_named(make, kind, said, path):
 
 
 def test_readers_may_stop_early(path):
-    write(path, cut(noise(100), 1000.0))
+    write(path, cut_chunks(noise(100), 1000.0))
     with closing(Recording(path).chunks()) as chunks:
         next(chunks)
     with open_source(f"replay:{path}") as source:
@@ -80,7 +80,7 @@ def test_readers_may_stop_early(path):
 
 
 def test_a_recording_is_read_as_often_as_one_likes(path):
-    chunks = cut(noise(40), 1000.0)
+    chunks = cut_chunks(noise(40), 1000.0)
     write(path, chunks)
     recording = Recording(str(path))
     for again in (recording, recording, recording.chunks()):

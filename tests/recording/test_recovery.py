@@ -15,7 +15,7 @@ from tactile_rt.recording.description import RECOVERED
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.recovery import MOST_NONE
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, write
 
 
@@ -25,7 +25,7 @@ def whole(tmp_path_factory):
     from mcap.reader import make_reader
 
     path = tmp_path_factory.mktemp("whole") / "run.mcap"
-    chunks = cut(noise(120), 1000.0, samples=5)
+    chunks = cut_chunks(noise(120), 1000.0, samples=5)
     with path.open("wb") as file:
         made = McapFile(file, Description(SPEC, 1_700_000_000 * 10**9, session={"a": "b"}))
         for i, chunk in enumerate(chunks, 1):
@@ -109,7 +109,7 @@ def test_a_piece_damaged_in_the_middle_is_left_out(whole, tmp_path):
 
 
 def test_a_whole_recording_needs_no_recovery(path):
-    write(path, cut(noise(10), 1000.0))
+    write(path, cut_chunks(noise(10), 1000.0))
     assert recover(path) == path
     assert list(path.parent.iterdir()) == [path]
 
@@ -247,7 +247,7 @@ def test_what_is_there_already_is_only_replaced_by_force(whole, tmp_path):
 
 @pytest.mark.parametrize("none, comes_back", [(MOST_NONE, True), (MOST_NONE + 1, False)])
 def test_so_many_messages_may_be_none_and_not_one_more(none, comes_back, tmp_path):
-    path, chunk = tmp_path / "cut.mcap", cut(noise(5), 1000.0, samples=5)[0]
+    path, chunk = tmp_path / "cut.mcap", cut_chunks(noise(5), 1000.0, samples=5)[0]
     with path.open("wb") as file:
         made = McapFile(file, Description(SPEC, 0))
         made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]))

@@ -16,7 +16,7 @@ from tactile_rt.recording.replay import DEMO
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import FakeCan, FakeSerial, cut
+from tactile_rt.testing import FakeCan, FakeSerial, cut_chunks
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, record_device, write
 
 
@@ -135,7 +135,7 @@ def test_every_speed_gives_the_same_chunks_and_decisions(channel, path, tmp_path
 
 
 def test_a_replay_keeps_the_recorded_pace(path):
-    write(path, cut(noise(400), 1000.0))
+    write(path, cut_chunks(noise(400), 1000.0))
     for speed, least in ((4, 0.09), (0, 0.0)):
         with open_source(f"replay:{path}?speed={speed}") as source:
             began = time.monotonic()
@@ -148,14 +148,14 @@ def test_a_replay_keeps_the_recorded_pace(path):
 
 
 def test_a_replay_gives_nothing_before_its_time(path):
-    write(path, cut(noise(40), 1000.0))
+    write(path, cut_chunks(noise(40), 1000.0))
     with open_source(f"replay:{path}?speed=0.0001") as source:
         assert source.read() is not None
         assert source.read(0) is None  # the next is due in 90 s
 
 
 def test_gaps_of_the_recording_are_counted_as_missing(path):
-    chunks = cut(noise(40), 1000.0, samples=10)
+    chunks = cut_chunks(noise(40), 1000.0, samples=10)
     write(path, [chunks[0], chunks[2], chunks[3]])
     again, source = replayed(path, "speed=0")
     assert len(again) == 3
@@ -174,7 +174,7 @@ def test_gaps_of_the_recording_are_counted_as_missing(path):
     ],
 )
 def test_wrong_options_are_named(options, said, path):
-    write(path, cut(noise(10), 1000.0))
+    write(path, cut_chunks(noise(10), 1000.0))
     with pytest.raises(ConfigError, match=said):
         open_source(f"replay:{path}?{options}")
 
@@ -244,7 +244,7 @@ def check_three(whole, n, rate_hz):
 
 
 def test_a_loop_begins_again_and_its_numbers_and_times_go_on(path):
-    write(path, cut(noise(100), SPEC.rate_hz))
+    write(path, cut_chunks(noise(100), SPEC.rate_hz))
     whole, stats = passes(f"replay:{path}?loop=true&speed=0", 100, 3)
     check_three(whole, 100, SPEC.rate_hz)
     assert (stats.delivered, stats.missing) == (300, 0)
@@ -274,7 +274,7 @@ def test_a_loop_of_nothing_ends(path):
 
 
 def test_the_recording_that_ships_has_a_name_and_a_file_of_that_name_a_path(cwd):
-    write(cwd / "demo", cut(noise(7), SPEC.rate_hz))
+    write(cwd / "demo", cut_chunks(noise(7), SPEC.rate_hz))
     for url, samples in (("demo", sum(map(len, Recording(DEMO)))), ("./demo", 7)):
         with open_source(f"replay:{url}?speed=0") as source:
             assert sum(map(len, source)) == samples

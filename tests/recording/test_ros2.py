@@ -15,7 +15,7 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.conversion import write_bag
 from tactile_rt.recording.replay import DEMO
-from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
+from tactile_rt.testing import FakeCan, FakeSerial, cut_chunks, small_spec
 from tests.helpers.recordings import SPEC, all_parts, noise, record_device, write_as_daemon
 
 
@@ -49,7 +49,7 @@ def whole(path, **about):
         spec, 1_700_000_000_000_000_000, calibration=Calibration.of("it", spec),
         session={"daemon_source": "finger-1", "who": "Ada"}, **about,
     )  # fmt: skip
-    chunks = cut(noise(40, (1, 3)), 1000.0, samples=10)
+    chunks = cut_chunks(noise(40, (1, 3)), 1000.0, samples=10)
     chunks[1] = replace(chunks[1], valid=np.zeros((10, 1), np.bool_))
     return write_as_daemon(path, said, chunks), chunks
 
@@ -143,6 +143,6 @@ def test_what_is_recovered_is_a_bag_again(path):
 
 def test_names_are_of_the_array_where_no_daemon_named_a_source(path):
     about = Description(replace(SPEC, name="2nd finger/tip"), 0)
-    write_as_daemon(path, about, cut(noise(5), 1000.0))
+    write_as_daemon(path, about, cut_chunks(noise(5), 1000.0))
     assert "/tactile/_2nd_finger_tip/samples" in by_rosbags(path)
     assert sum(map(len, Recording(path))) == 5

@@ -9,7 +9,7 @@ from tactile_rt.recording import Recording, StreamWriter
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.rotation import Rotation
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, FakeSerial, cut
+from tactile_rt.testing import ArraySource, FakeSerial, cut_chunks
 from tests.helpers.recordings import SPEC, all_parts, noise, record_device
 
 
@@ -39,7 +39,7 @@ def test_a_file_is_due_by_size_or_time(limits, size, due, tmp_path):
 
 
 def test_a_stream_goes_on_in_the_next_file(path, no_thread_left):
-    chunks = cut(noise(3000), 1000.0, samples=10)
+    chunks = cut_chunks(noise(3000), 1000.0, samples=10)
     limits = {"rotate_mb": 0.01, "flush_s": 0.0}
     with StreamWriter(path, ArraySource(SPEC, chunks), session={"who": "Ada"}, **limits) as writer:
         for chunk in chunks:

@@ -11,7 +11,7 @@ import pytest
 from tactile_rt.core.errors import RecordingError
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, FakeSerial, cut
+from tactile_rt.testing import ArraySource, FakeSerial, cut_chunks
 from tests.helpers.processes import start_program
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, record_device
 from tests.helpers.waiting import PATIENCE_S, until
@@ -89,7 +89,7 @@ def disk(monkeypatch):
 
 
 def test_what_a_slow_disk_has_no_room_for_is_counted_and_told(path, disk, no_thread_left):
-    chunks = cut(noise(3000), 1000.0, samples=10)
+    chunks = cut_chunks(noise(3000), 1000.0, samples=10)
     source = ArraySource(SPEC, chunks, live=True)
     with StreamWriter(path, source, queue_bytes=20_000, flush_s=0.0) as recorder:
         disk[0].open.clear()
@@ -110,7 +110,7 @@ def test_what_a_slow_disk_has_no_room_for_is_counted_and_told(path, disk, no_thr
 
 
 def test_a_source_that_can_wait_waits_for_a_slow_disk(path, disk):
-    chunks = cut(noise(3000), 1000.0, samples=10)
+    chunks = cut_chunks(noise(3000), 1000.0, samples=10)
     with StreamWriter(path, ArraySource(SPEC, chunks), queue_bytes=20_000) as recorder:
         for chunk in chunks:
             recorder.push(chunk)
@@ -119,7 +119,7 @@ def test_a_source_that_can_wait_waits_for_a_slow_disk(path, disk):
 
 
 def test_a_full_disk_is_told_and_what_is_written_can_be_recovered(path, disk, no_thread_left):
-    chunks = cut(noise(4000), 1000.0, samples=10)
+    chunks = cut_chunks(noise(4000), 1000.0, samples=10)
     recorder = StreamWriter(path, ArraySource(SPEC, chunks, live=True), flush_s=0.0)
     disk[0].most = 40_000
     end = time.monotonic() + PATIENCE_S
@@ -137,7 +137,7 @@ def test_a_full_disk_is_told_and_what_is_written_can_be_recovered(path, disk, no
 
 
 def test_what_is_flushed_is_there_whatever_happens_next(path, tmp_path, disk, no_thread_left):
-    chunks, now = cut(noise(300), 1000.0, samples=10), tmp_path / "now.mcap"
+    chunks, now = cut_chunks(noise(300), 1000.0, samples=10), tmp_path / "now.mcap"
     recorder = StreamWriter(path, ArraySource(SPEC, chunks, live=True), flush_s=1e9)
     for k, chunk in enumerate(chunks):
         recorder.push(chunk)
@@ -166,7 +166,7 @@ def test_what_is_recorded_is_on_the_medium_soon_and_a_slow_one_is_not_waited_for
         synced.append(os.fstat(handle).st_size)
 
     monkeypatch.setattr(os, "fdatasync", slow)
-    chunks = cut(noise(300), 1000.0, samples=10)
+    chunks = cut_chunks(noise(300), 1000.0, samples=10)
     with StreamWriter(path, ArraySource(SPEC, chunks, live=True), sync_s=0.01) as recorder:
         for chunk in chunks[:20]:
             recorder.push(chunk)

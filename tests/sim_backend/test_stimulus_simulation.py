@@ -50,7 +50,7 @@ def distance_along(model, data, start, way):
 @pytest.mark.parametrize("name", STIMULI)
 def test_the_face_is_the_analytic_arc(name):
     """Rays against the circle, written here from its centre and radius alone."""
-    surface = Surface.named(name)
+    surface = Surface.make(name)
     model, data = world_of(surface.pieces())
     turn = np.radians(surface.facing_deg)
     out = np.array([np.cos(turn), np.sin(turn), 0])
@@ -75,7 +75,7 @@ def test_the_face_is_the_analytic_arc(name):
 
 def test_concave_stays_concave():
     """A small ball rests in the hollow's middle, which a hull would have filled."""
-    surface = Surface.named("concave-close")
+    surface = Surface.make("concave-close")
     sagitta = surface.radius_mm - np.sqrt(surface.radius_mm**2 - (surface.chord_mm / 2) ** 2)
     assert sagitta == pytest.approx(5.30, abs=0.02)  # of the published mesh, at its scale
     turn = np.radians(surface.facing_deg)
@@ -88,15 +88,15 @@ def test_concave_stays_concave():
 
 def test_distances_go_away_from_the_array_in_steps():
     for shape in ("convex", "concave"):
-        named = (Surface.named(f"{shape}-{d}") for d in ("close", "medium", "far"))
+        named = (Surface.make(f"{shape}-{d}") for d in ("close", "medium", "far"))
         at = [np.array(surface.position_mm) for surface in named]
         np.testing.assert_allclose(at[1] - at[0], [1, 1, 0])
         np.testing.assert_allclose(at[2] - at[1], [1, 1, 0])
-        normal = np.radians(Surface.named(f"{shape}-far").facing_deg)
+        normal = np.radians(Surface.make(f"{shape}-far").facing_deg)
         assert (at[0] - at[1]) @ [np.cos(normal), np.sin(normal), 0] > 1.3
-    further = Surface.named("convex-far", step_mm=(2.0, 1.5, 0.5))
+    further = Surface.make("convex-far", step_mm=(2.0, 1.5, 0.5))
     np.testing.assert_allclose(
-        np.array(further.position_mm) - Surface.named("convex-close").position_mm, [4, 3, 1]
+        np.array(further.position_mm) - Surface.make("convex-close").position_mm, [4, 3, 1]
     )
 
 
@@ -110,12 +110,12 @@ def test_distances_go_away_from_the_array_in_steps():
 )
 def test_impossible_surfaces_are_refused(change, said):
     with pytest.raises(ConfigError, match=said):
-        dataclasses.replace(Surface.named("convex-far"), **change)
+        dataclasses.replace(Surface.make("convex-far"), **change)
 
 
 def test_unknown_stimuli_are_refused():
     with pytest.raises(ConfigError, match=r"no stimulus 'convex-near': there are convex-close, "):
-        Surface.named("convex-near")
+        Surface.make("convex-near")
 
 
 # ---- whisking against it
@@ -127,7 +127,7 @@ def test_closer_is_touched_earlier_and_by_more():
     felt = {}
     for name in STIMULI:
         simulation = WhiskSimulation(
-            some, Whisk(duration_s=0.24), PROFILES["realtime"], Surface.named(name).pieces()
+            some, Whisk(duration_s=0.24), PROFILES["realtime"], Surface.make(name).pieces()
         )
         felt[name] = whisk_against(simulation)
     for shape in ("convex", "concave"):

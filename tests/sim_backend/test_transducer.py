@@ -100,7 +100,7 @@ def test_the_noise_has_the_density_that_is_described() -> None:
     mouse = device_spec(load_animals("mouse"))
     spec = dataclasses.replace(mouse, channels=("mz",), units=("N m",), rate_hz=200.0)
     n = 20_000
-    (still,) = testing.cut(np.zeros((n, *spec.shape)), 200.0, samples=n)
+    (still,) = testing.cut_chunks(np.zeros((n, *spec.shape)), 200.0, samples=n)
     read = Sensor(SensorModel(), spec, 0, sensor).push(still)
     assert read is not None
     _, density = welch(read.values[:, :, 0], fs=200, nperseg=256, axis=0)

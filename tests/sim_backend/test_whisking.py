@@ -8,7 +8,7 @@ import pytest
 
 from tactile_rt.core.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
-from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirrored
+from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirror_whisker
 from tactile_rt.sim_backend.trajectories import Whisk, base_angles, mirror, read_trajectory
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.world import PROFILES, Profile, add_whiskers, empty_world, set_damping
@@ -105,7 +105,7 @@ def test_bases_follow_the_published_slopes():
 def test_protraction_is_rostral_on_both_sides():
     whiskers = tuple(
         dataclasses.replace(f(w), name=side + w.name)
-        for side, f in (("R", lambda w: w), ("L", mirrored))
+        for side, f in (("R", lambda w: w), ("L", mirror_whisker))
         for w in FEW[1:4]
     )
     level = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

@@ -9,7 +9,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import concatenate
 from tactile_rt.sources.combined import CombinedSource, MemberArray, combine_specs
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 
 HEAD = 'name = "a"\nrate_hz = 1\n'
 ONE = HEAD + '[[source]]\nname = "x"\nurl = "{}"'
@@ -27,8 +27,10 @@ def wave(spec, seconds, lag_s=0.0):
 
 
 def combined(lag_ns=0, right_seconds=2.0):
-    right = cut(wave(RIGHT, right_seconds, lag_ns / 1e9), 500.0, start_ns=10_000_000_000 + lag_ns)
-    left = cut(wave(LEFT, 2.0), 1000.0, start_ns=10_000_000_000)
+    right = cut_chunks(
+        wave(RIGHT, right_seconds, lag_ns / 1e9), 500.0, start_ns=10_000_000_000 + lag_ns
+    )
+    left = cut_chunks(wave(LEFT, 2.0), 1000.0, start_ns=10_000_000_000)
     members = [ArraySource(LEFT, left), ArraySource(RIGHT, right)]
     return CombinedSource(members, PARTS, "head", 250.0)
 

@@ -15,7 +15,7 @@ from tactile_rt.drivers.device_source import device_of
 from tactile_rt.recording import Recording
 from tactile_rt.recording.checking import compare_decoding
 from tactile_rt.sources.opening import check_model, check_source, open_source
-from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
+from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut_chunks, small_spec
 from tests.helpers.recordings import record_device
 from tests.helpers.waiting import PATIENCE_S, read_chunks
 
@@ -227,5 +227,5 @@ def test_it_is_one_source_with_all_that_the_device_has(tmp_path: Path) -> None:
         with open_source(f"{fake.url}&start_s={PATIENCE_S:g}&array={file}") as source:
             assert concatenate(read_chunks(source, 10)).values.shape[1:] == (1, 1)
             assert source.stats.delivered >= 10 and source.health.connections == 1
-    chunks = cut(np.zeros((3, 1, 6)), 1.0)
+    chunks = cut_chunks(np.zeros((3, 1, 6)), 1.0)
     assert device_of(ArraySource(check_source("serial:x?codec=bota"), chunks)) is None

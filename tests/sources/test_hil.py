@@ -13,7 +13,7 @@ from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.sources.hil import Loop, LoopReport, named_right, pair
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.tiny_model import write_model
 
 SPEC = small_spec()
@@ -30,7 +30,7 @@ def touches(n: int = 3000, start_ns: int = 12_345_678, **source) -> ArraySource:
     values = np.random.default_rng(0).normal(size=(n, *SPEC.shape)) * 2e-3
     values[1600:1900, 0] += 0.05
     values[2400:2700, 1] += 0.08
-    return ArraySource(SPEC, cut(values, SPEC.rate_hz, 9, start_ns), **source)
+    return ArraySource(SPEC, cut_chunks(values, SPEC.rate_hz, 9, start_ns), **source)
 
 
 @pytest.mark.parametrize("wire", ["serial", "slcan", "virtual"])
@@ -107,7 +107,7 @@ def test_a_source_that_breaks_is_told(model: Path) -> None:
             return super().read(timeout)
 
     with pytest.raises(SourceError, match="the finger is off"):
-        Loop(Broken(SPEC, cut(np.zeros((3000, *SPEC.shape)), SPEC.rate_hz)), model).run()
+        Loop(Broken(SPEC, cut_chunks(np.zeros((3000, *SPEC.shape)), SPEC.rate_hz)), model).run()
 
 
 @pytest.mark.parametrize(

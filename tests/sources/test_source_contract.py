@@ -13,12 +13,12 @@ from tactile_rt.recording import StreamWriter
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import write_object
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
+from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut_chunks, small_spec
 from tests.helpers.source_contract import Case, SourceContract
 from tests.helpers.waiting import PATIENCE_S
 
 SPEC = small_spec()
-CHUNKS = cut(np.random.default_rng(0).normal(size=(500, *SPEC.shape)), SPEC.rate_hz)
+CHUNKS = cut_chunks(np.random.default_rng(0).normal(size=(500, *SPEC.shape)), SPEC.rate_hz)
 SIM = "sim:mouse?objects=mug-1&sweeps=1&seed=1"
 
 LEARNT = {"rate_tolerance": 0.02, "settling_s": 0.1}  # the clock of a device

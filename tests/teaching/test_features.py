@@ -100,7 +100,7 @@ def test_silence_and_the_largest_numbers_stay_numbers(run, loads):
 
 def test_every_sensor_of_a_kind_is_looked_at_alike(run):
     timing = run.taught.timing
-    again = FeatureNetwork.drawn(run.spec, timing.substeps, timing.steps)
+    again = FeatureNetwork.draw(run.spec, timing.substeps, timing.steps)
     np.testing.assert_array_equal(again.kernels, run.network.kernels)
     np.testing.assert_array_equal(again.thresholds, run.network.thresholds)
     assert (np.diff(again.dilations) >= 0).all()

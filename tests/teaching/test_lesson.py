@@ -20,7 +20,7 @@ from tactile_rt.teaching.listener import find_motion, measure_changes, measured_
 from tactile_rt.teaching.model import FewShot
 from tactile_rt.teaching.onnx_bytes import OnnxGraph, with_metadata
 from tactile_rt.teaching.teacher import Teacher
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, touch, wrench_spec
 from tests.helpers.refusals import refusal
 
@@ -31,7 +31,7 @@ FEW = FewShot(wrench_spec(), (0.3 * NOISE).astype(np.float32), changes=0.9)
 
 def teach(lesson: Lesson, labels: list[str], seed: int, kinds: list[str] | None = None) -> None:
     """Teach touches, of these kinds if not of what they are called, as the command does."""
-    chunks = cut(felt(kinds or labels, seed), RATE_HZ)
+    chunks = cut_chunks(felt(kinds or labels, seed), RATE_HZ)
     path = lesson.next_recording()
     source = ArraySource(wrench_spec(), chunks)
     listener, told = lesson.listener(source.spec), iter(labels)
@@ -46,7 +46,7 @@ def teach(lesson: Lesson, labels: list[str], seed: int, kinds: list[str] | None 
 
 @pytest.fixture(scope="module")
 def taught(tmp_path_factory):
-    lesson = Lesson.begun(tmp_path_factory.mktemp("lesson") / "a", FEW)
+    lesson = Lesson.begin(tmp_path_factory.mktemp("lesson") / "a", FEW)
     teach(lesson, TAUGHT, seed=1)
     lesson.learn()
     return lesson
@@ -54,7 +54,7 @@ def taught(tmp_path_factory):
 
 def decided(lesson: Lesson, kinds: list[str], seed: int) -> list[str]:
     classifier = Classifier(lesson.folder / MODEL, wrench_spec())
-    found = [d for chunk in cut(felt(kinds, seed), RATE_HZ) for d in classifier.push(chunk)]
+    found = [d for chunk in cut_chunks(felt(kinds, seed), RATE_HZ) for d in classifier.push(chunk)]
     return [d.label for d in found if d.final]
 
 
@@ -90,7 +90,7 @@ def test_a_lesson_that_is_read_again_has_felt_the_same(taught):
 
 
 def test_a_lesson_goes_on(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teach(lesson, ["press", "press", "slide"], seed=4)
     assert lesson.taught_enough == ("press",)
     lesson = Lesson.read(tmp_path / "b")
@@ -101,7 +101,7 @@ def test_a_lesson_goes_on(taught, tmp_path):
 
 
 def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teach(lesson, ["press"] * 3, seed=6)
     path, recording = tmp_path / "b" / LABELS, tmp_path / "b" / "session-1.mcap"
     path.write_text(path.read_text() + "session-1.mcap,99.5,100.5,press,\nsession-1.mcap,12")
@@ -113,7 +113,7 @@ def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
 
 
 def test_a_touch_is_taken_back_by_its_own_line(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teach(lesson, ["press", "slide"], seed=6)
     path = tmp_path / "b" / LABELS
     whole = path.read_text().splitlines(keepends=True)
@@ -135,7 +135,7 @@ def test_a_touch_is_taken_back_by_its_own_line(taught, tmp_path):
 
 
 def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teach(lesson, ["press"] * 2, seed=6)
     path = tmp_path / "b" / LABELS
     whole = path.read_bytes()
@@ -186,7 +186,7 @@ def test_odd_files_beside_are_one_line(taught, tmp_path):
 
 def test_a_page_may_look_at_any_moment(taught, tmp_path):
     """It looks from a thread of its own: also between a touch that goes and what is made of it."""
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teach(lesson, ["press"] * 4, seed=8)
     teacher = Teacher(lesson, ["press"], 9)
     teacher.progress = replace(teacher.progress, odd=((4, "press"),))
@@ -197,7 +197,7 @@ def test_a_page_may_look_at_any_moment(taught, tmp_path):
 
 
 def test_one_touch_of_a_class_is_told_to_be_too_few(taught, tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teach(lesson, ["press", "press", "slide"], seed=8)
     assert Teacher(lesson, [], 2).summary()[-1] == "slide: one touch is too few, and was not learnt"
     teach(lesson, ["slide"] * 5, seed=9)
@@ -209,16 +209,16 @@ def test_it_says_why_nothing_was_felt(taught):
     listener = taught.listener(wrench_spec())
     assert "no sample came" in listener.hint()
     values = felt([], seed=9)
-    for chunk in cut(values[:15], RATE_HZ):
+    for chunk in cut_chunks(values[:15], RATE_HZ):
         assert not list(listener.push(chunk))
     assert "there was no second at rest yet" in listener.hint()
-    for chunk in cut(values[15:], RATE_HZ, start_ns=150_000_000):
+    for chunk in cut_chunks(values[15:], RATE_HZ, start_ns=150_000_000):
         assert not list(listener.push(chunk))
     said = listener.hint()
     (strongest,) = re.findall(r"strongest reading was (\d\.\d) times the noise \(sensor ", said)
     assert 2 < float(strongest) < 6 and said.endswith("and 6 is felt: touch more firmly")
     held = np.tile(values[-1:] + 9, (300, 1, 1))
-    for chunk in cut(held, RATE_HZ, start_ns=3_000_000_000):
+    for chunk in cut_chunks(held, RATE_HZ, start_ns=3_000_000_000):
         list(listener.push(chunk))
     assert "touched all the while: let go" in listener.hint()
 
@@ -230,7 +230,7 @@ def test_a_rest_in_which_something_moved_is_named(levels):
 
     def rest() -> str:
         rounded = np.round(values / levels) * levels if levels else values
-        return find_motion(list(cut(rounded.astype(np.float32), RATE_HZ)), spec)
+        return find_motion(list(cut_chunks(rounded.astype(np.float32), RATE_HZ)), spec)
 
     assert rest() == ""
     values[60:110, 0, 2] += 3.0
@@ -242,7 +242,7 @@ def test_a_rest_in_which_something_moved_is_named(levels):
 
 
 def test_two_classes_that_are_the_same_are_named(tmp_path):
-    lesson = Lesson.begun(tmp_path / "lesson", FEW)
+    lesson = Lesson.begin(tmp_path / "lesson", FEW)
     teach(lesson, ["press", "slide"] * 8, seed=3, kinds=["press"] * 16)
     assert Teacher(lesson, [], 8).progress.same == (("press", "slide"),)
     assert "press and slide feel the same: make them one" in Teacher(lesson, [], 8).summary()
@@ -252,10 +252,10 @@ def test_what_cannot_be_is_one_line(taught, tmp_path):
     (tmp_path / "others").mkdir()
     (tmp_path / "others" / LABELS).touch()
     with pytest.raises(ConfigError, match=r"holds labels\.csv, but no features\.onnx"):
-        Lesson.begun(tmp_path / "others", FEW)
-    assert "holds a lesson already" in refusal(Lesson.begun, taught.folder, FEW)
+        Lesson.begin(tmp_path / "others", FEW)
+    assert "holds a lesson already" in refusal(Lesson.begin, taught.folder, FEW)
     assert "holds no lesson: there is no features.onnx" in refusal(Lesson.read, tmp_path)
-    empty = Lesson.begun(tmp_path / "c", FEW)
+    empty = Lesson.begin(tmp_path / "c", FEW)
     assert "no class has 2 touches yet" in refusal(empty.learn)
     with pytest.raises(SpecMismatch):
         empty.listener(small_spec())
@@ -269,12 +269,12 @@ def test_the_floor_is_that_of_the_noise_or_of_the_steps():
     rng = np.random.default_rng(0)
     values = rng.normal(scale=[1e-3, 5.0], size=(400, 3, 2))
     values[..., 1] = np.round(values[..., 1] / 4) * 4  # in steps of 4
-    floor = measured_floor(cut(values, 100.0))
+    floor = measured_floor(cut_chunks(values, 100.0))
     assert floor[0] == pytest.approx(0.3e-3, rel=0.1)
     assert floor[1] == pytest.approx(0.3 * 5.1, rel=0.1)
-    still = cut(np.full((400, 3, 2), 235.0), 100.0)
+    still = cut_chunks(np.full((400, 3, 2), 235.0), 100.0)
     assert (measured_floor(still) > 0).all() and (measured_floor(still) < 1).all()
-    assert measure_changes(cut(values, 100.0)) > 0.9 and measure_changes(still) == 0
+    assert measure_changes(cut_chunks(values, 100.0)) > 0.9 and measure_changes(still) == 0
 
 
 def test_a_class_of_two_touches_does_not_let_strangers_through(taught):
@@ -282,7 +282,10 @@ def test_a_class_of_two_touches_does_not_let_strangers_through(taught):
     kept += [t for t in taught.touches if t.label == "double"][:2]
     features = np.stack([t.features for t in kept]).astype(float)
     classes = fit_classes(features, [t.label for t in kept], taught.taught.network.kinds)
-    listener, chunks = taught.listener(wrench_spec()), cut(felt(["push"] * 10, seed=3), RATE_HZ)
+    listener, chunks = (
+        taught.listener(wrench_spec()),
+        cut_chunks(felt(["push"] * 10, seed=3), RATE_HZ),
+    )
     strangers = np.stack([touch for chunk in chunks for *_, touch in listener.push(chunk)])
     nearest = classes.distances(strangers.astype(float))[:, -1].min(axis=1)
     assert (nearest > classes.reach[-1]).sum() >= 9
@@ -318,7 +321,7 @@ def test_a_touch_is_odd_under_a_wrong_name_and_not_by_chance(taught):
 
 
 def test_who_teaches_is_led_and_obeyed(tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teacher = Teacher(lesson, ["press", "slide"], 2)
     rng = np.random.default_rng(0)
     size = lesson.taught.network.size
@@ -355,7 +358,7 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert (state["right"], state["of"], state["label"]) == (4, 4, "rub")
     teacher.obey("done")
     assert teacher.done
-    quiet = Teacher(Lesson.begun(tmp_path / "c", FEW), [], 2)
+    quiet = Teacher(Lesson.begin(tmp_path / "c", FEW), [], 2)
     assert quiet.prompt() == "what is touched next? name it, or choose its number"
     assert "nothing was learnt" in quiet.take("", np.zeros((22, size), "f"), "x", (0, 1))
     assert quiet.obey("undo") == "there is no touch to take back"
@@ -370,7 +373,7 @@ def test_how_it_ended_is_what_a_page_shows(taught):
 
 
 def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teacher = Teacher(lesson, ["press"], 4)
     rng = np.random.default_rng(0)
     for k in range(4):
@@ -383,7 +386,7 @@ def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
 
 
 def test_a_class_may_be_a_number_and_none_is_made_of_one(tmp_path):
-    lesson = Lesson.begun(tmp_path / "b", FEW)
+    lesson = Lesson.begin(tmp_path / "b", FEW)
     teacher = Teacher(lesson, ["press", "2", "1"], 2)
     assert teacher.obey("1") == "touch it: 1 (1 of 2)", "its name comes before a number"
     assert teacher.obey("press") == "touch it: press (1 of 2)"
@@ -403,7 +406,7 @@ def test_the_writer_of_graphs_is_understood_by_others():
     x = g.input("x", ["batch", 3])
     y = g("Concat", g("Mul", x, g.constant(-2.5)), g("ReduceSum", x, g.integers(1)), axis=1)
     g.output("y", y, ["batch", 4])
-    data = g.serialised("two", {"a": "b"})
+    data = g.serialise("two", {"a": "b"})
     model = onnx.load_from_string(data)
     onnx.checker.check_model(model, full_check=True)
     assert {p.key: p.value for p in model.metadata_props} == {"a": "b"}
@@ -425,5 +428,5 @@ def test_what_comes_too_soon_is_the_rest_of_a_touch(taught, samples):
     # the second begins half a second after the first has ended, the third two seconds
     signal = np.concatenate([rest, slow[:-150], touches[1][100:], touches[2]])
     listener = taught.listener(wrench_spec())
-    found = [one for chunk in cut(signal, RATE_HZ, samples) for one in listener.push(chunk)]
+    found = [one for chunk in cut_chunks(signal, RATE_HZ, samples) for one in listener.push(chunk)]
     assert (len(found), listener.hasty) == (2, 1)

@@ -30,7 +30,7 @@ pytestmark = [
 
 
 def test_buttons_are_orders_and_what_is_said_is_shown(tmp_path):
-    lesson = Lesson.begun(tmp_path / "a", FewShot(wrench_spec(), np.float32(0.3 * NOISE)))
+    lesson = Lesson.begin(tmp_path / "a", FewShot(wrench_spec(), np.float32(0.3 * NOISE)))
     teacher = Teacher(lesson, ["press", "slide"], 2)
     shown, orders = [None], []
     rng = np.random.default_rng(0)

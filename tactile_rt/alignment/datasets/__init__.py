@@ -14,7 +14,7 @@ from pathlib import Path
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.packages import added, added_names
+from tactile_rt.core.packages import added_names, import_addition
 from tactile_rt.core.settings import no_such
 
 __all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
@@ -86,7 +86,7 @@ def find_dataset(name: str) -> NeuralDataset:
         module, _, attribute = DATASETS[name].partition(":")
         ours: NeuralDataset = getattr(import_module(module), attribute)
         return ours
-    theirs: NeuralDataset | None = added(ENTRY_POINTS, name)
+    theirs: NeuralDataset | None = import_addition(ENTRY_POINTS, name)
     if theirs is None:
         raise ConfigError(no_such("dataset", name, dataset_names()))
     return theirs

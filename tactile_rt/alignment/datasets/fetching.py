@@ -180,7 +180,7 @@ def fetch(
     return new, transferred
 
 
-def counted(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
+def count_recorded(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
     """Count mice and units of sessions with valid trials, and note what was left out."""
     readings, notes = read_nwb(paths, "start")
     mice = {reading.session.animal for reading in readings}

@@ -18,7 +18,7 @@ from importlib import import_module
 from tactile_rt.alignment.neural import Animal
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.packages import added, added_names
+from tactile_rt.core.packages import added_names, import_addition
 from tactile_rt.core.settings import no_such
 
 __all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "metric_names"]
@@ -89,7 +89,7 @@ def find_metric(name: str) -> Metric:
         module, _, function = METRICS[name][0].partition(":")
         ours: Metric = getattr(import_module(module), function)
         return ours
-    theirs: Metric | None = added(ENTRY_POINTS, name)
+    theirs: Metric | None = import_addition(ENTRY_POINTS, name)
     if theirs is None:
         raise ConfigError(no_such("metric", name, metric_names()))
     return theirs

@@ -52,12 +52,12 @@ def linear(animal: Animal) -> Measure:
             return float("nan")
         missing = goal.shape[1] - steps.shape[1]
         steps = np.pad(steps, ((0, 0), (0, max(missing, 0)), (0, 0)))
-        return 1 - float(((goal - predicted(steps, goal)) ** 2).sum()) / variance
+        return 1 - float(((goal - predict_held_out(steps, goal)) ** 2).sum()) / variance
 
     return Measure(1 - unexplained / variance, fit, MINIMUM_CEILING**2)
 
 
-def predicted(layer: Floats, goal: Floats) -> Floats:
+def predict_held_out(layer: Floats, goal: Floats) -> Floats:
     """Predict the goal's responses to every stimulus by regressions fitted to the others.
 
     The layer is (stimulus, bin, feature), the goal (stimulus, bin, unit), and so is the result.

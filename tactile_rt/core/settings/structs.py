@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from tactile_rt.core.errors import ConfigError, name_some
-from tactile_rt.core.settings.tree import SettingNode, named
+from tactile_rt.core.settings.tree import SettingNode, format_path
 
 UNITS = {"_s": "seconds", "_ms": "milliseconds", "_mb": "megabytes", "_hz": "hertz"}
 ALIKE = (  # units that a user may confuse
@@ -73,7 +73,7 @@ def convert(
 
 def refusal(root: SettingNode, path: Sequence[str | int], why: str) -> ConfigError:
     """Make the error for the value at a path."""
-    node, name = root.at(path), named(path)
+    node, name = root.at(path), format_path(path)
     where = node.where if node.line or node.file != root.file else root.where
     return ConfigError(f"{where}: {name}: {why}" if name else f"{where}: {why}")
 
@@ -212,20 +212,22 @@ def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -
     """Refuse unknown keys, values in place of tables, and the wrong one of [name], [[name]]."""
     bare = _strip_type(kind, node.value)
     if _is_table(bare) and not isinstance(node.value, dict):
-        name = named(path) or "the file"
-        raise ConfigError(f"{node.where}: {name} is a table of keys, not {shown(node.plain())}")
+        name = format_path(path) or "the file"
+        raise ConfigError(
+            f"{node.where}: {name} is a table of keys, not {format_value(node.plain())}"
+        )
     fields = types_of(bare) if _is_table(bare) else {}
     for key, below in node.value.items() if fields or _is_table(bare) else ():
         if key not in fields:
-            owner = named(path) or "the file"
+            owner = format_path(path) or "the file"
             advice = (path and _table_hint(key, top)) or hint(key, list(fields))
             raise ConfigError(f"{below.where}: {owner} has no key {key!r}; {advice}")
         inner, several = _find_struct(fields[key])
         if inner is not None and several and not isinstance(below.value, list):
-            name = named([*path, key])
+            name = format_path([*path, key])
             raise ConfigError(f"{below.where}: there may be several of {name}: write [[{key}]]")
         if inner is not None and not several and isinstance(below.value, list):
-            name = named([*path, key])
+            name = format_path([*path, key])
             raise ConfigError(f"{below.where}: there is but one: write [{name}]")
     for step, below, inner in _walk_values(node, kind):
         _check_keys(below, [*path, step], inner, top)
@@ -282,11 +284,11 @@ def _explain(error: Exception, node: SettingNode, kind: Any, path: Sequence[str 
         choices = [str(c) for c in typing.get_args(bare)]
         near = difflib.get_close_matches(str(value).lower(), choices, 1, 0.6)
         ask = f"; did you mean {near[0]}?" if near else ""
-        return f"{shown(value)} is not one of {', '.join(choices)}{ask}"
+        return f"{format_value(value)} is not one of {', '.join(choices)}{ask}"
     if "matching regex" in message:
-        return f"{shown(value)} is no {_describe_text(kind)}"
+        return f"{format_value(value)} is no {_describe_text(kind)}"
     if message.startswith("Expected `array`") and (expected := _describe_list(bare)):
-        return f"expected {expected}, got {shown(value)}"
+        return f"expected {expected}, got {format_value(value)}"
     if "of length" in message:
         return "must not be empty" if value in ("", [], {}) else "is too long"
     if not message.startswith("Expected "):
@@ -296,7 +298,7 @@ def _explain(error: Exception, node: SettingNode, kind: Any, path: Sequence[str 
     message = re.sub(rf"\b({'|'.join(WORDS)})\b", lambda word: WORDS[word[0]], message)
     key = str(path[-1]) if path else ""
     unit = next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
-    return f"{message}, got {shown(value)}" + (f" (in {unit})" if unit else "")
+    return f"{message}, got {format_value(value)}" + (f" (in {unit})" if unit else "")
 
 
 def _describe_text(kind: Any) -> str:
@@ -316,7 +318,7 @@ def _describe_list(kind: Any) -> str:
     return f"a list of {len(items)} {alike}"
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value for a message: at most 60 characters, without line breaks."""
     if isinstance(value, date | time):
         return value.isoformat()

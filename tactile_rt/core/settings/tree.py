@@ -74,7 +74,7 @@ class SettingNode:
                 yield from node.walk((*path, i))
 
 
-def named(path: Sequence[str | int]) -> str:
+def format_path(path: Sequence[str | int]) -> str:
     """Format a path for a message: ``source[0].url``."""
     return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
 
@@ -160,7 +160,7 @@ def _build(
     elif isinstance(value, list):
         made = [_build(v, (*path, i), lines, file, folder, line) for i, v in enumerate(value)]
     node = SettingNode(made, file, line, folder)
-    where = f"{node.where}: {named(path)}" if path else node.where
+    where = f"{node.where}: {format_path(path)}" if path else node.where
     if isinstance(value, float) and (value != value or value in (float("inf"), -float("inf"))):
         raise ConfigError(f"{where}: {value} is no quantity")
     if isinstance(value, int) and not -INT64 <= value < INT64:

@@ -11,14 +11,20 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings.structs import (
     convert,
+    format_value,
     hint,
     is_list,
     is_text,
     nearest,
-    shown,
     types_of,
 )
-from tactile_rt.core.settings.tree import SettingNode, make_node, named, plain_value, read_text
+from tactile_rt.core.settings.tree import (
+    SettingNode,
+    format_path,
+    make_node,
+    plain_value,
+    read_text,
+)
 
 LONGEST_URL = 4096  # characters
 NAMES = ("name", "kind")  # keys whose value identifies an item of a list
@@ -48,14 +54,14 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
     for i, step in enumerate(steps):
         last = i == len(steps) - 1
         if isinstance(at.value, list):
-            place = _find_item(at, step, origin, named(path))
+            place = _find_item(at, step, origin, format_path(path))
             path.append(place)
             if last:
-                raise ConfigError(f"{origin}: {named(path)} is a table: say which key of it")
+                raise ConfigError(f"{origin}: {format_path(path)} is a table: say which key of it")
             at = at.value[place]
             continue
         if not isinstance(at.value, dict):
-            raise ConfigError(f"{origin}: {named(path)} has a value, not keys")
+            raise ConfigError(f"{origin}: {format_path(path)} has a value, not keys")
         path.append(step)
         if last:
             value = written if is_text(kind, path) else plain_value(written)
@@ -230,7 +236,9 @@ def check_columns(table: CsvTable, known: Sequence[str], needed: Sequence[str] =
     """Refuse unknown columns, and the lack of a needed one."""
     for column in table.columns:
         if column not in known:
-            raise ConfigError(f"{table.where}: no column {shown(column)}; {hint(column, known)}")
+            raise ConfigError(
+                f"{table.where}: no column {format_value(column)}; {hint(column, known)}"
+            )
     for column in needed:
         if column not in table.columns:
             raise ConfigError(f"{table.where}: no column {column}; add it")

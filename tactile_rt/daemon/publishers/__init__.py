@@ -37,7 +37,7 @@ def publisher_class(kind: str) -> Any:
     if kind in PUBLISHERS:
         where, extra = PUBLISHERS[kind]
         return load_class(where, f"publisher {kind}", extra)
-    found = packages.added(packages.PUBLISHERS, kind)
+    found = packages.import_addition(packages.PUBLISHERS, kind)
     if found is not None:
         return found
     known = {*PUBLISHERS, *packages.added_names(packages.PUBLISHERS)}

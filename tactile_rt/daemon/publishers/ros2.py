@@ -165,7 +165,7 @@ class Ros2Publisher(Publisher):
     def _write_samples(self, item: SourceChunk) -> None:
         chunk, spec = item.chunk, item.spec
         utc_ns = chunk.t_ns + item.utc_offset_ns
-        data = messages.stamped(encode_samples(chunk), int(utc_ns[-1]), spec.frame)
+        data = messages.add_header(encode_samples(chunk), int(utc_ns[-1]), spec.frame)
         self._write(f"{item.source}/samples", messages.SAMPLES, data)
         wrenches = messages.wrenches_of(spec, chunk.values)
         if wrenches is None:

@@ -26,7 +26,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     parse_columns,
     read_mapping,
 )
-from tactile_rt.drivers.codecs.ascii_text import Names, fields, is_text, number, quoted
+from tactile_rt.drivers.codecs.ascii_text import Names, fields, is_text, number, quote_line
 
 TICK_NS: Final = {"s": 1e3, "iso": 1e3, "ms": 1e6, "us": 1e3, "ns": 1.0}
 NEVER_WRAPS: Final = 62  # bits, for a time in seconds
@@ -286,7 +286,7 @@ class AsciiLine(SerialCodec):
         name of the first column, with which each sample begins."""
         assert self._names is not None
         while rest := self._names.cut_glued(text):
-            self.complaint = f"line {quoted(text)} breaks off in a number, and another begins"
+            self.complaint = f"line {quote_line(text)} breaks off in a number, and another begins"
             self._count_damaged()
             text = rest
         found = self._names.find(text)
@@ -297,7 +297,7 @@ class AsciiLine(SerialCodec):
                 self.stats.skipped += len(text)
             if text.strip():
                 names = ", ".join(repr(c.label) for c in self._columns)
-                self.complaint = f"line {quoted(text)} has none of {names}"
+                self.complaint = f"line {quote_line(text)} has none of {names}"
             return
         if 0 in found or not found.keys().isdisjoint(self._open):
             if self._open and self._has_beginning:
@@ -335,7 +335,7 @@ class AsciiLine(SerialCodec):
     def _describe_problem(self, text: str, words: list[str]) -> str:
         if not is_text(text):
             return NO_TEXT
-        line = f"line {quoted(text.strip())}"
+        line = f"line {quote_line(text.strip())}"
         for k, (column, word) in enumerate(zip(self._columns, words, strict=False)):
             if number(word) is None and column.kind != "-":
                 name = f"{column.element}.{column.channel}" if column.element else column.kind

@@ -145,7 +145,7 @@ class Column:
     label: str = ""
 
     @classmethod
-    def measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
+    def make_measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
         """Return a column of measurements, whose numbers count `scale` units.
 
         The unit is one of `UNITS`; empty for the SI unit of a channel with a usual name.
@@ -196,7 +196,7 @@ def parse_column(word: str, where: str) -> Column:
     element, channel, scale, unit = found.groups()
     if unit and unit not in UNITS:
         raise ConfigError(f"{where}: unknown unit {unit!r}; {nearest(unit, UNITS)}")
-    return Column.measured(element, channel, unit or "", _parse_scale(scale, where))
+    return Column.make_measured(element, channel, unit or "", _parse_scale(scale, where))
 
 
 def parse_columns(words: Iterable[str], where: str) -> tuple[Column, ...]:

@@ -208,6 +208,6 @@ def _since_midnight(found: re.Match[str]) -> str:
     return f"{3600 * int(hours) + 60 * int(minutes) + int(seconds)}.{part or 0}"
 
 
-def quoted(line: str) -> str:
+def quote_line(line: str) -> str:
     """Return a line quoted and shortened for a message."""
     return repr(line if len(line) <= 70 else line[:67] + "...")

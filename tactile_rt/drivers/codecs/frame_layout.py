@@ -229,8 +229,8 @@ class FrameLayout:
             if not (all(scales) and np.isfinite((*scales, values.offset)).all()):
                 raise ConfigError(f"{path}: {where}: scale must be numbers other than 0")
             by_channel = dict(zip(values.channels, scales, strict=True))
-            columns = [Column.measured(e, c, values.unit, by_channel[c]) for e, c in pairs]
-            unit = np.array([Column.measured(e, c, values.unit).scale for e, c in pairs])
+            columns = [Column.make_measured(e, c, values.unit, by_channel[c]) for e, c in pairs]
+            unit = np.array([Column.make_measured(e, c, values.unit).scale for e, c in pairs])
             gain = np.array([column.scale for column in columns])
             order = values.order or self.mapping.order
             groups = len(elements) if values.by == "element" else len(values.channels)

@@ -239,7 +239,7 @@ class DeviceLog:
             self._fate[at] = new
 
 
-def damaged(packet: Packet, fault: Fault, draw: random.Random) -> tuple[Packet, Fate]:
+def damage_packet(packet: Packet, fault: Fault, draw: random.Random) -> tuple[Packet, Fate]:
     """Apply a bit flip or a truncation; return the damaged packet and its fate.
 
     CAN has a checksum of its own: a frame with a wrong bit does not arrive. At least one byte of a

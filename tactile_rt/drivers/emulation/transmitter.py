@@ -15,7 +15,7 @@ from tactile_rt.drivers.emulation.faults import (
     Fate,
     Fault,
     FaultSchedule,
-    damaged,
+    damage_packet,
 )
 
 SAME = 1e-3  # relative difference below which rates count as equal
@@ -122,7 +122,7 @@ class Transmitter:
             self._log.add(seq, t_ns, self._send_packet(packet, Fate.SENT))
         elif kind in ("bit_flip", "truncate"):
             assert self._faults is not None
-            packet, fate = damaged(packet, hit, self._faults.random)
+            packet, fate = damage_packet(packet, hit, self._faults.random)
             self._log.add(seq, t_ns, self._send_packet(packet, fate))
         elif kind == "duplicate":
             fate = self._send_packet(packet, Fate.SENT)

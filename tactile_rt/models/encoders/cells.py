@@ -68,7 +68,7 @@ class Cell(nn.Module):
         """Return the output h, shaped like x, and the new state; `drive` saves convolving x."""
         raise NotImplementedError
 
-    def convolved(self, x: Tensor, recurrent: Tensor, drive: Tensor | None) -> Tensor:
+    def convolve_gates(self, x: Tensor, recurrent: Tensor, drive: Tensor | None) -> Tensor:
         """Return the gates before their non-linearity, (..., gate * channel), in the state's type.
 
         Autocast rounds the convolutions, but not the memory.
@@ -116,7 +116,7 @@ class VanillaCell(Cell):
     elu: ClassVar[bool] = False
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
-        gate = self.convolved(x, state[0], drive)
+        gate = self.convolve_gates(x, state[0], drive)
         s = F.elu(gate) if self.elu else torch.tanh(gate)
         return s, (s,)
 
@@ -137,7 +137,7 @@ class UGRNNCell(Cell):
     gates, norms = 2, 2
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
-        c, g = self.convolved(x, state[0], drive).chunk(2, dim=-1)
+        c, g = self.convolve_gates(x, state[0], drive).chunk(2, dim=-1)
         s = torch.lerp(torch.tanh(c), state[0], torch.sigmoid(g + FORGET_BIAS))
         return s, (s,)
 
@@ -155,7 +155,7 @@ class IntersectionCell(Cell):
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
         (s,) = state
-        m, n, p, y = self.convolved(x, s, drive).chunk(4, dim=-1)
+        m, n, p, y = self.convolve_gates(x, s, drive).chunk(4, dim=-1)
         m, n = torch.tanh(m), torch.relu(n)
         p, y = torch.sigmoid(p + FORGET_BIAS), torch.sigmoid(y + FORGET_BIAS)
         return (n + y * (x - n)).to(x.dtype), (m + p * (s - m),)
@@ -179,7 +179,7 @@ class GRUCell(Cell):
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
         (s,) = state
-        r, u = self.convolved(x, s, drive).chunk(2, dim=-1)
+        r, u = self.convolve_gates(x, s, drive).chunk(2, dim=-1)
         c = self.candidate(x, torch.sigmoid(r + FORGET_BIAS) * s)
         c = torch.tanh(self.normal(c.to(s.dtype), first=2))
         s = torch.lerp(c, s, torch.sigmoid(u))
@@ -203,7 +203,7 @@ class LSTMCell(Cell):
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
         c, h = state
-        i, j, f, o = self.convolved(x, h, drive).chunk(4, dim=-1)
+        i, j, f, o = self.convolve_gates(x, h, drive).chunk(4, dim=-1)
         c = torch.sigmoid(f + FORGET_BIAS) * c + torch.sigmoid(i) * torch.tanh(j)
         normal = self.normal(c, first=4)
         h = torch.sigmoid(o) * torch.tanh(normal)
@@ -241,7 +241,7 @@ def make_cell(name: str, channels: int) -> Cell:
     if name in CELLS:
         return CELLS[name](channels)
     base = name.removesuffix("-ln")
-    found = packages.added(packages.CELLS, base)
+    found = packages.import_addition(packages.CELLS, base)
     if not (isinstance(found, type) and issubclass(found, Cell)):
         raise ConfigError(f"cell {base}: {found} is no class of encoders.cells.Cell")
     return found(channels, layer_norm=name != base)

@@ -169,7 +169,7 @@ class Graph:
             for _, group in sorted(groups.items(), key=lambda g: len(above[g[1][0].name] | g[0]))
         )
 
-    def scaled(self, width: float) -> "Graph":
+    def scale_channels(self, width: float) -> "Graph":
         """Return the graph with every node's channel count times `width`."""
         scale = [replace(n, channels=max(round(n.channels * width), 1)) for n in self.nodes]
         return replace(self, nodes=tuple(scale))

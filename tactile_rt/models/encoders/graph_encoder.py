@@ -44,7 +44,7 @@ class GraphEncoder(nn.Module):
     """Frames `(batch, step, channel, row, column)` to features.
 
     Args:
-        graph: what to build; its channel counts are final (see `Graph.scaled`).
+        graph: what to build; its channel counts are final (see `Graph.scale_channels`).
 
     Attributes:
         features: The number of channels of the graph's readout.
@@ -291,4 +291,4 @@ def build_encoder(text: str, width: float, frame: tuple[int, int, int]) -> Graph
             "the graph's {} has {} channels, rows and columns, the array's frames "
             "{}: change the graph".format(read.name, *sizes)
         )
-    return GraphEncoder(graph.scaled(width))
+    return GraphEncoder(graph.scale_channels(width))

@@ -70,7 +70,7 @@ class ConvNorm(nn.Module):
         matrix = taps[self.taps]  # (site out, site in, output, input)
         return matrix.transpose(1, 2).flatten(2).flatten(0, 1)
 
-    def folded(self) -> tuple[Tensor, Tensor]:
+    def fold_norm(self) -> tuple[Tensor, Tensor]:
         """Return matrix and bias with the norm's running statistics multiplied in."""
         norm = self.norm
         assert norm.running_var is not None and norm.running_mean is not None
@@ -182,7 +182,7 @@ class FoldedResNet18(_FrameEncoder):
         return features
 
     def _add_layer(self, name: str, layer: ConvNorm) -> None:
-        self.layers[name] = _make_linear(*layer.folded())
+        self.layers[name] = _make_linear(*layer.fold_norm())
 
 
 def sites_first(frames: Tensor) -> Tensor:

@@ -43,4 +43,4 @@ class ZhuangEncoder(GraphEncoder):
         cell: str = "intersection-ln",
         frame: tuple[int, int, int] = MOUSE_FRAME,
     ) -> None:
-        super().__init__(zhuang_graph(cell, frame).scaled(width))
+        super().__init__(zhuang_graph(cell, frame).scale_channels(width))

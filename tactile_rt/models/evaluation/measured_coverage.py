@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, PredictionSetRule, fitting
-from tactile_rt.classifier.model_card import ModelCard, decided
+from tactile_rt.classifier.model_card import ModelCard, choose_label
 from tactile_rt.classifier.model_file import file_outputs, load_model
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
@@ -180,5 +180,5 @@ def _predict_all(path: Path, test: SweepSet, disturbance: Disturbance) -> Floats
 
 def _decide(card: ModelCard, posteriors: Floats) -> NDArray[np.str_]:
     """Return (sweep,) labels decided at the last step; "" where no contact was found."""
-    found = [None if np.isnan(p).any() else decided(card, p, card.steps) for p in posteriors]
+    found = [None if np.isnan(p).any() else choose_label(card, p, card.steps) for p in posteriors]
     return np.array(["" if k is None else card.labels[k] for k in found])

@@ -100,9 +100,9 @@ def cut_windows(
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]
-        values = disturbance.of_samples(part.sweeps.values, part, rng)
+        values = disturbance.disturb_samples(part.sweeps.values, part, rng)
         found = part.onsets(values)
-        cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
+        cut = disturbance.disturb_windows(windows(values, found.start, data.timing), data, rng)
         yield CutWindows(cut, found.offset, found.sigma, found.start >= 0)
 
 

@@ -15,7 +15,7 @@ from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.core.errors import ConfigError, SpecMismatch, name_some
-from tactile_rt.models.datasets import SweepSet, relabelled
+from tactile_rt.models.datasets import SweepSet, relabel_set
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.measured_coverage import (
@@ -274,7 +274,7 @@ def _compare_svm(
     from tactile_rt.models.evaluation.svm import fit_svm  # scikit-learn takes a second to import
 
     learnt_from = (  # with the model's labels, as the test has
-        replace(relabelled(SweepSet.read(data, split), card.classes), window=test.window)
+        replace(relabel_set(SweepSet.read(data, split), card.classes), window=test.window)
         for split in ("train", "validation")
     )
     svm = fit_svm(*learnt_from)

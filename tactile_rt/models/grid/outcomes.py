@@ -178,7 +178,7 @@ def settings_of(grid: Grid, task: Task) -> str:
                 del cell["recipe"]  # what was done before there were any is as it was
             settings |= {"search": grid.search, "growth": grid.growth, "cell": cell}
             if task.cell.begin:
-                settings |= {"begun": settings_of(grid, grid.begun(task))}
+                settings |= {"begun": settings_of(grid, grid.find_beginning(task))}
         settings |= {"config": config}
         if task.random or task.cell.objective != SUPERVISED:
             settings |= {"probe": grid.probe}

@@ -202,12 +202,12 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         tasks = {(SVM, 0): Task(SVM, 0, None)} if self.svm else {}
         for cell in self.cells:
             for seed in range(cell.seeds or self.seeds):
-                random = Task(f"{RANDOM} {cell.network}", seed, self.untrained(cell))
+                random = Task(f"{RANDOM} {cell.network}", seed, self.make_untrained(cell))
                 for task in (Task(cell.name, seed, cell), random):
                     tasks.setdefault((task.name, seed), task)
         return list(tasks.values())
 
-    def untrained(self, cell: Candidate) -> Candidate:
+    def make_untrained(self, cell: Candidate) -> Candidate:
         """Return a cell's untrained network, with the settings of its probe, as a candidate."""
         own, usual = self._options(cell), TrainingConfig("")
         names = (k for k in OF_UNTRAINED if k in own or k in self.supervised)
@@ -221,7 +221,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             common = {k: v for k, v in said.items() if k not in (*OF_CELL, "width")}
         return {**common, **cell.options}
 
-    def begun(self, task: Task) -> Task:
+    def find_beginning(self, task: Task) -> Task:
         """Return the task whose trained network a task begins with."""
         assert task.cell is not None
         (cell,) = (one for one in self.cells if one.name == task.cell.begin)
@@ -233,7 +233,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if cell is None or task.random:
             return ()
         tuned = (Task(task.name, 0, cell),) if task.seed and not cell.recipe else ()
-        begun = (self.begun(task),) if cell.begin else ()
+        begun = (self.find_beginning(task),) if cell.begin else ()
         return tuple(one.slug for one in (*tuned, *begun))
 
 
@@ -287,7 +287,7 @@ def _check_grid(grid: Grid) -> None:
         if cell.name in before:
             raise ConfigError(f"two cells are {cell.name!r}")
         _check_cell(grid, cell, before)
-        bare = grid.untrained(cell)
+        bare = grid.make_untrained(cell)
         if untrained.setdefault(cell.network, bare) != bare:
             raise ConfigError(
                 f"cell {cell.name!r}: the network is another than that of a cell before it that "

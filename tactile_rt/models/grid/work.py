@@ -34,7 +34,7 @@ from tactile_rt.models.grid.outcomes import Outcome, Training
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
-from tactile_rt.models.training.loop import initialise, launched, train
+from tactile_rt.models.training.loop import initialise, launch_devices, train
 from tactile_rt.models.training.probing import probe
 from tactile_rt.sets.manifest import NEW_SWEEPS, SweepManifest
 from tactile_rt.sets.objects import holds_out_sweeps
@@ -75,7 +75,7 @@ class Workbench:
             sweeps = self.splits_of(task.cell.share)[0].sweeps
             pairs, length = config.pairs == TWO_SWEEPS, sweeps.values.shape[1]
             check_batches(sweeps.objects, length, config.batch, config.jitter, pairs)
-        with launched(config, self.accelerator):
+        with launch_devices(config, self.accelerator):
             pass
 
     def do(self, task: Task, report: Report = lambda _: None) -> Outcome:
@@ -173,10 +173,10 @@ class Workbench:
         assert cell is not None
         begin = ""
         if cell.begin:
-            begun = outcomes.read_outcome(self.grid, self.folder, self.grid.begun(task))
+            begun = outcomes.read_outcome(self.grid, self.folder, self.grid.find_beginning(task))
             if begun is None or begun.chosen is None:
                 raise DivergedError(f"{cell.begin!r} diverged, and there is nothing to begin with")
-            begin = str(self._run_folder(self.grid.begun(task), begun.chosen) / "best.pt")
+            begin = str(self._run_folder(self.grid.find_beginning(task), begun.chosen) / "best.pt")
         config = self.grid.config(
             task, self.data, learning_rate=at.learning_rate, warmup=at.warmup, updates=at.updates,
             begin=begin,
@@ -186,7 +186,7 @@ class Workbench:
             return found
         if cell.begin:  # only the outcome of the beginning may have been kept
             assert begun is not None and begun.chosen is not None
-            self._train(self.grid.begun(task), begun.chosen, report)
+            self._train(self.grid.find_beginning(task), begun.chosen, report)
         timed = self.accelerator == "cpu" and not (run / "last.pt").exists()
         began = time.process_time()
         splits, diverged = self.splits_of(cell.share), False
@@ -216,7 +216,7 @@ class Workbench:
         settings["config"].pop("data")
         if config.begin:
             settings["config"]["begin"] = "/".join(Path(config.begin).parts[-3:-1])
-            settings["begun"] = outcomes.settings_of(self.grid, self.grid.begun(task))
+            settings["begun"] = outcomes.settings_of(self.grid, self.grid.find_beginning(task))
         assert task.cell is not None
         if task.cell.objective != SUPERVISED:
             settings["probe"] = self.grid.probe

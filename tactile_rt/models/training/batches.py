@@ -314,7 +314,7 @@ class BatchFeed:
     def epoch(self, number: int) -> Yields[Batch, None, None]:
         """Yield the batches of an epoch."""
         self.waited = 0.0
-        with closing(prefetched(lambda: self._draw(number))) as ready:
+        with closing(prefetch_items(lambda: self._draw(number))) as ready:
             while True:
                 began = time.monotonic()
                 batch = next(ready, None)
@@ -343,7 +343,7 @@ def generator_of(device: torch.device, *seed: int) -> Generator:
     return Generator(device).manual_seed(word)
 
 
-def prefetched(
+def prefetch_items(
     draw: Callable[[], Iterator[Batch]], ahead: int = AHEAD
 ) -> Yields[Batch, None, None]:
     """Yield the items of `draw()`, made in another thread at most `ahead` in advance.

@@ -80,7 +80,7 @@ def train(
         OSError: the medium is full, or failed; the last checkpoint is as it was.
     """
     first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, the one that writes
-    with alone_in(folder) if first else nullcontext(), launched(config, device) as fabric:
+    with alone_in(folder) if first else nullcontext(), launch_devices(config, device) as fabric:
         return _train(fabric, config, folder, report, splits)
 
 
@@ -201,7 +201,7 @@ def _mean_loss(fabric: "Fabric", losses: list[float]) -> float:
 
 
 @contextmanager
-def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
+def launch_devices(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
     """Launch the devices of a run, which stay together until the block ends.
 
     Args:

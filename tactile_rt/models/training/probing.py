@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.locks import alone_in
 from tactile_rt.models.checkpoints import fill_checkpoint, load_checkpoint, probed_on, save_whole
-from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as, of_categories, windows
+from tactile_rt.models.datasets import SweepSet, check_sets, drawn_as, select_labelled, windows
 from tactile_rt.models.ead import TactileClassifier
 from tactile_rt.models.evaluation.measures import hits, predict, run_on
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
@@ -55,7 +55,7 @@ def probe(
             splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
             check_sets(path, splits)
         # the layer is over categories alone, without refusals
-        data, validation = (of_categories(drawn_as(one, saved["config"])) for one in splits)
+        data, validation = (select_labelled(drawn_as(one, saved["config"])) for one in splits)
         torch.manual_seed(config.seed)
         jitter = saved["config"].get("jitter", JITTER)
         touched = int((data.noisy_starts[0] >= 0).sum())  # in a small set some sweeps may be silent

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler, OneCycleLR
 
 from tactile_rt.core.errors import ModelError
-from tactile_rt.core.files import replaced
+from tactile_rt.core.files import replace_file
 from tactile_rt.models.checkpoints import describe_checkpoint, reason
 from tactile_rt.models.training.batches import Batch, BatchFeed
 from tactile_rt.models.training.config import TrainingConfig
@@ -129,7 +129,7 @@ def log_epoch(path: Path, metrics: dict[str, float]) -> None:
     writer = csv.DictWriter(text, list(metrics))
     writer.writeheader()
     writer.writerows([*old, metrics])
-    with replaced(path) as whole:
+    with replace_file(path) as whole:
         whole.write(text.getvalue().encode())
 
 
@@ -305,7 +305,7 @@ def batch_loss(
     with closing(feed.epoch(0)) as drawn:
         batch = next(drawn)
     seen = objective.see(batch.views, batch.generator)
-    graph = replayed(objective, seen, batch.labels, bf16)
+    graph = capture_loss(objective, seen, batch.labels, bf16)
     if graph is None:
         return by_kernels
 
@@ -329,7 +329,7 @@ class _Loss(nn.Module):
         return self.objective.loss(seen, labels)
 
 
-def replayed(
+def capture_loss(
     objective: Objective, seen: Sequence[Tensor], labels: Tensor, bf16: bool
 ) -> Callable[..., Tensor] | None:
     """Capture the objective's loss as a function of (*seen, labels) of fixed shapes.

@@ -283,7 +283,7 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
                 f"{topic.name} of {shape[0]} x {shape[1]}"
             )
         with suppress(ValueError):
-            chunk = decode_samples(messages.unstamped(raw), shape)
+            chunk = decode_samples(messages.strip_header(raw), shape)
             if not chunks:
                 offset = (_header_ns(message) or t_ns) - int(chunk.t_ns[-1])
             if not chunks or chunk.values.shape[1:] == chunks[0].values.shape[1:]:

@@ -129,7 +129,7 @@ def array_message(spec: ArraySpec, source: str, utc_ns: int) -> bytes:
     )  # fmt: skip
 
 
-def stamped(samples: bytes, utc_ns: int, frame: str) -> bytes:
+def add_header(samples: bytes, utc_ns: int, frame: str) -> bytes:
     """Insert a header into samples that `recording.layout.encode_samples` wrote."""
     begin = bytearray(cdr.header(utc_ns, frame))
     begin += bytes(-len(begin) % 4)
@@ -138,8 +138,8 @@ def stamped(samples: bytes, utc_ns: int, frame: str) -> bytes:
     return bytes(begin) + samples[BODY:]
 
 
-def unstamped(data: bytes) -> bytes:
-    """Remove the header that `stamped` inserted; raise ValueError if none is there."""
+def strip_header(data: bytes) -> bytes:
+    """Remove the header that `add_header` inserted; raise ValueError if none is there."""
     at = cdr.header_size(data)
     at += -at % 4
     many = data[at : at + 4]

@@ -48,7 +48,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
     WhiskerArray,
     both_sides,
     centred_mount,
-    mirrored,
+    mirror_whisker,
     place,
 )
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, TURN, Whisker
@@ -121,8 +121,8 @@ def species_array(name: str) -> WhiskerArray:
     whiskers = SPECIES[animal]()
     right = WhiskerArray(f"{animal}-right", whiskers, _mount_species(whiskers))
     if side == "left":
-        left = tuple(mirrored(w) for w in whiskers)
-        return WhiskerArray(f"{animal}-left", left, right.mount.mirrored())
+        left = tuple(mirror_whisker(w) for w in whiskers)
+        return WhiskerArray(f"{animal}-left", left, right.mount.mirror())
     return right if side == "right" else both_sides(right, f"{animal}-both")
 
 
@@ -186,7 +186,7 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
         return read_animals(Path(f"{name}.toml"), robot_text(name))
     if name in ANIMALS:  # these need no search of installed packages
         return (species_array(name),)
-    file = packages.added(packages.ARRAYS, name)
+    file = packages.import_addition(packages.ARRAYS, name)
     return (species_array(name),) if file is None else read_animals(Path(file))
 
 
@@ -233,7 +233,7 @@ def _read_toml(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray, .
     for number, values in enumerate(file.whisker):
         at: list[str | int] = ["whisker", number]
         _check_columns(nodes, at)
-        where = f"{nodes.at(at).where}: {settings.named(at)}"
+        where = f"{nodes.at(at).where}: {settings.format_path(at)}"
         if isinstance(values.get("whisker"), str):
             where += f" ({values['whisker']})"
         whiskers.append((where, _make_whisker(where, file.defaults | values)))
@@ -304,5 +304,5 @@ def _check_columns(nodes: settings.SettingNode, path: list[str | int]) -> None:
     """Refuse a table with a key that is not a column."""
     for key, node in nodes.at(path).value.items():
         if key not in COLUMNS:
-            where, hint = f"{node.where}: {settings.named(path)}", settings.hint(key, COLUMNS)
+            where, hint = f"{node.where}: {settings.format_path(path)}", settings.hint(key, COLUMNS)
             raise ConfigError(f"{where} has no key {key!r}; {hint}")

@@ -36,7 +36,7 @@ class Mount:
         roll, pitch, yaw = self.roll_pitch_yaw
         return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
 
-    def mirrored(self) -> "Mount":
+    def mirror(self) -> "Mount":
         """Return the pose mirrored in world x."""
         x, y, z = self.position
         roll, pitch, yaw = self.roll_pitch_yaw
@@ -87,7 +87,7 @@ class WhiskerArray:
                 names[key] = w.name
 
 
-def mirrored(whisker: Whisker) -> Whisker:
+def mirror_whisker(whisker: Whisker) -> Whisker:
     """Return the whisker on the other side of the head, its points reflected in x.
 
     Its curvature is the same, and its frame is right-handed, too: x along the whisker and y towards
@@ -109,7 +109,8 @@ def both_sides(right: WhiskerArray, name: str) -> WhiskerArray:
     """
     columns = 2 * max(w.column for w in right.whiskers) + 1
     left = (
-        replace(mirrored(w), name=f"L.{w.name}", column=columns - w.column) for w in right.whiskers
+        replace(mirror_whisker(w), name=f"L.{w.name}", column=columns - w.column)
+        for w in right.whiskers
     )
     kept = (replace(w, name=f"R.{w.name}") for w in right.whiskers)
     return replace(right, name=name, whiskers=(*kept, *left))

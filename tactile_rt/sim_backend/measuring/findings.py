@@ -100,7 +100,7 @@ def about(value: float, error: float) -> Figure:
     return Figure(value, value / (1 + error), value * (1 + error))
 
 
-def pooled(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[int]]:
+def pool_figures(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[int]]:
     """Pool several figures into their median, and return the indices of outliers.
 
     Its interval includes the uncertainty of each figure and their scatter.
@@ -198,7 +198,7 @@ class _ChannelAtRest:
             counted = len(rest.levels) * (rest.size - 2)
             error = SIGMAS * MEDIAN / math.sqrt(2 * counted) * (rest.noise[c] / white) ** 2
             figures.append(about(white / math.sqrt(passed_hz), error))
-        figure, strange = pooled(figures, NOISIER)
+        figure, strange = pool_figures(figures, NOISIER)
         unlike = [self._fine[k] for k in strange]
         notes = [f"unlike most: {name_some(unlike, MANY)}"] if unlike else []
         if dead := [name for name in self._rests if name not in self._live]:

@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.measuring.findings import (
     ArrayFinding,
     Figure,
     change,
-    pooled,
+    pool_figures,
 )
 from tactile_rt.sim_backend.measuring.ringing import HEARD, Ring
 from tactile_rt.sim_backend.rods.rod import Rod, make_rod
@@ -163,7 +163,7 @@ def _report_field(
     own = [n for n in figures if n not in usual]
     findings = []
     if usual:
-        figure, strange = pooled([figures[n] for n in usual], APART)
+        figure, strange = pool_figures([figures[n] for n in usual], APART)
         own += [usual[k] for k in strange]
         value, note = getattr(whiskers[usual[0]], field), f"of {len(usual) - len(strange)} whiskers"
         edits = change(("defaults", column), value, figure, f", {note}")
@@ -175,7 +175,7 @@ def _report_field(
         figure = figures[names[0]]
         # a whisker and its mirror image share a table
         if len(names) > 1 and all(figures[n].value for n in names):
-            figure, _ = pooled([figures[n] for n in names], math.inf)
+            figure, _ = pool_figures([figures[n] for n in names], math.inf)
         value = getattr(whiskers[names[0]], field) if column in tables[names[0]][1] else None
         edits = change(("whisker", number, column), value, figure)
         what = f"{column} of {name_some(names, MANY)}"

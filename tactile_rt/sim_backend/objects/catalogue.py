@@ -30,7 +30,7 @@ from tactile_rt.sim_backend.objects.shapes import (
     vessels,
 )
 from tactile_rt.sim_backend.objects.shapes import varied as varied_shapes
-from tactile_rt.sim_backend.objects.solids import TactileObject, normalised, stretched
+from tactile_rt.sim_backend.objects.solids import TactileObject, fit_unit_box, stretch_pieces
 
 __all__ = [
     "CATEGORIES",
@@ -109,14 +109,14 @@ def make_object(category: str, index: int) -> TactileObject:
     kind = _find_kind(category, index)
     # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])
-    build: _Builder = _BUILDERS.get(kind) or packages.added(packages.OBJECTS, kind)
+    build: _Builder = _BUILDERS.get(kind) or packages.import_addition(packages.OBJECTS, kind)
     if kind == category:
         pieces = build(rng)
     else:
         plain = rng.random() < PLAIN_SHARE
         pieces = build(rng) if plain else varied_shapes.BUILDERS.get(kind, build)(rng)
-        pieces = stretched(pieces, STRETCH ** rng.uniform(-1, 1, 3))
-    return TactileObject(f"{category}-{index}", kind, normalised(pieces))
+        pieces = stretch_pieces(pieces, STRETCH ** rng.uniform(-1, 1, 3))
+    return TactileObject(f"{category}-{index}", kind, fit_unit_box(pieces))
 
 
 def load_object(target: str, detail: MeshDetail = STANDARD) -> TactileObject:

@@ -150,7 +150,7 @@ def _find_inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_
     return inside
 
 
-def shuffled(planes: Floats) -> Floats:
+def spread_planes(planes: Floats) -> Floats:
     """Return planes in golden-ratio order, so that any few cover all directions."""
     ordered: Floats = planes[np.argsort(np.arange(len(planes)) * 0.6180339887 % 1)]
     return ordered

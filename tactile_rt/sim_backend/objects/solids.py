@@ -30,7 +30,7 @@ class TactileObject:
     made_by: str = "drawn"  # origin of the pieces: drawn as such, or as in `meshes`
 
 
-def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
+def fit_unit_box(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
     """Return the pieces moved and scaled together into the unit box."""
     corners = np.vstack([piece.bounds for piece in pieces])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -41,13 +41,15 @@ def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]
     )
 
 
-def moved(points: Points, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Points:
+def shift_points(points: Points, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Points:
     """Return points (n, 3) shifted by (x, y, z)."""
     shifted: Points = points + np.array([x, y, z])
     return shifted
 
 
-def stretched(pieces: Sequence[trimesh.Trimesh], factors: npt.ArrayLike) -> list[trimesh.Trimesh]:
+def stretch_pieces(
+    pieces: Sequence[trimesh.Trimesh], factors: npt.ArrayLike
+) -> list[trimesh.Trimesh]:
     """Return the pieces scaled along x, y and z by positive factors."""
     return [
         trimesh.Trimesh(piece.vertices * np.asarray(factors), piece.faces, process=False)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 
 A = Any  # a contiguous array of float64: numba infers the types of arguments
 
@@ -57,7 +57,7 @@ class Pose(NamedTuple):
     axes: A
 
 
-@compiled
+@compile_cached
 def place(chain: Chain, q: A, pose: Pose) -> None:
     """Compute a chain's pose from the first node and first resting frame in `pose`.
 
@@ -89,7 +89,7 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
             nodes[b + 1, i] = nodes[b, i] + frames[b, i, 0] * length[b]
 
 
-@compiled
+@compile_cached
 def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
     """Compute the pose of a chain on a (4, 3) base: point in row 0, frame in the others."""
     for i in range(3):
@@ -99,7 +99,7 @@ def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
     place(chain, q, pose)
 
 
-@compiled
+@compile_cached
 def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
     """Compute the lower triangle of the mass matrix.
 
@@ -151,7 +151,7 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
                     )
 
 
-@compiled
+@compile_cached
 def inertial_forces(
     chain: Chain, pose: Pose, v: A, a: A, base: A, pushed: A, work: A, torques: A, wrench: A
 ) -> None:
@@ -234,7 +234,7 @@ def inertial_forces(
             wrench[3], wrench[4], wrench[5] = m0, m1, m2
 
 
-@compiled
+@compile_cached
 def factor(matrix: A, n: int) -> bool:
     """Compute the Cholesky factor of the first n rows, in place, from the lower triangle.
 
@@ -256,7 +256,7 @@ def factor(matrix: A, n: int) -> bool:
     return True
 
 
-@compiled
+@compile_cached
 def solve_forth(lower: A, n: int, x: A) -> None:
     """Solve L y = x, in place."""
     for i in range(n):
@@ -266,7 +266,7 @@ def solve_forth(lower: A, n: int, x: A) -> None:
         x[i] = s / lower[i, i]
 
 
-@compiled
+@compile_cached
 def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
     """Solve L y = x for `count` columns of x, in place."""
     for i in range(n):
@@ -277,7 +277,7 @@ def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
             x[i, c] /= lower[i, i]
 
 
-@compiled
+@compile_cached
 def solve_back(lower: A, n: int, x: A) -> None:
     """Solve L' y = x, in place."""
     for i in range(n - 1, -1, -1):

@@ -82,7 +82,7 @@ def _warn_uncached_once() -> None:
     )
 
 
-def compiled(function: Function) -> Function:
+def compile_cached(function: Function) -> Function:
     """Return a function that is compiled when first called, and cached on disk.
 
     It releases the interpreter lock, and its sums keep the order of the source: the same numbers

@@ -10,7 +10,7 @@ per iteration. Unlike with the convex cones of many engines, a sliding contact d
 import math
 from typing import Any
 
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 
 A = Any
 CREEP = 2e-5  # mm/ms: below this slip, friction is less than Coulomb's
@@ -21,7 +21,7 @@ MOST_ROUNDS, LATER_ROUNDS = 10, 2
 TOLERANCE = 1e-4  # of the largest impulse
 
 
-@compiled
+@compile_cached
 def impulses(count: int, response: A, free: A, friction: float, drag: A, found: A) -> int:
     """Solve for the impulses of contacts.
 

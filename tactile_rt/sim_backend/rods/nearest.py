@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 
 A = Any
 MOST_ROUNDS = 40
@@ -15,7 +15,7 @@ OVERLAP_MM = 1e-7  # below, the direction between the nearest points is undefine
 WORK = (6, 4)  # shape of the scratch
 
 
-@compiled
+@compile_cached
 def _find_weights(simplex: A, count: int, weights: A, w: A) -> float:
     """Compute the squared distance from the origin to the hull of up to four points.
 
@@ -91,7 +91,7 @@ def _find_weights(simplex: A, count: int, weights: A, w: A) -> float:
     return best
 
 
-@compiled
+@compile_cached
 def nearest(
     a: A, b: A, corners: A, faces: A, beside: A, beside_at: A, known: A, work: A, found: A
 ) -> None:

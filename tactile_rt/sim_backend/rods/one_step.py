@@ -15,7 +15,7 @@ from tactile_rt.sim_backend.rods.chains import (
     solve_forth,
     solve_many_forth,
 )
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 from tactile_rt.sim_backend.rods.friction import impulses
 from tactile_rt.sim_backend.rods.touching import MOST_CONTACTS, Contacts
 
@@ -24,7 +24,7 @@ OUT_SWEEPS = 30
 GIVES_MM = 1e-4  # deflection of a sticking contact before it slides
 
 
-@compiled
+@compile_cached
 def _fill_directions(normal: A, frame: A, rows: A) -> None:
     """Fill rows (3, 3) with a normal and two tangents, the first along the link if possible."""
     for axis in range(2):
@@ -69,7 +69,7 @@ class Scratch(NamedTuple):
     move: A
 
 
-@compiled
+@compile_cached
 def scratch(links: int, n: int) -> Scratch:
     """Allocate `Scratch` for a whisker of `links` links and `n` degrees of freedom."""
     wide = 3 * MOST_CONTACTS
@@ -91,7 +91,7 @@ def scratch(links: int, n: int) -> Scratch:
     )
 
 
-@compiled
+@compile_cached
 def step(
     h: float,
     fresh: bool,
@@ -252,7 +252,7 @@ def step(
         _push_out(h, count, base, surface, q, v, pose, near, room)
 
 
-@compiled
+@compile_cached
 def _push_out(
     h: float,
     count: int,

@@ -13,7 +13,7 @@ from tactile_rt.sim_backend.rods.chains import (
     solve_back,
     solve_forth,
 )
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 from tactile_rt.sim_backend.rods.one_step import scratch, step
 from tactile_rt.sim_backend.rods.touching import Contacts
 
@@ -23,7 +23,7 @@ SETTLED, NUDGE = 1e-12, 1e-6  # tolerance, and step of finite differences, rad
 LITTLE = 0.005  # rad, sum over all joints: the limit of the linear range
 
 
-@compiled
+@compile_cached
 def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool:
     """Find the angles at which a whisker rests under its weight, by Newton's method.
 
@@ -75,7 +75,7 @@ def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool
     return off < SETTLED
 
 
-@compiled
+@compile_cached
 def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None:
     """Compute the matrix that moves a whisker near rest through a sample of 1 ms.
 
@@ -141,7 +141,7 @@ def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None
                     answers[i, column] = (answers[i, column] + found[i]) / (2 * NUDGE)
 
 
-@compiled
+@compile_cached
 def move_on(free: float, state: A, root: A, shaken: A, x: A, felt: A) -> float:
     """Advance a whisker near rest by a whole sample, if nothing is in its way.
 

@@ -51,8 +51,8 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
     """Cut a whisker into equal cells, and choose a step with which it rings correctly.
 
     A step that is long against a period makes a mode slower and damps it more. Both are corrected
-    for every mode, see `matched`, as far as the step allows. If it does not for the first mode,
-    the step is halved, but only for whiskers whose ringing the samples can represent.
+    for every mode, see `match_ringing`, as far as the step allows. If it does not for the first
+    mode, the step is halved, but only for whiskers whose ringing the samples can represent.
 
     Args:
         links: number of cells; the chain has one more link.
@@ -72,14 +72,16 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
     ratios *= omegas / slow * (slow[first] / omegas[first])
     softer = (slow / omegas) ** 2
     steps, resonance_hz = steps_per_sample, float(omegas[first] / (2 * np.pi) * 1e3)
-    found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
+    found = [match_ringing(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
     while (
         (found[first][1] < 0 or resonance_hz * steps_per_sample > SMOOTH_HZ * steps)
         and resonance_hz < HEARD_HZ
         and steps < FINEST * steps_per_sample
     ):
         steps *= 2
-        found = [matched(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)]
+        found = [
+            match_ringing(w, z, SAMPLE_MS / steps) for w, z in zip(omegas, ratios, strict=True)
+        ]
     ratio = float(ratios[first])
     if found[first][1] < 0:  # over-damped even without damping: the ratio of backward Euler alone
         turn = omegas[first] * SAMPLE_MS / steps
@@ -89,7 +91,7 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
     onto, heavy, damped = mass @ shapes, [], []
     for level in range(LEVELS):
         h = SAMPLE_MS / steps / 2**level
-        found = [matched(w, z, h) for w, z in zip(omegas, ratios, strict=True)]
+        found = [match_ringing(w, z, h) for w, z in zip(omegas, ratios, strict=True)]
         heavier = np.array([m if beta >= 0 else 1.0 for m, beta in found]) * softer
         drags = np.array([max(beta, 0.0) for _, beta in found]) * slow**2
         heavy.append((onto * (heavier - 1)) @ onto.T)
@@ -160,7 +162,7 @@ def _find_modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
     return omegas, shapes
 
 
-def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:
+def match_ringing(omega: float, ratio: float, h: float) -> tuple[float, float]:
     """Compute mass factor and damping that make backward Euler ring a mode exactly.
 
     The step x' = x + h v', m (v' - v) = -h (k x' + beta k v') multiplies the mode by two numbers.

@@ -9,8 +9,8 @@ for every place where a link is nearest to a piece of the object, within `NEAR_M
 (Moreau 1988; Stewart and Trinkle 1996). If a tip flew further than that and overlaps, it is moved
 out without changing its velocity. A step in which a node moves further than `LEAP_MM` near the
 object is repeated in parts, and one in which the object moves far is divided from the start;
-masses and damping are matched to each length of a step, see `rod.matched`. Near its rest and away
-from the object, a whisker advances by a whole sample at once, see `resting`.
+masses and damping are matched to each length of a step, see `rod.match_ringing`. Near its rest and
+away from the object, a whisker advances by a whole sample at once, see `resting`.
 """
 
 import math
@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tactile_rt.sim_backend.rods.chains import Chain, Pose, place_at
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 from tactile_rt.sim_backend.rods.one_step import scratch, step
 from tactile_rt.sim_backend.rods.resting import LITTLE, move_on
 from tactile_rt.sim_backend.rods.touching import (
@@ -74,7 +74,7 @@ class RowBounds(NamedTuple):
     answers: A
 
 
-@compiled
+@compile_cached
 def advance(
     steps: A,
     rows: RowBounds,
@@ -167,7 +167,7 @@ def advance(
     return done
 
 
-@compiled
+@compile_cached
 def _advance(
     steps_per_sample: int,
     chain: Chain,
@@ -354,7 +354,7 @@ def _advance(
     return done
 
 
-@compiled
+@compile_cached
 def _is_moving(q: A, v: A, rest: A) -> bool:
     for i in range(len(q)):
         if not (abs(q[i] - rest[i]) <= STILL and abs(v[i]) <= STILL):
@@ -362,7 +362,7 @@ def _is_moving(q: A, v: A, rest: A) -> bool:
     return False
 
 
-@compiled
+@compile_cached
 def _measure_distance(way: A, sample: int) -> float:
     square = 0.0
     for i in range(3):
@@ -370,7 +370,7 @@ def _measure_distance(way: A, sample: int) -> float:
     return math.sqrt(square)
 
 
-@compiled
+@compile_cached
 def _find_largest_move(old: A, new: A) -> float:
     """Return the largest motion of a node; not a number if any is."""
     furthest = 0.0
@@ -383,7 +383,7 @@ def _find_largest_move(old: A, new: A) -> float:
     return math.sqrt(furthest)
 
 
-@compiled
+@compile_cached
 def _rotate_base(root: A, base: A, t: float, here: A) -> None:
     """Compute a base's frame at a time after the sample's start (Rodrigues' rotation)."""
     x, y, z = base[1, 0] * t, base[1, 1] * t, base[1, 2] * t

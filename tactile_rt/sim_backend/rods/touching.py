@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tactile_rt.sim_backend.rods.chains import Pose
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 from tactile_rt.sim_backend.rods.nearest import WORK, nearest
 
 A = Any
@@ -106,7 +106,7 @@ def unseen(whiskers: int, segments: int, pieces: int) -> Seen:
     )
 
 
-@compiled
+@compile_cached
 def forget(seen: Seen) -> None:
     """Reset all bounds, as before the first search."""
     seen.reach[:] = -np.inf
@@ -117,7 +117,7 @@ def forget(seen: Seen) -> None:
     seen.planes[:, :, 4] = seen.travelled[0]
 
 
-@compiled
+@compile_cached
 def find_near(
     pose: Pose,
     segments: Segments,
@@ -237,7 +237,7 @@ def find_near(
     return count
 
 
-@compiled
+@compile_cached
 def _is_nearest(s: int, now: A, link_of: A) -> bool:
     """Return whether no neighbour on the same link is nearer, by present bounds."""
     gap, link = now[s, 0], link_of[s]
@@ -246,7 +246,7 @@ def _is_nearest(s: int, now: A, link_of: A) -> bool:
     return not (s + 1 < len(link_of) and link_of[s + 1] == link and now[s + 1, 0] < gap)
 
 
-@compiled
+@compile_cached
 def _place_ends(in_link: A, node: A, frame: A, centre: A, ends: A) -> None:
     """Compute the (2, 3) ends of a segment relative to the object's position."""
     for end in range(2):

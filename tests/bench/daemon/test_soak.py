@@ -17,7 +17,7 @@ from tactile_rt.daemon.states import Snapshot
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 
 MS = 1_000_000
 MUST = ("unbalanced", "unexplained", "miscounted", "queues_unbalanced", "queues_dropped",
@@ -68,7 +68,7 @@ def test_what_was_added_to_a_file_that_cannot_grow_counts_as_lost(tmp_path):
     recorder.open(view)
     recorder.handle([Opened("a", spec, "synthetic:", ArraySource(spec, []), 1, 1)])
     values = np.random.default_rng(0).normal(size=(sent, *spec.shape))
-    chunks = cut(values, spec.rate_hz, samples=1, start_ns=2)
+    chunks = cut_chunks(values, spec.rate_hz, samples=1, start_ns=2)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for n, chunk in enumerate(chunks):
         recorder._flush_at = 0.0 if n % 10 == 9 else np.inf  # every tenth is followed by a flush

@@ -16,7 +16,7 @@ from bench.perception.generator import _without, measured
 from bench.perception.methods import Method, of_kinds
 from bench.perception.page import PAGE, figures, made
 from bench.perception.scores import Figures, score
-from tactile_rt.models.datasets import SweepSet, joined
+from tactile_rt.models.datasets import SweepSet, join_sets
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation.measured_coverage import Coverage
 from tactile_rt.models.evaluation.measures import Interval
@@ -186,7 +186,7 @@ def test_sets_are_joined_by_the_names_of_their_kinds(data: Data) -> None:
     some = of_kinds(test, ("zebra", data.kinds[3]))
     assert set(some.sweeps.labels) == {1}
     assert len(some.sweeps) == (test.sweeps.labels == 3).sum()
-    both = joined([of_kinds(one, data.kinds) for one in (test, turned)])
+    both = join_sets([of_kinds(one, data.kinds) for one in (test, turned)])
     assert np.array_equal(both.sweeps.labels, np.tile(test.sweeps.labels, 2))
 
 

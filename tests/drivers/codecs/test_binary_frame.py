@@ -14,7 +14,7 @@ from tactile_rt.drivers.codecs.framing import crc16_modbus
 from tactile_rt.drivers.codecs.optoforce import OptoForceOptions, OptoForceSerial
 from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, cut
+from tactile_rt.testing import ArraySource, cut_chunks
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, join, mutations
 from tests.helpers.waiting import PATIENCE_S, read_chunks
 
@@ -250,7 +250,7 @@ def test_the_host_starts_stops_and_asks_and_the_device_obeys(tmp_path):
 def test_a_described_sensor_streams_over_a_line():
     """Its emulator, a pty, and our own way to open it; the description's start is answered."""
     values = signal(200).astype(np.float32)
-    source = ArraySource(example().spec, cut(values, 250.0, 10))
+    source = ArraySource(example().spec, cut_chunks(values, 250.0, 10))
     options = {"mapping": str(EXAMPLE)}
     with EmulatedSerial(source, "binary_frame", options=options, pace="fast") as device:
         url = f"{device.url}&start_s={PATIENCE_S:g}"

@@ -23,7 +23,7 @@ from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, 
 from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.emulation.transmitter import fit
 from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
-from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
+from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut_chunks, small_spec
 from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
 from tests.helpers.waiting import PATIENCE_S, read_chunks, until
 
@@ -44,7 +44,7 @@ def signal(n: int, seed: int = 0) -> np.ndarray:
 
 
 def native(n: int = 0, values: np.ndarray | None = None, **options: Any) -> Emulator:
-    made = ArraySource(SPEC, cut(signal(n) if values is None else values, SPEC.rate_hz))
+    made = ArraySource(SPEC, cut_chunks(signal(n) if values is None else values, SPEC.rate_hz))
     source = options.pop("source", made)
     options = {"pace": "fast", "endpoint": SerialEndpoint(), **options}
     return Emulator(NativeSerial(NativeOptions()), source, **options)
@@ -191,7 +191,7 @@ def test_the_clock_drifts_jumps_and_restarts() -> None:
 
 def test_a_host_that_does_not_read_loses_what_does_not_fit_and_stops_nobody() -> None:
     endpoint = SerialEndpoint(fifo_bytes=20_000)
-    source = ArraySource(SPEC, cut(signal(3000), 1000.0), live=True)
+    source = ArraySource(SPEC, cut_chunks(signal(3000), 1000.0), live=True)
     with native(endpoint=endpoint, source=source) as device:
         host = Host(endpoint.pty.path)
         until(lambda: device.log.sent == 3000)
@@ -203,7 +203,7 @@ def test_a_host_that_does_not_read_loses_what_does_not_fit_and_stops_nobody() ->
 
 
 def test_a_host_that_goes_is_noticed_and_the_next_finds_nothing_stale() -> None:
-    source = ArraySource(SPEC, cut(signal(200_000), 1000.0), live=True)
+    source = ArraySource(SPEC, cut_chunks(signal(200_000), 1000.0), live=True)
     endpoint = SerialEndpoint(fifo_bytes=30_000)
     with native(endpoint=endpoint, source=source) as device:
         first = Host(device.endpoint.pty.path)
@@ -277,7 +277,7 @@ def test_a_name_that_is_taken_is_not_taken_away(tmp_path: Path) -> None:
 
 
 def native_can(n: int, endpoint: Any, **options: Any) -> Emulator:
-    source = ArraySource(SPEC, cut(signal(n) * 1e-3, SPEC.rate_hz))
+    source = ArraySource(SPEC, cut_chunks(signal(n) * 1e-3, SPEC.rate_hz))
     codec = NativeCan(NativeCanOptions(format="float32"))
     return Emulator(codec, source, endpoint, **{"pace": "fast", **options})
 
@@ -345,7 +345,7 @@ def test_faults_of_a_bus() -> None:
     errors = [m for m in messages if m.is_error_frame]
     foreign = [m for m in messages if m.is_extended_id and not m.is_error_frame]
     ours = [m for m in messages if 0x102 <= m.arbitration_id <= 0x103 and not m.is_error_frame]
-    per_sample = len(device.codec.encode(cut(signal(1), 1000.0)[0])[0])
+    per_sample = len(device.codec.encode(cut_chunks(signal(1), 1000.0)[0])[0])
     assert len(errors) == 3 and len(foreign) == 3
     assert len(ours) == 2000 * per_sample - 2 - 1 - per_sample + per_sample
     assert device.log.fate[[800, 900, 1000, 1100]].tolist() == [
@@ -381,7 +381,7 @@ class Asked(SerialCodec):
 @pytest.mark.parametrize("pace", ["fast", "realtime"])
 def test_a_polled_device_answers_polls_only(pace: str) -> None:
     values = np.arange(20_000, dtype=np.float32)[:, None, None] * np.ones(SPEC.shape, np.float32)
-    source = ArraySource(SPEC, cut(values, 1000.0))
+    source = ArraySource(SPEC, cut_chunks(values, 1000.0))
     with Emulator(Asked(), source, SerialEndpoint(), pace=pace) as device:
         fd = os.open(device.endpoint.pty.path, os.O_RDWR | os.O_NOCTTY)
         assert not select.select([fd], [], [], 0.1)[0] and device.log.sent == 0
@@ -410,7 +410,7 @@ def test_a_commanded_array_moves() -> None:
         def set_whisking(self, *how: float) -> None:
             self.moved = how
 
-    source = Moving(SPEC, cut(signal(100_000), 1000.0))
+    source = Moving(SPEC, cut_chunks(signal(100_000), 1000.0))
     with Emulator(NativeSerial(NativeOptions()), source, SerialEndpoint()) as device:
         host = Host(device.endpoint.pty.path)
         os.write(host.fd, host.codec.whisk(8.0, 0.5, -0.25).send)
@@ -421,7 +421,7 @@ def test_a_commanded_array_moves() -> None:
 
 def test_an_array_is_fitted_to_the_device_s() -> None:
     source, device = small_spec(3), small_spec(5)
-    chunk = cut(signal(2)[:, :3], 1000.0)[0]
+    chunk = cut_chunks(signal(2)[:, :3], 1000.0)[0]
     wide = fit(source, device)(chunk)
     assert np.array_equal(wide.values[:, :3], chunk.values) and not wide.values[:, 3:].any()
     assert wide.valid.tolist() == [[True] * 3 + [False] * 2] * 2
@@ -463,7 +463,7 @@ def test_so_is_a_wrong_combination() -> None:
 
 
 def test_a_stream_of_known_length_stops_there() -> None:
-    endless = ArraySource(SPEC, cut(signal(5000), 1000.0), live=True)
+    endless = ArraySource(SPEC, cut_chunks(signal(5000), 1000.0), live=True)
     faults = FaultSchedule([Fault("drop", rate=100)])
     device, _ = hear_all(native(source=endless, pace="realtime", seconds=2.0, faults=faults))
     assert device.log.sent == 2000

@@ -7,7 +7,13 @@ import pytest
 
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule, damaged, read_faults
+from tactile_rt.drivers.emulation.faults import (
+    Fate,
+    Fault,
+    FaultSchedule,
+    damage_packet,
+    read_faults,
+)
 
 RATE = 1000
 
@@ -126,15 +132,15 @@ def test_what_damage_does_to_a_packet() -> None:
     draw = FaultSchedule([]).random
     packet = bytes(range(40))
     for bits in (1, 5, 9999):
-        hurt, fate = damaged(packet, Fault("bit_flip", rate=1, amount=bits), draw)
+        hurt, fate = damage_packet(packet, Fault("bit_flip", rate=1, amount=bits), draw)
         assert fate == Fate.CORRUPTED and len(hurt) == 40
         flipped = sum((a ^ b).bit_count() for a, b in zip(packet, hurt, strict=True))
         assert flipped == min(bits, 320)
-    cut = damaged(packet, Fault("truncate", rate=1, amount=4), draw)
+    cut = damage_packet(packet, Fault("truncate", rate=1, amount=4), draw)
     assert cut == (packet[:36], Fate.TRUNCATED)
-    assert damaged(packet, Fault("truncate", rate=1, amount=99), draw)[0] == packet[:1]
+    assert damage_packet(packet, Fault("truncate", rate=1, amount=99), draw)[0] == packet[:1]
     frames = [CanFrame(i) for i in range(9)]
-    left, fate = damaged(frames, Fault("bit_flip", rate=1, amount=2), draw)
+    left, fate = damage_packet(frames, Fault("bit_flip", rate=1, amount=2), draw)
     assert fate == Fate.CORRUPTED and len(left) == 7
     assert [f for f in frames if f in left] == left
-    assert damaged(frames, Fault("truncate", rate=1, amount=9), draw)[0] == []
+    assert damage_packet(frames, Fault("truncate", rate=1, amount=9), draw)[0] == []

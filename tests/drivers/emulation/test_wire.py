@@ -19,7 +19,7 @@ from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.emulation.pseudo_terminal import Wire, bytes_s, frames_s, misheard
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, cut, small_spec
+from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
@@ -93,7 +93,7 @@ def test_bytes_are_heard_as_they_are_at_their_speed_and_nearly_at_it(data, baud)
 )  # fmt: skip
 def test_a_device_sends_at_its_own_rate_whatever_it_measures(codec, options, hz):
     values = np.random.default_rng(0).normal(size=(60_000, 3, 2)).astype(np.float32)
-    source = ArraySource(small_spec(rate_hz=1234.0), cut(values, 1234.0, 10))
+    source = ArraySource(small_spec(rate_hz=1234.0), cut_chunks(values, 1234.0, 10))
     chunks = []
     with (
         EmulatedSerial(source, codec, options=options) as emulated,
@@ -206,7 +206,7 @@ def test_every_device_fits_its_own_wire(codec):
     if made.usb or made.spec is None:
         return
     spec = made.spec
-    chunk = cut(np.full((2, *spec.shape), 1e-3), spec.rate_hz)[0]
+    chunk = cut_chunks(np.full((2, *spec.shape), 1e-3), spec.rate_hz)[0]
     size = max(map(len, made.encode(chunk)))
     assert bytes_s(size, made.baud, made.parity) * spec.rate_hz < 1.0
 
@@ -236,7 +236,7 @@ def test_anyskin_reads_its_sensor(capsys):
 
 def test_minimalmodbus_reads_an_ft300_and_lets_it_stream():
     values = np.tile(np.array([[[1.5, -2.25, 10.0, 0.125, -0.5, 0.001]]]), (5000, 1, 1))
-    source = ArraySource(Ft300(Ft300Options()).spec, cut(values, 100.0, 10))
+    source = ArraySource(Ft300(Ft300Options()).spec, cut_chunks(values, 100.0, 10))
     with EmulatedSerial(source, "ft300") as emulated:
         sensor = minimalmodbus.Instrument(emulated.port, slaveaddress=9)
         sensor.serial.baudrate = 19_200

@@ -95,7 +95,7 @@ def test_fusion():
 
 
 def test_width_scales_every_node_but_not_the_frame():
-    half = parse_graph(TEXT).scaled(0.5)
+    half = parse_graph(TEXT).scale_channels(0.5)
     assert [n.channels for n in half.nodes] == [16, 32, 16, 32]
     assert half.frame.channels == 30
 

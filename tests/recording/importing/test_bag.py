@@ -13,7 +13,7 @@ from tactile_rt.recording.importing.bag_file import is_bag
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import schema_text
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 from tests.helpers.recordings import odd_chunks, write
 
 rosbags = pytest.importorskip("rosbags")
@@ -43,7 +43,7 @@ def bag(folder, form, told=False):
         ours = writer.add_connection("/skin/samples", messages.SAMPLES, typestore=store)
         for k, chunk in enumerate(our_chunks()):
             stamp = T0 + int(chunk.t_ns[-1])
-            writer.write(ours, T0 + k, messages.stamped(encode_samples(chunk), stamp, "mount"))
+            writer.write(ours, T0 + k, messages.add_header(encode_samples(chunk), stamp, "mount"))
         if told:
             array = writer.add_connection("/skin/array", messages.ARRAY, typestore=store)
             writer.write(array, T0, messages.array_message(small_spec(), "skin", T0))
@@ -52,7 +52,7 @@ def bag(folder, form, told=False):
 
 def our_chunks():
     values = np.random.default_rng(1).normal(size=(30, *small_spec().shape))
-    return cut(values, 1000.0, samples=7, start_ns=10**9)
+    return cut_chunks(values, 1000.0, samples=7, start_ns=10**9)
 
 
 def fill(store, writer, serialized, header):

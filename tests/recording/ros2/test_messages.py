@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.ros2 import cdr, messages
 from tactile_rt.recording.ros2.cdr import PACKAGE, SIMPLE, STANDARD, fields_of, schema_text
-from tactile_rt.testing import cut, small_spec
+from tactile_rt.testing import cut_chunks, small_spec
 
 OURS = sorted(f"tactile_rt_msgs/msg/{p.stem}" for p in (PACKAGE / "msg").glob("*.msg"))
 RANGES = {
@@ -111,11 +111,11 @@ def test_names_are_those_of_ros_2():
 @pytest.mark.parametrize("frame", ["", "a", "head", "mount", "x" * 9])
 @pytest.mark.parametrize("samples", [1, 2])
 def test_samples_with_a_header_are_decoded_by_another_and_come_back(frame, samples, store):
-    (chunk,) = cut(np.arange(6.0 * samples, dtype=np.float32).reshape(samples, 3, 2), 1000.0,
+    (chunk,) = cut_chunks(np.arange(6.0 * samples, dtype=np.float32).reshape(samples, 3, 2), 1000.0,
                    samples=samples)  # fmt: skip
     body = encode_samples(chunk)
-    data = messages.stamped(body, 1_700_000_000_123_456_789, frame)
-    assert messages.unstamped(data) == body
+    data = messages.add_header(body, 1_700_000_000_123_456_789, frame)
+    assert messages.strip_header(data) == body
     found = store.deserialize_cdr(data, messages.SAMPLES)
     assert (found.header.frame_id, found.header.stamp.sec) == (frame, 1_700_000_000)
     assert found.header.stamp.nanosec == 123_456_789

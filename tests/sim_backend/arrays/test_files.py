@@ -25,7 +25,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
     Mount,
     WhiskerArray,
     both_sides,
-    mirrored,
+    mirror_whisker,
     place,
 )
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
@@ -96,14 +96,14 @@ def test_the_rat_stands_where_the_mouse_stands() -> None:
 @pytest.mark.parametrize("animal", ["mouse", "rat"])
 def test_a_mirrored_whisker_is_the_reflected_curve(animal: str) -> None:
     for right in load_array(animal).whiskers:
-        left = mirrored(right)
+        left = mirror_whisker(right)
         here = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         np.testing.assert_allclose(points(left, here), points(right, here) @ MIRROR, atol=1e-12)
         turn = left.orientation
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(turn) == pytest.approx(1)
         assert left.curvature > 0  # y still points to the concave side
-        assert mirrored(left) == right
+        assert mirror_whisker(left) == right
 
 
 def test_a_reflected_push_in_the_simulator_gives_reflected_loads() -> None:
@@ -111,7 +111,7 @@ def test_a_reflected_push_in_the_simulator_gives_reflected_loads() -> None:
     loads = []
     for whisker, mount, force in (
         (right, MOUNT, np.array([0.02, -0.03, 0.01])),
-        (mirrored(right), MOUNT.mirrored(), np.array([-0.02, -0.03, 0.01])),
+        (mirror_whisker(right), MOUNT.mirror(), np.array([-0.02, -0.03, 0.01])),
     ):
         world = empty_world(PROFILES["dataset"])
         add_whiskers(world, (whisker,), PROFILES["dataset"], mount)
@@ -137,7 +137,7 @@ def test_both_sides_make_a_face() -> None:
         right, left = both[f"R.{w.name}"], both[f"L.{w.name}"]
         assert (right.row, right.column) == (w.row, w.column)
         assert (left.row, left.column) == (w.row, 13 - w.column)
-        assert replace(left, name=w.name, column=w.column) == mirrored(w)
+        assert replace(left, name=w.name, column=w.column) == mirror_whisker(w)
     # face to face with the animal its right is at one's left; the nose is in the middle
     for row in range(5):
         along = sorted((w for w in both.values() if w.row == row), key=lambda w: w.column)

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 import numpy as np
 import pytest
 
-from tactile_rt.calibration import declared
+from tactile_rt.calibration import declare_calibration
 from tactile_rt.core.stream import ArraySpec, Chunk, concatenate
 from tactile_rt.core.stream.sensor_spec import SensorSpec
 from tactile_rt.drivers.codec import Codec
@@ -85,7 +85,7 @@ def test_its_codec_carries_it(name: str) -> None:
     assert carried is not None
     assert (array.elements, array.channels) == (carried.elements, carried.channels)
     assert (array.units, array.rate_hz) == (carried.units, carried.rate_hz)
-    assert declared(carried, array).array == array
+    assert declare_calibration(carried, array).array == array
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -34,7 +34,7 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, UNITS
-from tactile_rt.testing import cut
+from tactile_rt.testing import cut_chunks
 
 # Short sweeps of few objects: what is tested here is where they end up.
 RECIPE = SweepRecipe(
@@ -117,7 +117,7 @@ def test_the_stored_parameters_are_those_of_the_sweep(finished: Path) -> None:
         [np.zeros(((RECIPE.lead + 1) * 9, 30, 6)), *(simulation.advance(n) for n in (100, 7, 91))]
     )
     resampler = Resampler(RECIPE.period_ns, 1e3 / SAMPLE_MS)
-    outputs = [resampler.push(chunk) for chunk in cut(loads, 1e3 / SAMPLE_MS, samples=50)]
+    outputs = [resampler.push(chunk) for chunk in cut_chunks(loads, 1e3 / SAMPLE_MS, samples=50)]
     again = np.concatenate([out.values for out in outputs if out is not None])
     assert len(again) >= 25
     assert np.array_equal(again[:25], stored)

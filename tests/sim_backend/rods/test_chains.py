@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import link_inertia, link_nodes
 from tactile_rt.sim_backend.rods import chains
-from tactile_rt.sim_backend.rods.rod import make_rod, matched
+from tactile_rt.sim_backend.rods.rod import make_rod, match_ringing
 from tactile_rt.sim_backend.world import Mount, Profile, add_whiskers, empty_world
 
 LINKS, FREE = 10, 20
@@ -108,7 +108,7 @@ def test_a_base_that_is_accelerated_pulls_every_mass_along() -> None:
 def test_a_matched_step_multiplies_a_mode_as_time_does(ratio: float, turn: float) -> None:
     """Both poles of backward Euler with the mass and damping found are those of the oscillator."""
     omega, h = 0.8, turn / 0.8
-    heavier, beta = matched(omega, ratio, h)
+    heavier, beta = match_ringing(omega, ratio, h)
     k, m = 1.0, heavier / omega**2
     step = np.linalg.inv([[1.0, -h], [h * k / m, 1 + h * beta * k / m]])
     lam = np.roots([1, 2 * ratio * omega, omega**2]).astype(complex)

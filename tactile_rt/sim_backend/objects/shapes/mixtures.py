@@ -9,7 +9,14 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.objects.solids import hull, moved, normalised, ring, slab, stretched
+from tactile_rt.sim_backend.objects.solids import (
+    fit_unit_box,
+    hull,
+    ring,
+    shift_points,
+    slab,
+    stretch_pieces,
+)
 
 Builder = Callable[[Generator], list[Trimesh]]
 
@@ -40,12 +47,12 @@ def medley(rng: Generator, builders: Sequence[Builder]) -> list[Trimesh]:
     upper = _take_half(builders[second](rng), below=False)
     top = max(float(piece.bounds[1, 2]) for piece in lower)
     foot = min(float(piece.bounds[0, 2]) for piece in upper)
-    raised = [hull(moved(piece.vertices, z=top - foot)) for piece in upper]
+    raised = [hull(shift_points(piece.vertices, z=top - foot)) for piece in upper]
     parts = [np.ptp(np.vstack([p.vertices for p in part]), axis=0) for part in (lower, raised)]
     width, depth, _ = np.minimum(*parts)
     thin = rng.uniform(0.02, 0.1)
     board = hull(slab(width, depth, top - thin), slab(width, depth, top + thin))
-    return stretched([*lower, board, *raised], 1.25 ** rng.uniform(-1, 1, 3))
+    return stretch_pieces([*lower, board, *raised], 1.25 ** rng.uniform(-1, 1, 3))
 
 
 def _draw_solid(rng: Generator) -> Trimesh:
@@ -71,6 +78,6 @@ def _draw_solid(rng: Generator) -> Trimesh:
 
 def _take_half(pieces: Sequence[Trimesh], below: bool) -> list[Trimesh]:
     """Return the pieces centred below or above the middle of the whole; all if none."""
-    whole = normalised(pieces)
+    whole = fit_unit_box(pieces)
     mine = [piece for piece in whole if (float(piece.centroid[2]) < 0) == below]
     return mine or list(whole)

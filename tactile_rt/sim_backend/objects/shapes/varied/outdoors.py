@@ -11,9 +11,9 @@ from tactile_rt.sim_backend.objects.solids import (
     box,
     hull,
     lathe,
-    moved,
     ring,
     rod,
+    shift_points,
     slab,
 )
 
@@ -56,14 +56,14 @@ def castle(rng: Generator) -> list[Trimesh]:
     for k, (x, y) in enumerate(spots):
         tall = high * u(0.75, 1.25)
         sides = 4 if square else ROUND
-        body = moved(ring(r, 0, sides), x, y)
-        pieces.append(hull(body, moved(body, z=tall)))
+        body = shift_points(ring(r, 0, sides), x, y)
+        pieces.append(hull(body, shift_points(body, z=tall)))
         if top == 0:  # a spire
-            eave = moved(ring(u(1.0, 1.3) * r, tall, sides), x, y)
+            eave = shift_points(ring(u(1.0, 1.3) * r, tall, sides), x, y)
             pieces.append(hull(eave, [(x, y, tall + u(0.1, 0.35))]))
         elif top == 1:  # a parapet
-            edge = moved(ring(1.2 * r, tall - 0.02, sides), x, y)
-            pieces.append(hull(edge, moved(edge, z=u(0.05, 0.12))))
+            edge = shift_points(ring(1.2 * r, tall - 0.02, sides), x, y)
+            pieces.append(hull(edge, shift_points(edge, z=u(0.05, 0.12))))
         elif top == 2:  # battlements
             for a in 2 * np.pi * (np.arange(4) + 0.5) / 4:
                 at = (x + 0.75 * r * np.cos(a), y + 0.75 * r * np.sin(a), tall + 0.03)
@@ -72,11 +72,11 @@ def castle(rng: Generator) -> list[Trimesh]:
         along = np.array([p[0] - q[0], p[1] - q[1]])
         across = np.array([-along[1], along[0]]) / np.linalg.norm(along) * thick / 2
         foot = np.array([(*(np.array(e) + s * across), 0.0) for e in (p, q) for s in (-1, 1)])
-        pieces.append(hull(foot, moved(foot, z=curtain * high)))
+        pieces.append(hull(foot, shift_points(foot, z=curtain * high)))
     if rng.random() < 0.5:  # a keep
         side, tall = u(0.2, 0.6) * aspect, u(0.6, 1.4) * high
         keep = slab(side, side, 0.0)
-        pieces.append(hull(keep, moved(keep, z=tall)))
+        pieces.append(hull(keep, shift_points(keep, z=tall)))
         if rng.random() < 0.4:
             pieces.append(hull(slab(1.2 * side, 1.2 * side, tall), [(0, 0, tall + u(0.1, 0.3))]))
     if rng.random() < 0.4:
@@ -114,8 +114,8 @@ def house(rng: Generator) -> list[Trimesh]:
         found = [box((x, y, wall / 2), (long, wide, wall))]
         kind, eave = rng.integers(4), u(0.0, 0.1)
         rise, thick = u(0.1, 0.4), u(0.0, 0.05)
-        edge = moved(slab(long + 2 * eave, wide + 2 * eave, wall - thick), x, y)
-        rim = moved(edge, z=thick + 0.005)
+        edge = shift_points(slab(long + 2 * eave, wide + 2 * eave, wall - thick), x, y)
+        rim = shift_points(edge, z=thick + 0.005)
         if kind == 0:  # a gable, along or across
             ends = [(x + s * (long / 2 + eave), y, wall + rise) for s in (-1, 1)]
             if rng.random() < 0.4:
@@ -131,7 +131,7 @@ def house(rng: Generator) -> list[Trimesh]:
             found.append(hull(edge, rim, high))
         else:  # flat, with a rim or things on it
             if rng.random() < 0.6:
-                found.append(hull(edge, moved(edge, z=0.03 + thick)))
+                found.append(hull(edge, shift_points(edge, z=0.03 + thick)))
             for _ in range(int(rng.integers(0, 3))):
                 at = (x + u(-0.3, 0.3) * long, y + u(-0.3, 0.3) * wide)
                 size = (u(0.06, 0.3, 3) * (long, wide, 0.5)).tolist()
@@ -202,7 +202,7 @@ def pagoda(rng: Generator) -> list[Trimesh]:
         pieces.append(rod((0, 0, z - 0.05), (0, 0, z + u(0.05, 0.25)), 0.03, 0.015, sides=8))
     if rng.random() < 0.4:
         base = ring(u(1.1, 1.6) * wide, -u(0.02, 0.1), sides, turn=turn)
-        pieces.append(hull(base, moved(base * (1, 1, 0), z=0.01)))
+        pieces.append(hull(base, shift_points(base * (1, 1, 0), z=0.01)))
     return pieces
 
 

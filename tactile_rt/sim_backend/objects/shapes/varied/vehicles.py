@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, moved, rod, slab
+from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, rod, shift_points, slab
 
 
 def car(rng: Generator) -> list[Trimesh]:
@@ -33,7 +33,9 @@ def car(rng: Generator) -> list[Trimesh]:
         )
     elif kind == 4:  # rounded over, like a beetle
         a, r = u(0.3, 0.45), u(0.1, 0.28)
-        dome = moved(ball((0, 0, 0), 1.0).vertices * (a, 0.45 * wide, r), u(-0.1, 0.05), 0, belt)
+        dome = shift_points(
+            ball((0, 0, 0), 1.0).vertices * (a, 0.45 * wide, r), u(-0.1, 0.05), 0, belt
+        )
         pieces.append(hull(dome))
     else:  # open: seats or a load
         for x in (-0.25, 0.05)[: int(rng.integers(1, 3))]:

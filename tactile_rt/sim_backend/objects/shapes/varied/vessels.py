@@ -4,7 +4,16 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.objects.solids import ROUND, hull, lathe, moved, ring, slab, tube, wall
+from tactile_rt.sim_backend.objects.solids import (
+    ROUND,
+    hull,
+    lathe,
+    ring,
+    shift_points,
+    slab,
+    tube,
+    wall,
+)
 
 
 def bottle(rng: Generator) -> list[Trimesh]:
@@ -17,8 +26,8 @@ def bottle(rng: Generator) -> list[Trimesh]:
     if kind == 0:  # square, as for oil or medicine
         flat, cut, shoulder = u(0.35, 1.0), 0.2 * wide, u(0.02, 0.2)
         body = slab(2 * wide, 2 * wide * flat, 0, cut * flat)
-        pieces.append(hull(body, moved(body, z=start)))
-        pieces.append(hull(moved(body, z=start), ring(neck, min(start + shoulder, top), 12)))
+        pieces.append(hull(body, shift_points(body, z=start)))
+        pieces.append(hull(shift_points(body, z=start), ring(neck, min(start + shoulder, top), 12)))
         pieces += lathe([(neck, min(start + shoulder, top) - 0.01), (neck, top + 0.01)], 16)
     else:
         sides = ROUND if rng.random() < 0.75 else int(rng.choice([5, 6, 8]))  # round mostly
