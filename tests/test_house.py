@@ -39,6 +39,7 @@ TABLES = {
     "tactile_rt.models",
     "tactile_rt.alignment.datasets",
     "tactile_rt.alignment.metrics",
+    "tactile_rt.alignment.other_models",
     "tactile_rt.models.ead",
     "tactile_rt.sources.opening",
 }

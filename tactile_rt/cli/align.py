@@ -13,7 +13,6 @@ from tactile_rt.cli.options import Json, Seed, argument, option, set_option
 from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.settings import take_sets
-from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
     from tactile_rt.alignment.results import Results
@@ -196,6 +195,7 @@ def decode_stimuli(
         from tactile_rt.alignment.decoding import decode, decode_paper, decode_rdm, mean_decoded
         from tactile_rt.alignment.loading import check_models, load_layers
         from tactile_rt.alignment.stimuli_input import read_stimuli
+        from tactile_rt.core.stream.stimuli import STIMULI
 
         felt = read_stimuli(stimuli)
         frozen = load_strict(benchmark) if benchmark else None

@@ -13,7 +13,6 @@ from tactile_rt.cli.app import check_output, needing
 from tactile_rt.cli.options import Json, Seed, argument, option
 from tactile_rt.cli.tables import print_table, progress_bar, share_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
     from tactile_rt.alignment.board import Alignments, BoardRow
@@ -167,6 +166,7 @@ def _make_rows(
 ) -> list[tuple["BoardRow", Any]]:
     from tactile_rt.alignment.board import BoardRow, traces_of, traces_of_stimuli
     from tactile_rt.alignment.loading import load_layers, load_untrained
+    from tactile_rt.core.stream.stimuli import STIMULI
 
     rows: list[tuple[BoardRow, Any]] = []
     for path, name in files:

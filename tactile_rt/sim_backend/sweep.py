@@ -110,7 +110,7 @@ def way_to_contact(
 
 
 def _reduce_corners(piece: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Reduce the corners of a piece to at most `SIDES`, within 0.3 % of its size."""
+    """Reduce a piece to at most `SIDES` corners, within 0.3 % of its size."""
     if len(piece.vertices) <= SIDES:
         return piece
     z, turn = np.linspace(-1, 1, SIDES), np.pi * (3 - np.sqrt(5)) * np.arange(SIDES)

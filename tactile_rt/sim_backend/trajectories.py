@@ -112,7 +112,10 @@ class Recorded:
 
 
 def _ramp(x: Floats) -> Floats:
-    """Rise smoothly from 0 (x <= 0) to 1 (x >= 1), with continuous first two derivatives."""
+    """Rise smoothly from 0 at x = 0 to 1 at x = 1.
+
+    The first two derivatives are continuous.
+    """
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)
 

@@ -165,7 +165,7 @@ class Transducer:
 
 
 def dipole_field(magnet: MagnetSpec, turns: Floats) -> Floats:
-    """Compute the (..., 3) field, T, of a magnet on a turned base, in the element's frame.
+    """Compute a magnet's field (..., 3) on a turned base, T, element's frame.
 
     Args:
         turns: (..., 2) rotation vector of the base about the element's y and z, rad.

@@ -153,7 +153,7 @@ def stamp_samples(values: NDArray[np.float32], first: int = 0, start_ns: int = 0
 
 
 def quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Compute the unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation."""
+    """Convert a rotation matrix to a unit quaternion (w, x, y, z), w >= 0."""
     q = np.empty(4)
     mujoco.mju_mat2Quat(q, np.ascontiguousarray(matrix, dtype=np.float64).ravel())
     q = q if q[0] >= 0 else -q

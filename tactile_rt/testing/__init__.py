@@ -23,7 +23,7 @@ from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedDevice, Emu
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import synthetic_spec
 
-__all__ = ["ArraySource", "FakeCan", "FakeSerial", "cut", "small_spec"]
+__all__ = ["ArraySource", "FakeCan", "FakeSerial", "cut_chunks", "small_spec"]
 
 
 def small_spec(elements: int = 3, rate_hz: float = 1000.0) -> ArraySpec:

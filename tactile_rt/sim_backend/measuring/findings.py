@@ -96,7 +96,7 @@ class ArrayFinding:
 
 
 def about(value: float, error: float) -> Figure:
-    """Make a figure from a value and a relative error, which is half of its interval."""
+    """Make a figure from a value and its relative error, half the interval."""
     return Figure(value, value / (1 + error), value * (1 + error))
 
 

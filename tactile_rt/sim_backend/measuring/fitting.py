@@ -42,7 +42,7 @@ class Fitted(NamedTuple):
 
 
 def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
-    """Read the array of a file, and check that a recording can be compared with it."""
+    """Read an array from a file and check that a recording fits it."""
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"{path}: an array that says what reads it is a .toml file")
     array = load_array(str(path))
@@ -113,7 +113,7 @@ def _find_out_of_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding
 
 
 def _read_tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
-    """Return the number and the content of each whisker's table, by its name in the stream."""
+    """Return number and content of each whisker's table, by its name."""
     file = parse_toml(text, "array").plain()
     sides = ("R.", "L.") if file.get("mirror") else ("",)
     return {

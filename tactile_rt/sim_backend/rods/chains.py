@@ -91,7 +91,7 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
 
 @compile_cached
 def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
-    """Compute the pose of a chain on a (4, 3) base: point in row 0, frame in the others."""
+    """Compute the pose of a chain on a base (4, 3): point, then frame."""
     for i in range(3):
         pose.nodes[0, i] = root[0, i]
         for k in range(3):

@@ -26,7 +26,7 @@ GIVES_MM = 1e-4  # deflection of a sticking contact before it slides
 
 @compile_cached
 def _fill_directions(normal: A, frame: A, rows: A) -> None:
-    """Fill rows (3, 3) with a normal and two tangents, the first along the link if possible."""
+    """Fill rows with a normal and two tangents, one along the link if possible."""
     for axis in range(2):
         x0, x1, x2 = frame[0, axis], frame[1, axis], frame[2, axis]
         onto = x0 * normal[0] + x1 * normal[1] + x2 * normal[2]

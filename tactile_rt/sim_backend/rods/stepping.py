@@ -66,7 +66,7 @@ class RodState(NamedTuple):
 
 
 class RowBounds(NamedTuple):
-    """The starts of each whisker's rows, and the end of the last's: (whisker + 1,) each."""
+    """Starts of each whisker's rows, and the last end, (whisker + 1,) each."""
 
     links: A
     joints: A

@@ -155,7 +155,7 @@ class RodWorld:
         )
 
     def rest_loads(self) -> Floats:
-        """Compute the (whisker, 6) base loads of whiskers at rest under gravity, N and N m."""
+        """Compute base loads (whisker, 6) at rest under gravity, N and N m."""
         return _rotate_loads(-self._weights, self._frames)
 
     def advance(
