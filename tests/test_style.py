@@ -1,17 +1,11 @@
-"""Names and first lines read as NumPy's and ROS's do: see CONTRIBUTING, "Names and sentences".
-
-What was written before the rules stands in style.txt, which only gets shorter:
-`python -m tests.test_style` strikes out what has been mended and adds nothing.
-"""
+"""Names and first lines read as NumPy's and ROS's do: see CONTRIBUTING, "Names and sentences"."""
 
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 from tests.helpers.source_tree import FUNCTIONS, modules
 
-FILE = Path(__file__).with_name("style.txt")
 WORDS = 15  # of a docstring's first sentence
 # A function does something: its name is a verb. A true conversion may be a participle.
 PARTICIPLE = re.compile(
@@ -50,17 +44,5 @@ def offences() -> Iterator[str]:
                 yield f"unclear {name}"
 
 
-def test_new_names_and_first_lines_are_plain() -> None:
-    known = set(FILE.read_text("utf-8").split("\n"))
-    new = sorted(set(offences()) - known)
-    assert new == [], "see CONTRIBUTING, Names and sentences"
-
-
-def test_what_has_been_mended_is_struck_out() -> None:
-    known = {line for line in FILE.read_text("utf-8").split("\n") if line}
-    assert sorted(known - set(offences())) == [], "python -m tests.test_style strikes it out"
-
-
-if __name__ == "__main__":
-    known = FILE.read_text("utf-8").split("\n") if FILE.exists() else list(offences())
-    FILE.write_text("\n".join(sorted(set(known) & set(offences()))) + "\n", "utf-8")
+def test_names_and_first_lines_are_plain() -> None:
+    assert sorted(offences()) == [], "see CONTRIBUTING, Names and sentences"

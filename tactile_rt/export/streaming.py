@@ -42,8 +42,8 @@ def streaming(network: EAD, integer: bool = False) -> EAD:
     if isinstance(encoder, GraphEncoder):
         if all(_is_plain(encoder, node.name) for node in encoder.graph.nodes):
             out.encoder = StreamingGraph(encoder, integer)
-    elif hasattr(encoder, "deployed"):
-        out.encoder = encoder.deployed()
+    elif hasattr(encoder, "fold_weights"):
+        out.encoder = encoder.fold_weights()
     if isinstance(network.attender, GPT):
         out._modules["attender"] = StreamingGPT(network.attender, integer)
     return out.eval()

@@ -141,7 +141,7 @@ class ResNet18Encoder(_FrameEncoder):
         self.blocks = nn.ModuleList(blocks)
         self.fc = nn.Linear(inputs, self.features)
 
-    def deployed(self) -> "FoldedResNet18":
+    def fold_weights(self) -> "FoldedResNet18":
         """Return its form for inference: only the taps that matter, batch norm folded in."""
         return FoldedResNet18(self)
 

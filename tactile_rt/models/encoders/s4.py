@@ -169,7 +169,7 @@ class S4Encoder(nn.Module):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """One step: frame (batch, channel, row, column) to features (batch, feature), new state.
 
-        The kernels are computed anew; `deployed` has them ready.
+        The kernels are computed anew; `fold_weights` has them ready.
         """
         return self.filter(frame, self.kernels(self.taps), state)
 
@@ -192,7 +192,7 @@ class S4Encoder(nn.Module):
             x = block.merge(x, (inputs[-1] * kernels[layer].t()).sum(1))
         return self.out(x), {"s4_inputs": torch.stack(inputs, 1)}
 
-    def deployed(self) -> "FoldedS4":
+    def fold_weights(self) -> "FoldedS4":
         """Return its form for inference, with kernels computed once."""
         return FoldedS4(self)
 

@@ -65,7 +65,7 @@ def test_gradients_are_those_of_the_convolutions():
 
 def test_deployed_gives_the_same():
     encoder, x = build(), frames()
-    folded = encoder.deployed()
+    folded = encoder.fold_weights()
     torch.testing.assert_close(folded(x), encoder(x), rtol=0, atol=TOLERANCE)
     out, _ = folded.step(x[:, 0], torch.zeros(len(x), dtype=torch.int64), {})
     torch.testing.assert_close(out, encoder(x)[:, 0], rtol=0, atol=TOLERANCE)
@@ -74,4 +74,4 @@ def test_deployed_gives_the_same():
 
 
 def test_deployed_is_small():
-    assert count_parameters(ResNet18Encoder().deployed()) < 3_000_000
+    assert count_parameters(ResNet18Encoder().fold_weights()) < 3_000_000
