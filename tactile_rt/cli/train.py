@@ -212,7 +212,7 @@ def export(
 @app.command(epilog="tactile-rt grid wide24 grid --processes 2")
 def grid(
     plan: Annotated[
-        str, argument("TOML file, or a shipped plan: paper-claims, wide24, wide24-full.")
+        str, argument("TOML file, or a shipped plan: paper, paper-claims, wide24, wide24-full.")
     ],
     folder: Annotated[Path, argument("Output folder; finished tasks are kept.")],
     processes: Annotated[int, option("Networks to train in parallel.", min=1)] = 2,

@@ -88,7 +88,7 @@ def replace_in(plan: Path, old: str, new: str) -> None:
 
 
 def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
-    assert shipped_grids() == ("paper-claims", "wide24", "wide24-full")
+    assert shipped_grids() == ("paper", "paper-claims", "wide24", "wide24-full")
     grid = read_grid("wide24")
     names = {cell.name for cell in grid.cells}
     for encoder in ("gru", "s4", "resnet18", "mamba", "zhuang-intersection-ln"):
@@ -151,7 +151,7 @@ def test_a_slip_in_a_grid_is_named(plan: Path, old: str, new: str, said: str) ->
 
 
 def test_a_grid_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
-    said = r"no grid none\.toml: name a TOML file, or one of paper-claims"
+    said = r"no grid none\.toml: name a TOML file, or one of paper,"
     with pytest.raises(ConfigError, match=said):
         read_grid("none.toml")
 
