@@ -201,7 +201,10 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
         _say(f"a recording is taken to hold {order}; --touches tells another number")
     before = lesson.folder.glob("session-*.mcap") if not source.live else ()
     if any(Recording(one).description.source == url for one in before):
-        _say(f"{lesson.folder} holds touches of this recording: they are taken once more")
+        raise ConfigError(
+            f"{lesson.folder} holds touches of {url} already: teach it in another folder, or "
+            "correct what labels.csv says of them"
+        )
     earlier = len(lesson.touches)
     path = lesson.next_recording()
     orders.listen()

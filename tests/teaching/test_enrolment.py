@@ -68,8 +68,8 @@ def test_objects_are_told_apart_and_a_stranger_is_none_of_these(lesson, network)
 
 def test_a_recording_that_was_taught_before_or_holds_more_is_told(lesson, call, network, tmp_path):
     how = "teach", f"replay:{tmp_path}/stream.mcap?speed=0", "--classes", ",".join(SIZES)
-    _, said, _ = call(*how, lesson[0], "--touches", 6)
-    assert "touches of this recording: they are taken once more\n" in said
+    code, _, refused = call(*how, lesson[0], "--touches", 6)
+    assert code == 2 and "already: teach it in another folder" in refused
     _, said, _ = call(*how, tmp_path / "b", "--touches", 4, "--model", network)
     assert "9 touches: if each was touched 3 times, --touches 3\n" in said
 
