@@ -120,7 +120,7 @@ def network_layers(
 
 
 def _draw_first_weights(model: TactileClassifier, training: object) -> TactileClassifier:
-    """Draw the initial weights as published if the training used such; return the model."""
+    """Draw initial weights as the paper's code does, if the training did; return the model."""
     paper = table(training).get("first_weights") == "paper"
     if paper and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)

@@ -86,9 +86,9 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
 
 
 def traces_of(layers: Layers) -> Traces:
-    """Convert layers for metrics: NaN before the step that input reaches.
+    """Return responses for metrics, NaN in the steps before input reaches the layer.
 
-    Responses of a single step, computed elsewhere for a whole stimulus, are repeated for each step.
+    A layer with one response per stimulus, computed elsewhere, gets that response in every step.
     """
     out: dict[str, Floats] = {}
     for name, trace in layers.traces.items():
@@ -113,7 +113,7 @@ def with_cells(
     notes: Iterable[str] = (),
     progress: Callable[[float], None] = lambda share: None,
 ) -> Alignments:
-    """Make the board of one dataset from given rows and a row of another animal.
+    """Compute the board of one dataset: the given rows, and another animal as model.
 
     Args:
         rows: each with its layers' responses to the dataset's conditions.
@@ -159,7 +159,7 @@ def join_boards(boards: Sequence[Alignments]) -> Alignments:
 
 
 def _make_cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
-    """Make a model's cell: score on each animal the layer best on the others."""
+    """Score a model on each animal by the layer that fits the others best."""
     values = np.array([[m.fit(trace) for m in measures] for trace in traces.values()])
     values = values.reshape(len(traces), len(measures))
     finite = np.flatnonzero(np.isfinite(values).all(axis=1)) if len(measures) else np.empty(0, int)
@@ -175,7 +175,7 @@ def _make_cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
 
 
 def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
-    """Make the cell of animals as models of each other, from mean fits."""
+    """Score each animal by the mean fit of the other animals to it."""
     scores, raw = [], []
     for target, measure in animals:
         found = [measure.fit(_convert_to_layer(a)) for a, _ in animals if a is not target]

@@ -39,11 +39,11 @@ def build(
     selection: Selection | None = None,
     clock: str | None = None,
 ) -> Benchmark:
-    """Freeze a benchmark from recordings.
+    """Compute a benchmark from recordings; scoring models needs only the result.
 
     Args:
-        inputs: NWB files and folders of them; sessions of any named stimuli, an ``.npz`` or two
-            tables (`named_recordings`); or, for paper-code, one published ``.npz``.
+        inputs: NWB files and folders of them; or, for stimuli of any names, one ``.npz`` or two
+            tables (`named_recordings`); or, for paper-code, the published ``.npz``.
         progress: called with the share done, 0 to 1.
         selection: which sessions and units to keep; None for all.
         clock: the clock of spike times: the ``session``'s, as in NWB and by default for strict, or

@@ -128,7 +128,7 @@ def contact_response(
 
 
 def _search_shifts(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floats]:
-    """Return shifts in s and the rise after contact for spike times less each shift."""
+    """Return shifts, s, and the rise after contact with each subtracted from spike times."""
     begin = contacts[0] - 2 * reach
     bins = int((contacts[-1] - contacts[0] + 4 * reach) / BIN_S) + 2
 

@@ -136,7 +136,7 @@ def _leave_one_out(values: Floats, labels: Labels) -> float:
 
 @cache
 def _list_divisions(labels: Labels) -> tuple[Labels, ...]:
-    """List all divisions into unnamed classes of the labels' sizes, the given one first."""
+    """List all partitions of the stimuli into groups of these sizes, the given one first."""
 
     def renumber(order: Labels) -> Labels:
         names: dict[int, int] = {}

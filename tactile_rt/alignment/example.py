@@ -123,7 +123,7 @@ def _standardise(values: Floats) -> Floats:
 
 
 def _draw_alike(rng: np.random.Generator, rates: Floats) -> Floats:
-    """Draw random responses with the unit means and the variance over stimuli of given ones."""
+    """Draw random responses with the same unit means and variance over stimuli as the given."""
     level = rates.mean(axis=0)
     spread = np.sqrt(((rates - level) ** 2).mean())
     return np.asarray(level + spread * _standardise(rng.normal(size=rates.shape)))

@@ -164,7 +164,7 @@ class Mice:
 
 
 def _compute_maps(rdm: Floats) -> Floats:
-    """Compute maps (part, pair, pair) of RDMs to vectors with weighted covariances as products."""
+    """Compute (part, pair, pair) matrices that whiten and centre RDMs, for weighted covariances."""
     stimuli = count_stimuli(len(rdm))
     contrasts, parts = _make_contrasts(stimuli), _select_parts(stimuli)
     shared = contrasts @ _compute_gram(rdm) @ contrasts.T
@@ -196,7 +196,7 @@ def _compute_gram(rdm: Floats) -> Floats:
 
 
 def _damage(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
-    """Return RDMs (draw, pair) whose geometry is partly that of strangers (draw, pair)."""
+    """Mix a share `lost` of strangers' geometry into an RDM; return RDMs (draw, pair)."""
     made = np.empty_like(strangers)
     own = _compute_features(rdm)
     stimuli = len(own)

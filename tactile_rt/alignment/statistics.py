@@ -120,6 +120,6 @@ def standard_error(values: ArrayLike, ddof: int = 1) -> float:
 
 
 def student(degrees: int, cases: int) -> float:
-    """Return the value that Student's t exceeds in one of 8 or 10 cases."""
+    """Return the value that Student's t exceeds with probability 1 / `cases` (8 or 10)."""
     points = STUDENT[cases]
     return points[min(degrees, len(points)) - 1]  # degrees of freedom from 1 on

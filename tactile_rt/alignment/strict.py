@@ -172,7 +172,7 @@ def freeze_strict(
 def _make_pools(
     sessions: Sequence[tuple[NeuralSession, int]], divisions: int, seed: int
 ) -> tuple[_Pool, _Pool]:
-    """Pool all units, and the reliable ones, of an animal's canonical sessions with keys."""
+    """Pool all units, and the reliable ones alone, of sessions and keys of `canonical`."""
     every, kept = [], []
     for session, key in sessions:
         made = divide_trials(session, divisions, np.random.default_rng([seed, key]))
@@ -294,7 +294,7 @@ def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
 
 
 def _refine(ranks: Keys, start: Keys) -> tuple[Keys, Keys]:
-    """Refine keys of trials, and compute those of units, from initial keys of trials."""
+    """Compute keys of trials and units by colour refinement from initial keys of trials."""
     trial = start
     for _ in range(ROUNDS):
         unit = _mix(_mix(ranks + trial[:, None]).sum(axis=0, dtype=np.uint64))

@@ -61,6 +61,6 @@ def declare(source: Source, array: ArraySpec) -> Source:
 
 
 def declare_calibration(spec: ArraySpec, array: ArraySpec) -> Calibration:
-    """Make the calibration that only declares samples of one array to be of another."""
+    """Return a calibration that changes only the array that samples belong to."""
     device = re.sub(r"[^\w.:+-]+", "-", spec.name, flags=re.ASCII).strip(".-") or "device"
     return replace(Calibration.of(device, spec), array=array)

@@ -146,18 +146,18 @@ def _format_file(c: Calibration) -> str:
         lines.append(f"units = {_toml(c.output_units)}")
     if c.mapping:
         lines += ["", "[mapping]  # output element = raw element, in the order of the output"]
-        lines += [f"{_key(new)} = {_toml(old)}" for new, old in c.mapping.items()]
+        lines += [f"{_quote_key(new)} = {_toml(old)}" for new, old in c.mapping.items()]
     for what, rows, meaning in (
         ("tare", c.tare, "raw reading at no load"),
         ("noise", c.noise, "standard deviation of the raw reading at no load"),
     ):
         if rows:
             lines += ["", f"[{what}]  # {meaning}: {_join(c.channels)}"]
-            lines += [f"{_key(element)} = {_toml(row)}" for element, row in rows.items()]
+            lines += [f"{_quote_key(element)} = {_toml(row)}" for element, row in rows.items()]
     if c.matrices:
         lines += ["", "[matrix]  # a row per output channel: output unit per raw unit"]
     for element, matrix in c.matrices.items():
-        lines += [f"{_key(element)} = [  # columns: {_join(c.channels)}"]
+        lines += [f"{_quote_key(element)} = [  # columns: {_join(c.channels)}"]
         lines += [
             f"  {_toml(row)},  # {_join(of)}" for of, row in zip(outputs, matrix, strict=True)
         ]
@@ -171,7 +171,7 @@ def _format_file(c: Calibration) -> str:
         ]
         if c.mirror.signs:
             lines += ["[mirror.signs]  # of channels whose name and unit do not tell"]
-            lines += [f"{_key(channel)} = {sign}" for channel, sign in c.mirror.signs.items()]
+            lines += [f"{_quote_key(channel)} = {sign}" for channel, sign in c.mirror.signs.items()]
     if c.gain:
         gain = f"gain = {_toml(c.gain)}  # of elements without a matrix: {_join(c.channels)}"
         lines.insert(lines.index("history = ["), gain)
@@ -189,5 +189,5 @@ def _join(names: Iterable[str]) -> str:
     return ", ".join(_toml(name)[1:-1] for name in names)
 
 
-def _key(name: str) -> str:
+def _quote_key(name: str) -> str:
     return name if BARE.fullmatch(name) else _toml(name)

@@ -134,7 +134,7 @@ def _measure_rest(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 
 
 def _diagnose(values: Floats, offset: Floats, noise: Floats, t_s: Floats, spec: ArraySpec) -> str:
-    """Describe a touch or drift of an element, on its worst channel; empty: at rest."""
+    """Describe an element's touch or drift by its worst channel; empty text if at rest."""
     scale = np.where(noise > 0, noise, 1.0)  # without noise, no reading has changed, either
     medians = np.stack([np.median(b, axis=0) for b in _split_blocks(values)])
     quarter = len(values) // 4

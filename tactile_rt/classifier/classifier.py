@@ -81,8 +81,8 @@ class Classification:
         probabilities: (class,) The posterior probability of each of them, float32.
         latency_s: The time that the model's step took, s.
         prediction_set: The classes that are still possible, the most probable first, by the model's
-            rule for the measured noise; empty without such a rule, and for windows of ``sliding``
-            that begin within a contact.
+            rule for the measured noise; empty without such a rule, and in mode ``sliding`` for
+            windows that begin after the onset.
         coverage: The share of touches of known kinds whose true class is in the prediction set of
             every step; None without a set.
         late: Whether the decision missed its deadline, see `decision_rules.Deadline`.
@@ -93,8 +93,8 @@ class Classification:
             box, crate; empty if the class has no kinds, or no rule as for `prediction_set`.
         names_coverage: The share of touches of that class whose true kind is among the names of
             every step; None without names.
-        object: The enrolled object, or "none of these"; empty if none is enrolled, and before a
-            touch's last step, also where `sure` ends it early: thresholds are for last steps only.
+        object: The enrolled object, or "none of these"; empty if none is enrolled, before a touch's
+            last step, and if `sure` ends it early, since the thresholds are those of the last step.
         object_margin: The score of the likeliest object less its threshold; below 0 the object is
             none of these; None without objects.
         object_touches: The number of touches that `object` rests on, more than 1 where they are

@@ -80,7 +80,7 @@ class Contents:
 
 
 def read_onnx(data: bytes) -> Contents:
-    """Walk a serialised ``ModelProto``.
+    """Check a serialised ``ModelProto`` and return its contents.
 
     Raises:
         BadModel: damaged, or with external data, foreign operators, functions, training, loops,
@@ -115,6 +115,8 @@ def split_fields(data: bytes | memoryview) -> Iterator[tuple[int, memoryview, me
 
 
 class _Walk:
+    """A walker over a serialised model, with a method that checks each kind of message."""
+
     def __init__(self, data: bytes | memoryview) -> None:
         if len(data) > MAX_BYTES:
             raise BadModel(f"{len(data)} bytes, more than the {MAX_BYTES} that ONNX allows")

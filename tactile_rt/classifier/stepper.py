@@ -113,7 +113,7 @@ class Stepper:
             state.zero(lane)
 
     def run(self) -> NDArray[np.float32]:
-        """Take a step; return (lane, class) logits, a buffer that the next step overwrites."""
+        """Run one step; return (lane, class) logits, a buffer that the next step overwrites."""
         self._samples.send()
         with self._flush:
             self._session.run_with_iobinding(self._steps[self._now])

@@ -105,7 +105,7 @@ def open_url(url: str) -> "Source":
 
 @contextmanager
 def needing(extra: str) -> Iterator[None]:
-    """Let the block import packages of an extra; name the extra if one is missing."""
+    """Turn a failed import in the block into an error that names the extra."""
     with require_extra("this needs", extra), starting():
         yield
 

@@ -90,14 +90,14 @@ class _Output:
         if not self._alone:
             typer.echo(text)
 
-    def go_on(self, *words: object) -> None:
+    def end_with_command(self, *words: object) -> None:
         """Print the last line: the command to continue with."""
         self._all["command"] = command = shlex.join(["tactile-rt", *map(str, words)])
         if not self._alone:
             typer.echo(command)
         told_as_json(self._all, self._json)
 
-    def nothing(self, what: str, hint: str = "") -> NoReturn:
+    def end_without_result(self, what: str, hint: str = "") -> NoReturn:
         """Print the last line, that nothing was found, and exit."""
         self.say(f"{what}{f': {hint}' if hint else ''}")
         told_as_json(self._all, self._json)
@@ -152,12 +152,12 @@ def _sniff_port(
         out.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
         fields = {"codec": "ascii_line", "columns": columns}
         fields |= {} if baud == 115_200 else {"baud": str(baud)}
-        out.go_on("run", "--source", f"{url}?{_make_query(fields)}")
+        out.end_with_command("run", "--source", f"{url}?{_make_query(fields)}")
         return
     if not any(data for _, data in texts):
         hint = "" if ask else "try --ask: it may have to be started"
-        out.nothing(f"nothing came from {port}", hint)
-    out.nothing(f"nothing fits what came from {port}", DESCRIBE)
+        out.end_without_result(f"nothing came from {port}", hint)
+    out.end_without_result(f"nothing fits what came from {port}", DESCRIBE)
 
 
 def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, out: _Output) -> None:
@@ -172,12 +172,14 @@ def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, out:
             fits += sniff_frames(answer, further)
     if not fits:
         if not frames:
-            out.nothing(
+            out.end_without_result(
                 f"nothing came from {url}",
                 "is the bit rate right?" + ("" if ask else " or try --ask: it may wait to be told"),
             )
         _show_identifiers(frames, out)
-        out.nothing(f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc")
+        out.end_without_result(
+            f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc"
+        )
     _show(fits, out)
     _propose_run(url, fits[0], {}, out)
 
@@ -187,7 +189,7 @@ def _propose_run(url: str, fit: "CodecFit", further: dict[str, str], out: _Outpu
     if not fit.described:
         out.say("it has not described its array here; it does when it is started")
     sign = "&" if "?" in url else "?"
-    out.go_on("run", "--source", f"{url}{sign}{_make_query(fields)}")
+    out.end_with_command("run", "--source", f"{url}{sign}{_make_query(fields)}")
 
 
 def _usual_baud(fit: "CodecFit") -> int:
@@ -229,15 +231,15 @@ def _sniff_file(path: Path, further: "list[Tried]", out: _Output) -> None:
         if not fits[0].described:
             out.say("it did not describe its array: array=FILE.json of `tactile-rt describe` does")
             fields["array"] = "FILE.json"
-        out.go_on("import", path, "--as", _make_query(fields))
+        out.end_with_command("import", path, "--as", _make_query(fields))
     elif is_can:
         _show_identifiers(start, out)
         for note in log.notes:
             out.say(note)
         hint = "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'"
-        out.nothing(f"no codec fits {path}", hint)
+        out.end_without_result(f"no codec fits {path}", hint)
     elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, out):
-        out.nothing(f"nothing fits {path}", _describe_lack(data) or DESCRIBE)
+        out.end_without_result(f"nothing fits {path}", _describe_lack(data) or DESCRIBE)
 
 
 def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
@@ -247,11 +249,11 @@ def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
     try:
         proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     except ConfigError as error:
-        out.nothing(str(error))
+        out.end_without_result(str(error))
     if proposed is None:
         return False
     if not proposed.columns:
-        out.nothing(f"no columns are found with which it is read: {proposed.said}"[:200])
+        out.end_without_result(f"no columns are found with which it is read: {proposed.said}"[:200])
     out.say(f"{proposed.said}: names and units are for you to say")
     options: list[object] = ["--columns", proposed.columns]
     if not proposed.table:
@@ -260,7 +262,7 @@ def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
         which = "the header's" if proposed.rate_hz else f"not {GUESSED_HZ}"
         out.say(f"no column is a time: --rate says how many came in a second, {which}")
         options += ["--rate", f"{proposed.rate_hz or GUESSED_HZ:g}"]
-    out.go_on("import", path, *options)
+    out.end_with_command("import", path, *options)
     return True
 
 
@@ -290,9 +292,9 @@ def _sniff_bag(path: Path, out: _Output) -> None:
         try:
             element_order(read_model(shipped_model())[0].array, about.spec)
         except SpecMismatch:
-            out.go_on("teach", f"replay:{path}?speed=0", "lesson", "--classes", "A,B")
+            out.end_with_command("teach", f"replay:{path}?speed=0", "lesson", "--classes", "A,B")
         else:
-            out.go_on("run", "--source", f"replay:{path}")
+            out.end_with_command("run", "--source", f"replay:{path}")
         return
     topics = bag_topics(path)
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
@@ -304,12 +306,14 @@ def _sniff_bag(path: Path, out: _Output) -> None:
     if not known and proposed:
         best = max(proposed, key=lambda t: t.messages)
         out.say(f"{best.name} has numbers: names and units are for you to say")
-        out.go_on("import", path, "--topic", best.name, "--columns", best.proposed)
+        out.end_with_command("import", path, "--topic", best.name, "--columns", best.proposed)
         return
     if not known:
-        out.nothing(f"{path}: of no topic is known what is what", "say it with --columns")
+        out.end_without_result(
+            f"{path}: of no topic is known what is what", "say it with --columns"
+        )
     best = max(known, key=lambda t: t.messages)
-    out.go_on("import", path, *(["--topic", best.name] if len(known) > 1 else []))
+    out.end_with_command("import", path, *(["--topic", best.name] if len(known) > 1 else []))
 
 
 # output

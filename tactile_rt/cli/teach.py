@@ -133,7 +133,7 @@ def teach(
 
 
 class Orders:
-    """Queue of orders from lines of stdin and the buttons of a page.
+    """Queue of the user's orders, such as ``undo``, from stdin and a page's buttons.
 
     Args:
         at: host and port of the page; None: no page.
@@ -158,7 +158,7 @@ class Orders:
             self._page.close()
 
     def end(self, message: str) -> None:
-        """Show on the page how the lesson ended; wait until it has asked."""
+        """Show on the page how the lesson ended; wait while the page fetches it."""
         if self.teacher is not None:
             self.teacher.ended = message
             time.sleep(PAGE_S if self._page else 0)
@@ -168,7 +168,7 @@ class Orders:
         threading.Thread(target=self._take_lines, daemon=True).start()
 
     def next(self) -> str:
-        """Return the next order; empty if there is none."""
+        """Return the user's next order; empty text if none waits."""
         return "" if self._orders.empty() else self._orders.get()
 
     def _take_lines(self) -> None:

@@ -88,7 +88,7 @@ class BoundedQueue(Generic[T]):
         self._closed = False
         self.taking = True
         self._put, self._taken, self._dropped = (dict.fromkeys(kinds, 0) for _ in range(3))
-        self._seen = self._counts()
+        self._seen = self._count_items()
 
     def put(self, item: T) -> None:
         """Add an item; drop the oldest items if necessary."""
@@ -183,12 +183,12 @@ class BoundedQueue(Generic[T]):
         """Present counts. If a thread hangs with the lock, those of the last call are given."""
         if self._lock.acquire(timeout=LOOK_S):
             try:
-                self._seen = self._counts()
+                self._seen = self._count_items()
             finally:
                 self._lock.release()
         return self._seen
 
-    def _counts(self) -> QueueState:
+    def _count_items(self) -> QueueState:
         waiting = dict.fromkeys(self._put, 0)
         for _, kind, n, *_ in self._queue:
             waiting[kind] += n

@@ -116,7 +116,7 @@ def _hide_name(path: Path) -> Path:
 
 
 def _raise_for(error: BaseException, hidden: Path, path: Path) -> None:
-    """Raise an error of a hidden or unnamed file as one of `path`. Ignore any other."""
+    """Raise an OSError that names the hidden file, or none, as one of `path`. Ignore others."""
     if not isinstance(error, OSError) or not error.errno:
         return
     named = error.filename  # a number if the file was opened by its descriptor

@@ -42,7 +42,7 @@ def added_names(group: str) -> tuple[str, ...]:
 
 
 def import_addition(group: str, name: str) -> Any:
-    """Import what another package adds to a group by this name; None if none does.
+    """Import the object that another package adds to a group by this name, or None.
 
     Raises:
         ConfigError: The import fails; the message names the package.

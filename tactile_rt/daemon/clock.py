@@ -40,10 +40,10 @@ class Clock:
 
 
 class Turns:
-    """The last turns of threads that are no parts but must keep running.
+    """The last turns (passes of the loop) of critical threads that are no parts.
 
-    The watch is one of them. It needs few and short turns, so if it is kept waiting, so is the
-    whole process.
+    The watch is one of them. Its turns are few and short, so if it is kept waiting, so is the whole
+    process.
     """
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Turns:
         self._waits = LossWindow()  # the watch's waiting time for a processor, ns
 
     def take(self, name: str) -> None:
-        """Note a turn of a thread."""
+        """Record that a thread takes a turn now."""
         self._turns[name] = time.monotonic_ns()
 
     def silent(self) -> Mapping[str, float]:
@@ -61,7 +61,7 @@ class Turns:
         return {name: (now - turned) / 1e9 for name, turned in self._turns.copy().items()}
 
     def watch(self, thread_id: int | None) -> float:
-        """Note a turn of the watch; return how long it was starved, s, or 0."""
+        """Record a turn of the watch; return how long it was starved, s, or 0."""
         now = time.monotonic_ns()
         lasted_s = (now - self._turns.get("watch", now)) / 1e9
         self._read_waited_s(thread_id)  # count the waiting time from now on
@@ -71,7 +71,7 @@ class Turns:
         return lasted_s
 
     def starved_s(self, thread_id: int | None) -> float:
-        """Return how long the whole process lately had no turn, s."""
+        """Return for how long the whole process recently got no processor time, s."""
         now = time.monotonic_ns()
         since = self._turns.get("watch")
         waiting = (now - since) / 1e9 if since else 0.0

@@ -95,16 +95,16 @@ class Consumer(abc.ABC):
         return {}
 
     def diagnose(self) -> str:
-        """Return what prevents its work now, or an empty string. The text has no number that keeps
-        changing; called from any thread, must be quick."""
+        """Return the cause that prevents its work now, or an empty string. The text has no number
+        that keeps changing; called from any thread, must be quick."""
         return ""
 
     def foresee(self) -> str:
-        """Return what will soon prevent its work, and when; otherwise as `diagnose`."""
+        """Return the cause that will soon prevent its work, and when; otherwise as `diagnose`."""
         return ""
 
     def on_disk(self) -> Mapping[str, OnDisk]:
-        """Return what a recording consumer has on disk, by source; called as `details`."""
+        """Return a recording consumer's account of samples on disk, by source; see `details`."""
         return {}
 
 

@@ -98,7 +98,7 @@ class Daemon:
         with self._changing:
             for wanted, consumer in ready:
                 self._add_consumer(wanted, consumer)
-            self._load_accepted()
+            self._load_accepted_arrays()
             self._reconcile()
         self.report("daemon", "starting", f"{self._loaded.path}")
         self._watcher.start()
@@ -232,7 +232,7 @@ class Daemon:
         return self._clock.utc_offset_ns()
 
     def note_turn(self, name: str) -> None:
-        """Note a turn of a thread that is no part but must keep running."""
+        """Record a turn of a critical thread that is no part: ``main`` or ``watch``."""
         self._turns.take(name)
 
     def silent(self) -> Mapping[str, float]:
@@ -340,7 +340,7 @@ class Daemon:
                 if done is not None:
                     done()
 
-    def _load_accepted(self) -> None:
+    def _load_accepted_arrays(self) -> None:
         if self._memory is None or not self._memory.exists():
             return
         try:
@@ -348,7 +348,7 @@ class Daemon:
         except Exception as error:  # any damage to the file
             self.report("daemon", "memory", f"delete {self._memory}: {reason_of(error)}", "warning")
 
-    def _store_accepted(self) -> None:
+    def _store_accepted_arrays(self) -> None:
         known = {p.config.url: p.accepted for p in self._sources.copy().values() if p.accepted}
         if self._memory is None or (arrays := {**self._arrays, **known}) == self._arrays:
             return
@@ -364,7 +364,7 @@ class Daemon:
         another device node: that is locked now, and the one before is released."""
         if self._changing.acquire(blocking=False):
             try:
-                self._store_accepted()
+                self._store_accepted_arrays()
                 with suppress(AlreadyRunning):  # opening it then fails and reports it
                     self._lock(self._loaded, self._file_keys)
             finally:

@@ -10,7 +10,7 @@ Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
 
 
 class Ledger:
-    """The account of a source; written by the recorder's thread, read by any thread."""
+    """The account of a source's samples; written by the recorder's thread, read by any thread."""
 
     def __init__(self) -> None:
         self._now: tuple[Sums, tuple[RecordingWriter, ...]] = (0, 0, 0), ()  # finished; open files
@@ -45,7 +45,7 @@ class Ledger:
 
 
 def _add_files(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:
-    """Add the figures of files to earlier sums."""
+    """Add the counts and times of files to earlier ones."""
     samples, written_ns, synced_ns = past
     return (
         samples + sum(file.stats.samples for file in files),

@@ -119,17 +119,19 @@ def _fill_names(loaded: Loaded) -> Config:
                     ["model", i], f"which source? source = one of {', '.join(sources) or 'none'}"
                 )
             (source,) = sources
-        name = _assign(model.name or source, taken, bool(model.name), loaded, ["model", i])
+        name = _assign_name(model.name or source, taken, bool(model.name), loaded, ["model", i])
         models.append(msgspec.structs.replace(model, source=source, name=name))
     taken = {"recorder", "page", "metrics", "systemd", "log"}
     for i, publisher in enumerate(config.publisher):
         base = publisher.name or re.sub(r"[^A-Za-z0-9_-]", "-", publisher.kind)
-        name = _assign(base, taken, bool(publisher.name), loaded, ["publisher", i])
+        name = _assign_name(base, taken, bool(publisher.name), loaded, ["publisher", i])
         publishers.append(msgspec.structs.replace(publisher, name=name))
     return msgspec.structs.replace(config, model=tuple(models), publisher=tuple(publishers))
 
 
-def _assign(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]) -> str:
+def _assign_name(
+    name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]
+) -> str:
     made, n = name, 1
     while made in taken:
         if given:

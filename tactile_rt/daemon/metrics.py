@@ -111,7 +111,7 @@ def _is_own(host: str) -> bool:
 def exposition(snapshot: Snapshot) -> bytes:
     """Return all metrics of the daemon as Prometheus' text."""
     lines = []
-    for rows, labelled in _list_things(snapshot):
+    for rows, labelled in _list_tables(snapshot):
         for name, label, about, value in rows:
             found: list[str] = []
             for labels, thing in labelled:
@@ -130,7 +130,7 @@ def exposition(snapshot: Snapshot) -> bytes:
     return "".join(lines).encode()
 
 
-def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labels, Any]]]]:
+def _list_tables(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labels, Any]]]]:
     """Yield each table of metrics, with the things that it describes and their labels."""
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]

@@ -49,9 +49,9 @@ class ExitCode(IntEnum):
 
 
 def note_signals() -> None:
-    """Note signals from now on, so that only `run_daemon` obeys them, earlier ones included.
+    """Queue signals from now on; `run_daemon` obeys those that came before it, too.
 
-    This stays so to the end, lest a signal ends the process while Python shuts down."""
+    The handlers stay, so that no signal ends the process while Python shuts down."""
     for number in SIGNALS:
         signal.signal(number, lambda number, frame: _noted.put(number))
     signal.signal(signal.SIGUSR1, signal.SIG_IGN)  # log rotators send it; see `Log`

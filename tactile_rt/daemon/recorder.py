@@ -160,7 +160,7 @@ class Recorder(Consumer):
             self._count_unsynced()
 
     def on_disk(self) -> Mapping[str, OnDisk]:
-        """Return what is on disk of each source that was ever open; from any thread."""
+        """Return the account on disk of each source that was ever open; from any thread."""
         return {name: self._on_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
 
     def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
@@ -441,7 +441,7 @@ class Recorder(Consumer):
         return True
 
     def _count_unsynced(self) -> None:
-        """Count what was lost in closed files whose last sync failed."""
+        """Count the samples and packets lost in closed files whose last sync failed."""
         for name, ledger in self._ledgers.items():
             for file, samples, packets in ledger.settle():
                 assert file.failed is not None
@@ -454,8 +454,8 @@ class Recorder(Consumer):
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
     def _leave_file(self, track: _Track, error: OSError) -> None:
-        """Leave a file that cannot be written as it is. A new file is tried later, with pauses if
-        one after another fails. The reason names no file, so that it stays the same.
+        """Stop writing a file that fails; it stays as it is. A new file is tried later, with pauses
+        if one after another fails. The reason names no file, so that it stays the same.
         """
         file, why = track.file, words(self._folder.path, error)
         if file is None:

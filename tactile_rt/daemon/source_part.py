@@ -55,7 +55,7 @@ class _Lent:
 
 
 class Acquisition:
-    """The reader of lent sources, in a thread that runs while any source is lent."""
+    """A thread that reads the sources lent to it by `attend`, while there are any."""
 
     def __init__(self) -> None:
         self._reader = Reader()
@@ -181,7 +181,7 @@ class SourcePart(Part):
 
     @property
     def silent_s(self) -> float:
-        """As of every part, but 0 while it waits for a device that is away."""
+        """Duration of its current turn of work, s; 0 also while its device is away."""
         return 0.0 if self._away else super().silent_s
 
     def expect(self, sensor: SensorSpec | None, changes: float) -> None:
@@ -265,7 +265,7 @@ class SourcePart(Part):
         return not (self._stop.is_set() or self._left)
 
     def _take_chunk(self, stream: Source, chunk: Chunk | None) -> None:
-        """Take what has been read, in the thread that has read it."""
+        """Post a chunk in the thread that has read it; check the device when due."""
         now = self._busy_ns = time.monotonic_ns()
         if now >= self._look_ns:
             self._check_device(now)

@@ -39,7 +39,7 @@ BREAKS = ("fails", "has failed", "stalls")  # reasons whose subject is the part
 
 @dataclass(frozen=True)
 class Latency:
-    """Durations of an action: since the start, and of the newest 1000 (`p50_ms` ...)."""
+    """Durations of an action: a histogram since the start, percentiles of the newest 1000."""
 
     count: int = 0
     sum_s: float = 0.0

@@ -22,7 +22,7 @@ class Trend:
         self._kept: deque[tuple[float, float]] = deque(maxlen=KEPT + 1)
 
     def add(self, at_s: float, value: float) -> None:
-        """Take a value that was measured at a time, s."""
+        """Add a value measured at a time, s; keep the largest of every 20 s."""
         if not self._kept or at_s - self._kept[-1][0] >= EVERY_S:
             self._kept.append((at_s, value))
         else:
@@ -30,9 +30,9 @@ class Trend:
             self._kept[-1] = (began_s, max(largest, value))
 
     def growth(self) -> tuple[float, float, float] | None:
-        """Return the median of its first and last third, and the time between them, s.
+        """Return the medians of the first and the last third, and the time between, s.
 
-        None unless each third lies wholly above the one before.
+        None unless all values of each third exceed all of the third before.
         """
         kept = list(self._kept)[:-1]  # the last one is not complete
         n = len(kept) // 3
@@ -70,7 +70,7 @@ class Trends:
         self._memory, self._late = Trend(), dict[str, Trend]()
 
     def look(self, at_s: float, resident_bytes: int, late_s: Mapping[str, float]) -> None:
-        """Take the present measurements; forget sources that are not named."""
+        """Add the present measurements; forget sources that are not named."""
         self._memory.add(at_s, resident_bytes / MB)
         self._late = {name: self._late.get(name, Trend()) for name in late_s}
         for name, seconds in late_s.items():

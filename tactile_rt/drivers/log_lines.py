@@ -146,7 +146,7 @@ class AscLines:
             self.odd_date = self.odd_date or " ".join(words)
 
     def _read_event(self, words: list[str]) -> Found:
-        """Read what follows the time of a line."""
+        """Read the rest of a line after its time."""
         fd = words[:1] == ["CANFD"]
         bus, text, way, *rest = [*words[fd:], "", "", ""]
         if fd:

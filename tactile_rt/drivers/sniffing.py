@@ -183,7 +183,7 @@ def _flip_bits(data: bytes) -> bytes:
 
 
 def _rank(fits: list[CodecFit]) -> list[CodecFit]:
-    """Sort by share explained with proof, then by share alone, fewer options and frames."""
+    """Sort by explained share weighted with proof, then share alone, fewest options, frames."""
     return sorted(fits, reverse=True, key=lambda fit: (
         round(min(1.0, fit.explained) * (0.5 + 0.5 * fit.proof), 1),
         round(fit.explained, 2), -len(fit.options), fit.intact,

@@ -103,12 +103,12 @@ def run_file(path: Path) -> Step:
 
 
 def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[str, float]:
-    """Measure what a file's precision costs at the last step, clean and at rated noise.
+    """Compare a file of reduced precision with the trained network at the last step.
 
     Returns:
-        ``quantisation_top1_drop`` in points, ``quantisation_agreement`` in %,
-        ``quantisation_posterior``, the largest difference of a posterior, and
-        ``quantisation_sweeps``, the number of sweeps.
+        Of sweeps without and with rated noise: ``quantisation_top1_drop``, percentage points;
+        ``quantisation_agreement`` of decisions, %; ``quantisation_posterior``, the largest
+        difference of a posterior; and ``quantisation_sweeps``, the number of both.
     """
     classes = len(sweeps.manifest.categories)
     before, after = (
@@ -128,7 +128,7 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
 
 
 def _add_figures(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelCard:
-    """Write further figures into a model file and return its new card."""
+    """Add measured figures to the card in a model file; return the new card."""
     card = msgspec.structs.replace(card, figures={**card.figures, **figures})
     proto = onnx.load(path)
     onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})

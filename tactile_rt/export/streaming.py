@@ -160,9 +160,9 @@ class StreamingGraph(nn.Module):
                 valid = node.kind == "valid"
                 self.drives[node.name] = Taps(conv.weight, conv.bias, size, valid, integer)
             if node.cell != "none":
-                self.cells[node.name] = self._cell(encoder.cells[node.name], node.name)
+                self.cells[node.name] = self._make_cell(encoder.cells[node.name], node.name)
 
-    def _cell(self, cell: nn.Module, name: str) -> Cell:
+    def _make_cell(self, cell: nn.Module, name: str) -> Cell:
         assert isinstance(cell, Cell)
         if isinstance(cell, IntersectionCell) and cell.gamma is not None:
             weights = cell.conv.weight, cell.conv.bias
@@ -197,7 +197,7 @@ class StreamingGraph(nn.Module):
             sources = [e.source for e in node.reads]
             read = [now if s == self.graph.frame.name else state[f"{s}_h"] for s in sources]
             drive = self.drives[node.name]
-            x = self._dense(drive, read) if node.kind == "dense" else drive(*read)
+            x = self._apply_dense(drive, read) if node.kind == "dense" else drive(*read)
             if node.name in self.cells:
                 cell = self.cells[node.name]
                 assert isinstance(cell, Cell)
@@ -208,8 +208,8 @@ class StreamingGraph(nn.Module):
         kept = (key for node in self.graph.nodes for key in self.keys[node.name])
         return new[f"{self.graph.readout}_h"], {key: new[key] for key in kept}
 
-    def _dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
-        """Apply a dense node to every site's channels, then those of vectors."""
+    def _apply_dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
+        """Apply a dense node to its sources, joined: every site's channels, then vectors."""
         maps, vectors = [m for m in read if m.dim() == 3], [m for m in read if m.dim() == 2]
         if not vectors:
             joined = torch.cat(maps, -1)

@@ -230,7 +230,7 @@ def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
 
 
 def select_labelled(data: SweepSet) -> SweepSet:
-    """Return the sweeps of its categories alone; training makes none of them implausible."""
+    """Return the set's labelled sweeps only, without implausible loads drawn in training."""
     if not data.refusals:
         return data  # keeps the onsets that were found before
     known = np.flatnonzero(data.sweeps.labels >= 0)

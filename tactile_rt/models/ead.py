@@ -217,7 +217,7 @@ class EAD(nn.Module):
         self.decoder = kind(width, config.outputs, config.width, config.max_steps)
 
     def features(self, frames: Tensor) -> Tensor:
-        """Return the features (batch, step, feature) of frames that the decoder reads."""
+        """Run encoder and attender; return the decoder's input, features (batch, step, feature)."""
         frames = F.pad(frames, (0, 1)) if self._needs_silent_cell else frames
         features: Tensor = self.attender(self.encoder(frames))
         return features

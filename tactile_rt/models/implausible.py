@@ -25,7 +25,7 @@ def _swap_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> S
     out = samples.copy()
     for k in range(len(out)):
         first, second = rng.choice(3, 2, replace=False)
-        for axes in _pick(vectors, rng):
+        for axes in _pick_vectors(vectors, rng):
             out[k][..., [axes[first], axes[second]]] = samples[k][..., [axes[second], axes[first]]]
     return out
 
@@ -36,7 +36,7 @@ def _invert_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) ->
     out = samples.copy()
     for k in range(len(out)):
         turned = rng.permutation(len(vectors[0]))[: rng.integers(1, len(vectors[0]) + 1)]
-        for axes in _pick(vectors, rng):
+        for axes in _pick_vectors(vectors, rng):
             out[k][..., [axes[i] for i in turned]] *= -1
     return out
 
@@ -87,6 +87,8 @@ def _find_vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
     return [tuple(names.index(stem + axis) for axis in AXES) for stem in whole]
 
 
-def _pick(vectors: list[tuple[int, ...]], rng: np.random.Generator) -> list[tuple[int, ...]]:
-    """Return all vectors or, as often, one of them."""
+def _pick_vectors(
+    vectors: list[tuple[int, ...]], rng: np.random.Generator
+) -> list[tuple[int, ...]]:
+    """Return all vectors, or with probability one half a random one of them."""
     return vectors if rng.random() < 0.5 else [vectors[rng.integers(len(vectors))]]

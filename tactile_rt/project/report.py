@@ -58,11 +58,11 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
         sample=f"{len(set(objects.tolist()))} objects, {len(labels)} sweeps",
         swept=_describe_sweeps(sweeps),
         kinds=escape(", ".join(card.classes)),
-        headlines=_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
-        robust=_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
-        confused=_confusions(list_confusions(table, card.classes)),
-        over_time=_picture(project.report / "accuracy_over_time.png"),
-        confusion=_picture(project.report / "confusion.png"),
+        headlines=_format_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
+        robust=_format_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
+        confused=_format_confusions(list_confusions(table, card.classes)),
+        over_time=_embed_picture(project.report / "accuracy_over_time.png"),
+        confusion=_embed_picture(project.report / "confusion.png"),
     )
     path = project.report / "report.html"
     write_whole(path, lambda file: file.write(text.encode()))
@@ -104,7 +104,7 @@ def _describe_sweeps(folder: Path) -> str:
     )
 
 
-def _rows(records: Sequence[tuple[Record, str]]) -> str:
+def _format_rows(records: Sequence[tuple[Record, str]]) -> str:
     return "\n".join(
         f"<tr><td>{escape(words)}</td><td class=n>{r.value:.1f} {escape(r.unit)}</td>"
         f"<td>{escape(r.anchor.partition(',')[0].replace('95 % interval ', ''))}</td></tr>"
@@ -112,7 +112,7 @@ def _rows(records: Sequence[tuple[Record, str]]) -> str:
     )
 
 
-def _confusions(pairs: Sequence[tuple[str, str, float]]) -> str:
+def _format_confusions(pairs: Sequence[tuple[str, str, float]]) -> str:
     if not pairs:
         return "<p>Nothing: no kind is taken for another in more than one sweep of twenty.</p>"
     items = "".join(
@@ -122,5 +122,5 @@ def _confusions(pairs: Sequence[tuple[str, str, float]]) -> str:
     return f"<ul>{items}</ul>"
 
 
-def _picture(path: Path) -> str:
+def _embed_picture(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()

@@ -96,7 +96,9 @@ def write_dataset(
             beside.write_text(about_text(about), "utf-8")
             episodes.append(episode)
             first += episode.rows
-        meta.write_meta(made, fps, {**_features(spec, width), **meta.FRAME}, episodes, tasks, films)
+        meta.write_meta(
+            made, fps, {**_describe_features(spec, width), **meta.FRAME}, episodes, tasks, films
+        )
     return n
 
 
@@ -182,7 +184,7 @@ def _newest_valid(
     return found
 
 
-def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
+def _describe_features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
     """Describe the columns for ``info.json``."""
     elements, channels, feature = list(spec.elements), list(spec.channels), meta.describe_feature
     flat = [f"{e}.{c}" for e in elements for c in channels]
@@ -202,7 +204,7 @@ def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
 def _make_schema(pa: Any, spec: ArraySpec, width: int) -> Any:
     kinds = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
     fields = []
-    for name, feature in {**_features(spec, width), **meta.FRAME}.items():
+    for name, feature in {**_describe_features(spec, width), **meta.FRAME}.items():
         kind = kinds[feature["dtype"]]
         for size in reversed(feature["shape"] if feature["shape"] != [1] else []):
             kind = pa.list_(kind, size)

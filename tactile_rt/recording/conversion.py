@@ -293,7 +293,7 @@ def _write_metadata(files: Sequence[_File]) -> str:
         "version": BAG_VERSION,
         "storage_identifier": "mcap",
         "relative_file_paths": [file.name for file in files],
-        **_span(begin_ns, end_ns),
+        **_describe_span(begin_ns, end_ns),
         "message_count": sum(totals.values()),
         "topics_with_message_count": [
             {
@@ -310,7 +310,7 @@ def _write_metadata(files: Sequence[_File]) -> str:
         "files": [
             {
                 "path": file.name,
-                **_span(file.begin_ns, file.end_ns),
+                **_describe_span(file.begin_ns, file.end_ns),
                 "message_count": sum(file.counts.values()),
             }
             for file in files
@@ -320,7 +320,7 @@ def _write_metadata(files: Sequence[_File]) -> str:
     return text.decode() + "\n"
 
 
-def _span(begin_ns: int, end_ns: int) -> dict[str, Any]:
+def _describe_span(begin_ns: int, end_ns: int) -> dict[str, Any]:
     return {
         "duration": {"nanoseconds": end_ns - begin_ns},
         "starting_time": {"nanoseconds_since_epoch": begin_ns},

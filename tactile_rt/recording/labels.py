@@ -52,7 +52,7 @@ class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def thing(self) -> tuple[str, str]:
-        """Touched thing: label and object."""
+        """Label and object of the touched thing."""
         return self.label, self.object
 
 

@@ -182,7 +182,7 @@ class Episode:
     statistics: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
 
     def columns(self, frame: NDArray[np.int64], fps: int) -> dict[str, NDArray[Any]]:
-        """Return the columns of some rows other than samples.
+        """Return all columns except the samples for some rows of the episode.
 
         Args:
             frame: (row,) Numbers of the rows within the episode.

@@ -114,7 +114,7 @@ class _Reader:
                 yield from self._split_chunk(data)
 
     def _chunk_around(self, mark: int) -> tuple[int, bytes | None]:
-        """Return where to search on, and the chunk's data around this mark if intact."""
+        """Return the position to search next, and the intact chunk's data at this mark."""
         begin = mark - MARK_AT
         head = self._peek(begin, MARK_AT + len(MARK) + 8) if begin >= 0 else b""
         if len(head) < MARK_AT + len(MARK) + 8:
@@ -186,7 +186,7 @@ class _Reader:
     def _read_single(self, opcode: int, length: int) -> "Iterator[Record]":
         """Yield a record outside chunks if recordings use its kind; skip it otherwise."""
         if opcode == MESSAGE and length <= MOST_UNPACKED:
-            yield self._message(self._read(length))
+            yield self._parse_message(self._read(length))
             return
         if opcode == METADATA:
             self._metadata += length
@@ -238,7 +238,7 @@ class _Reader:
             if at > end:
                 raise ValueError("a record is longer than its chunk")
             if opcode == MESSAGE:
-                yield self._message(data[begin:at])
+                yield self._parse_message(data[begin:at])
                 continue
             self._count_other()
             if opcode == CHANNEL:
@@ -251,7 +251,7 @@ class _Reader:
         if self._others > MOST_OTHERS:
             raise _LimitExceeded(f"more than {MOST_OTHERS} records besides messages")
 
-    def _message(self, data: bytes) -> "Message":
+    def _parse_message(self, data: bytes) -> "Message":
         channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data)
         return self._new_message(channel, log_time, data[_MESSAGE.size :], publish_time, sequence)
 

@@ -51,10 +51,10 @@ PART = ".mcap.part"  # ending of the name of a file without a complete descripti
 
 
 class McapFile:
-    """Channels of a recording in an MCAP file, without file name or health.
+    """MCAP file with the channels of a recording; `RecordingWriter` adds name and health.
 
     Args:
-        file: to write; the caller closes it.
+        file: the file to write; the caller closes it.
         further: additional channels, and the ROS 2 message type of each.
     """
 
@@ -93,8 +93,8 @@ class McapFile:
         self.put(name, put_in_form(name, data, offset_ns, spec.frame), t_ns)
 
     def put(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message that is already in its form in the file. Messages are numbered, so that a
-        loss is noticed."""
+        """Add a message that is encoded as in the file. Messages are numbered, so that a loss is
+        noticed."""
         utc = max(0, t_ns + self.about.utc_offset_ns)
         count = self.counts[name]
         self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)

@@ -121,7 +121,7 @@ class WhiskSimulation:
         return read_base_loads(sensors / self._steps_per_sample), touch
 
     def _compute_turns(self, steps: int) -> NDArray[np.float64]:
-        """Compute (steps + 2, base angle) turns, from the step before the next on."""
+        """Compute the bases' turns (steps + 2, base angle), rad, from the previous step on."""
         at = np.arange(self._step - 1, self._step + steps + 1)
         times = at.astype(np.float64) * (self.model.opt.timestep * 1e-3)
         turns = self._trajectory.offsets(times, self._whiskers) * self._mirror

@@ -150,7 +150,7 @@ class WhiskingSource(PacedSource):
 
     @staticmethod
     def check(array: str, options: WhiskingOptions) -> ArraySpec:
-        """Return the spec without keeping the array open; raise the `ConfigError` of opening it."""
+        """Open and close the array; return its spec, or raise the `ConfigError` of opening."""
         with WhiskingSource(array, options) as source:
             return source.spec
 

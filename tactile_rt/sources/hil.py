@@ -309,6 +309,6 @@ def pair(
 
 
 def _is_identical(a: Classification, b: Classification) -> bool:
-    """Return whether two decisions have the same bits, except for the time taken."""
+    """Return whether two decisions have equal times, step, label and bits of probabilities."""
     plain = all(getattr(a, n) == getattr(b, n) for n in ("onset_ns", "t_ns", "step", "final"))
     return plain and a.label == b.label and a.probabilities.tobytes() == b.probabilities.tobytes()

@@ -77,7 +77,7 @@ def fit_classes(
     features: Floats,
     labels: Sequence[str],
     kinds: Sequence[slice],
-    told: LeaveOneOut | None = None,
+    judged: LeaveOneOut | None = None,
     others: Floats | None = None,
 ) -> TouchClasses:
     """Learn classes from touches.
@@ -86,12 +86,12 @@ def fit_classes(
         features: (touch, step, feature) of all touches.
         labels: (touch,) the class of each.
         kinds: slices of features of one kind, and so of one scale.
-        told: the result of `leave_one_out` for these touches; None: it is computed.
+        judged: the result of `leave_one_out` for these touches; None: it is computed.
         others: (touch, step, feature) of touches of anything else; None: no such touches.
     """
     _check_enough(labels)
-    told = told or leave_one_out(features, labels, kinds)
-    nearest = told.distances.min(axis=2)  # (touch, step)
+    judged = judged or leave_one_out(features, labels, kinds)
+    nearest = judged.distances.min(axis=2)  # (touch, step)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
     many = np.bincount(own)[own] >= ENOUGH
     nearest = nearest[many] if many.any() else nearest
@@ -101,7 +101,7 @@ def fit_classes(
     middle = np.median(logs, axis=0)
     spread = MAD * np.median(np.abs(logs - middle), axis=0)
     reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
-    temperature = _fit_temperature(told.distances[:, -1], own)
+    temperature = _fit_temperature(judged.distances[:, -1], own)
     names = tuple(str(name) for name in classes)
     found = TouchClasses(names, *_fit_shared(features, own, kinds), reach, temperature)
     if others is None or not len(others):
@@ -118,9 +118,9 @@ def count_refused(
 
     Each of `others` (touch, step, feature) is judged by what is learnt without it.
     """
-    told, refused = leave_one_out(features, labels, kinds), 0
+    judged, refused = leave_one_out(features, labels, kinds), 0
     for k in range(len(others)):
-        found = fit_classes(features, labels, kinds, told, np.delete(others, k, axis=0))
+        found = fit_classes(features, labels, kinds, judged, np.delete(others, k, axis=0))
         refused += bool(found.distances(others[k : k + 1])[0, -1].min() > found.reach[-1])
     return refused
 

@@ -89,7 +89,7 @@ class FewShot:
         others: Floats,
         largest: NDArray[np.float32],
         name: str,
-        told: dict[str, Any],
+        provenance: dict[str, Any],
     ) -> ModelCard:
         """Write the model of the classes of these touches (touch, step, feature)."""
         graph, network = OnnxGraph(), self.network
@@ -103,7 +103,7 @@ class FewShot:
             "refusals": (UNKNOWN,),
             "unknown": OpenSetRule(POSTERIOR, "logits", (MAYBE,)),
             "temperature": classes.temperature,
-            "provenance": {**_list_versions(), **told},
+            "provenance": {**_list_versions(), **provenance},
         }
         if largest.any():
             believed = np.maximum(LARGER * largest, NOISES * self.floor)
@@ -169,13 +169,13 @@ class Enrolment:
         others: Floats,
         largest: NDArray[np.float32],
         name: str,
-        told: dict[str, Any],
+        provenance: dict[str, Any],
     ) -> ModelCard:
-        """Write the same network with the objects of these touches in its card."""
+        """Write a copy of the model file whose card has the objects of these touches."""
         card = msgspec.structs.replace(
             self.card,
             name=name,
-            provenance={**self.card.provenance, **_list_versions(), **told},
+            provenance={**self.card.provenance, **_list_versions(), **provenance},
             enrolled=self._enrol(features, labels),
         )
         data = with_metadata(self._data, METADATA_KEY, msgspec.json.encode(card).decode())

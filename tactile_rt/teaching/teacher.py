@@ -121,7 +121,7 @@ class Teacher:
         return self.note("\n".join([", ".join(filter(None, texts[:2])), *texts[2:]]))
 
     def prompt(self) -> str:
-        """Return what the user should do now."""
+        """Return the present instruction to the user."""
         if self.ended:
             return self.ended
         if self.done:
@@ -135,7 +135,7 @@ class Teacher:
         return f"touch it: {self.label} ({count + 1}{of})"
 
     def state(self) -> dict[str, Any]:
-        """Return what a page shows."""
+        """Return the state that the page shows."""
         # Called in another thread: what is read twice must not change in between.
         progress, touches = self.progress, tuple(self.lesson.touches)
         right, of = progress.right
@@ -164,7 +164,7 @@ class Teacher:
         }
 
     def summary(self) -> Sequence[str]:
-        """Return what was learnt, line by line."""
+        """Return lines on the result of each class, and on classes that are confused."""
         lines = [
             f"{name}: {good} of {count} touches right, leave-one-out"
             for name, count, good in self.progress.classes

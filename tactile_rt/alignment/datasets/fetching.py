@@ -225,7 +225,7 @@ def _find_columns(file: Any) -> Iterator[str]:
 
 
 def _find_clocks(file: Any) -> Iterator[tuple[str, float]]:
-    """Yield names of whiskers' timestamps and the last time, s; the others are not needed."""
+    """Yield the path of each whisker's timestamps and the last of them, s. No other is needed."""
     for module in file.get("processing", {}).values():
         for name, group in module.items():
             end = parts.last_time(group) if name.startswith(parts.WHISKER) else None

@@ -178,7 +178,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Payload of n >= 1 consecutive samples, the only one in the program.
+    """n >= 1 consecutive samples, the form in which all samples move through the program.
 
     Attributes:
         seq: (n,) int64 sequence number of each sample; a gap means lost samples.

@@ -155,7 +155,7 @@ class Column:
 
 
 def read_mapping(path: str, kind: type[Table]) -> Table:
-    """Read a mapping file as this kind of table."""
+    """Read a TOML mapping file as a `kind`; refuse another version."""
     nodes = read_toml(Path(path))
     mapping: Table = convert(nodes, kind)
     if mapping.version != VERSION:

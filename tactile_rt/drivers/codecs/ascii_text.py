@@ -82,7 +82,7 @@ def fields(line: str, words_are_names: bool = False) -> list[str]:
 
 
 class Names:
-    """Finder of numbers by the names before them.
+    """Finder of the numbers in a line of text by the names before them.
 
     Args:
         names: place of each number, by its name; ``a.b`` for a number in an object of JSON,

@@ -77,7 +77,7 @@ class Ati485(SerialCodec):
     )
 
     def __init__(self, options: Ati485Options) -> None:
-        self._matrix = _matrix(options.matrix)
+        self._matrix = _read_matrix(options.matrix)
         gauges = dict.fromkeys((f"g{k}" for k in range(6)), "1")
         channels = gauges if self._matrix is None else SIX_AXES
         super().__init__(ArraySpec.at_origin("ati_485", options.rate_hz, channels))
@@ -238,7 +238,7 @@ class Ati485(SerialCodec):
         return answer
 
 
-def _matrix(path: str) -> NDArray[np.float64] | None:
+def _read_matrix(path: str) -> NDArray[np.float64] | None:
     """Read the 6 x 6 calibration matrix from a file; None without a path."""
     if not path:
         return None

@@ -241,7 +241,7 @@ def _strip_units(name: str) -> str:
 
 
 def _is_count(name: str) -> bool:
-    """Return whether a name is that of a count; the unit in Fx_N is none."""
+    """Return whether a column's name means a count; the N of ``Fx_N`` is a unit."""
     return _COUNT.fullmatch(_TAIL_UNIT.sub("", _strip_units(name))) is not None
 
 

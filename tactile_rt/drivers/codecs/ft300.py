@@ -89,7 +89,7 @@ class Ft300(DescribedFrame):
         """Execute a Modbus function; return the answer without address and checksum."""
         kind, first, n = request[0], *struct.unpack(">HH", request[1:5])
         if kind in (READ_HOLDING, READ_INPUT):
-            registers = self._registers()
+            registers = self._make_registers()
             if n < 1 or any(k not in registers for k in range(first, first + n)):
                 return bytes((kind | ERROR, NO_SUCH_ADDRESS))
             values = [registers[k] for k in range(first, first + n)]
@@ -100,7 +100,7 @@ class Ft300(DescribedFrame):
         self.streaming = output == STREAM
         return request[:5]
 
-    def _registers(self) -> dict[int, int]:
+    def _make_registers(self) -> dict[int, int]:
         loads = [0] * 6
         if self.newest is not None:
             frame = super().encode(self.newest)[0]

@@ -68,7 +68,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Send this many CAN error frames."""
 
     def gather(self, seconds: float) -> None:
-        """Set the time for which an adapter gathers data, s; 0: none."""
+        """Set the interval at which an adapter passes on collected data, s; 0: at once."""
 
     @property
     def backlog(self) -> int:

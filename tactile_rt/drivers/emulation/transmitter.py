@@ -63,7 +63,7 @@ class Transmitter:
         self._clock.restart(t_ns)
 
     def look(self, t_ns: int) -> None:
-        """Advance to a time without a sample, at which the plug may change."""
+        """Advance to a time without a sample, and apply the faults due then."""
         hit = self._apply_fault(t_ns)
         self._set_away(hit is not None and hit.kind == "unplug")
 

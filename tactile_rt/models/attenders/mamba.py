@@ -67,7 +67,7 @@ class MambaBlock(nn.Module):
         )
         x = F.silu(conv)
         y = selective_scan(*self._select(x))  # (batch, step, inner)
-        return self._out(y, x, gate)
+        return self._project_out(y, x, gate)
 
     def step(self, features: Tensor, taps: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Run one step.
@@ -80,7 +80,7 @@ class MambaBlock(nn.Module):
         x = F.silu(self.conv_bias + (taps * self.conv_weight.t()).sum(1))  # (batch, inner)
         dt, signal, a, b, c = self._select(x)  # a (inner, STATES); b, c (batch, STATES)
         h = torch.exp(dt[..., None] * a) * h + (dt * signal)[..., None] * b[:, None]
-        return self._out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
+        return self._project_out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
 
     def _select(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return the arguments of `selective_scan` for x (..., inner): dt, x, a, b and c."""
@@ -90,7 +90,7 @@ class MambaBlock(nn.Module):
         exact = self.A_log.dtype
         return dt.to(exact), x.to(exact), -torch.exp(self.A_log), b.to(exact), c.to(exact)
 
-    def _out(self, y: Tensor, x: Tensor, gate: Tensor) -> Tensor:
+    def _project_out(self, y: Tensor, x: Tensor, gate: Tensor) -> Tensor:
         out: Tensor = self.out_proj((y + self.D * x) * F.silu(gate))
         return out
 

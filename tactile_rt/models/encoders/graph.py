@@ -135,7 +135,7 @@ class Graph:
 
     @property
     def remaining(self) -> dict[str, int]:
-        """Steps from each node's output to the readout's; the frame counts as its reader."""
+        """Steps from each node to the readout; the frame has those of its nearest reader."""
         distance = {self.readout: 0}
         nodes = {node.name: node for node in self.nodes}
         queue = [self.readout]

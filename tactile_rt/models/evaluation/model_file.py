@@ -115,7 +115,9 @@ def evaluate_model(
         records.append(top("top-1 at rated noise of 1 kHz samples", raw[:, -1], how))
     few = _take_first_sweeps(test, ROBUSTNESS_SWEEPS)
     records += measure_robustness(few, run, clean[_first_sweeps(objects, ROBUSTNESS_SWEEPS), -1])
-    records += _calibration(clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample)
+    records += _measure_calibration(
+        clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample
+    )
     undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
     records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
     unknown = None
@@ -186,7 +188,7 @@ def _has_other_source(test: SweepSet, card: ModelCard) -> bool:
     return source is not None and test.manifest.recipe.get("objects", {}).get("from") != source
 
 
-def _calibration(
+def _measure_calibration(
     clean: Floats, noisy: Floats, labels: Labels, objects: Names, temperature: float, sample: str
 ) -> list[Record]:
     at = f"at temperature {temperature:.3g}"

@@ -90,7 +90,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def saw_nothing(trials: Sequence[Training], chance: float) -> bool:
-    """Return whether trials tell no rate from another: all near chance, or equal."""
+    """Return whether trials cannot rank learning rates: all near chance, or all equal."""
     scores = [trial.score for trial in trials if not trial.diverged]
     if not scores:
         return False  # all diverged: longer trials would, too

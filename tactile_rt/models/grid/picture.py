@@ -51,7 +51,7 @@ def draw_grid(results: GridResults, path: Path) -> None:
     bottom.set_xlabel("top-1 accuracy on objects never seen in training (%)")
     handles: list[object] = [
         Patch(color=colour, label=label)
-        for label, colour in dict.fromkeys(_family(row) for row in networks)
+        for label, colour in dict.fromkeys(_find_family(row) for row in networks)
     ]
     handles.append(Patch(color="0.4", alpha=PALE, label="same network, untrained, linear probe"))
     if svm is not None:
@@ -74,7 +74,7 @@ def draw_grid(results: GridResults, path: Path) -> None:
 
 def _draw_bars(axes: Axes, rows: list[Row]) -> None:
     for k, row in enumerate(rows):
-        _, colour = _family(row)
+        _, colour = _find_family(row)
         if row.random is not None:
             _draw_bar(axes, k - BAR / 2, row.random, colour, PALE)
         if row.top1 is not None:
@@ -102,5 +102,5 @@ def _draw_bar(axes: Axes, at: float, value: Interval, colour: str, alpha: float)
     axes.errorbar(100 * value.value, at, xerr=error, fmt="none", ecolor="black", elinewidth=1)
 
 
-def _family(row: Row) -> tuple[str, str]:
+def _find_family(row: Row) -> tuple[str, str]:
     return next((f for prefix, f in FAMILIES.items() if row.network.startswith(prefix)), OTHER)

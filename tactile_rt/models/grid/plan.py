@@ -70,7 +70,7 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def learning(self) -> str:
-        """Objective, views, beginning and share of objects: ``simclr tactile+masking``."""
+        """Objective, augmentations, initial weights and share: ``simclr tactile+masking``."""
         views = [self.augmentation] if self.augmentation != "none" else []
         views += ["masking"] if self.masking else []
         views += [str(self.options[key]) for key in NAMING if key in self.options]
@@ -81,7 +81,7 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def name(self) -> str:
-        """Name, unique in a grid; a supervised cell's is its network and unusual settings."""
+        """Name, unique in a grid: `network` and `learning`, without the word "supervised"."""
         return f"{self.network} {self.learning.removeprefix(SUPERVISED).strip()}".strip()
 
 
@@ -94,12 +94,12 @@ class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The trials of a cell's first seed that choose rate and warm-up by validation.
+    """The trials with a cell's first seed that choose learning rate and warm-up by validation.
 
     Attributes:
         learning_rate: The peaks that are tried, all with the first warm-up.
-        warmup: The shares of all updates in which the rate rises; the others are tried with the
-            best peak.
+        warmup: The shares of all updates in which the rate rises; all but the first are tried
+            with the best peak.
     """
 
     learning_rate: tuple[float, ...] = (5e-4, 1.5e-3, 5e-3, 1.5e-2)
@@ -110,7 +110,7 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The lengths of a cell's trainings: doubled until that gains less than `gain`.
 
-    Each time it is trained from the beginning, with a whole schedule of its rate.
+    Each time it is trained from the beginning, with a whole schedule of its learning rate.
 
     Attributes:
         first, most: The first and the largest number of updates.
@@ -150,7 +150,7 @@ class Task(msgspec.Struct, frozen=True):
 
     @property
     def slug(self) -> str:
-        """A name for files."""
+        """Name of the task's files, from its name and seed."""
         return f"{self.name.replace(' ', '_')}_seed{self.seed}"
 
     @property
@@ -190,7 +190,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "width": cell.width or self.width,
             "batch": self.batch,
             "seed": task.seed,
-            **self._options(cell),
+            **self._collect_options(cell),
             **chosen,
         }
         convert(make_node(options, f"cell {cell.name!r}", 0, Path()), TrainingConfig)
@@ -209,16 +209,16 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def make_untrained(self, cell: Candidate) -> Candidate:
         """Return a cell's untrained network, with the settings of its probe, as a candidate."""
-        own, usual = self._options(cell), TrainingConfig("")
+        own, usual = self._collect_options(cell), TrainingConfig("")
         names = (k for k in OF_UNTRAINED if k in own or k in self.supervised)
         kept = {k: own.get(k, getattr(usual, k)) for k in names}
         return Candidate(cell.encoder, cell.attender, width=cell.width, options=kept)
 
-    def _options(self, cell: Candidate) -> dict[str, Any]:
+    def _collect_options(self, cell: Candidate) -> dict[str, Any]:
         common = self.supervised if cell.objective == SUPERVISED else self.self_supervised
         if cell.recipe:
-            said = load_recipe(cell.recipe).train
-            common = {k: v for k, v in said.items() if k not in (*OF_CELL, "width")}
+            train = load_recipe(cell.recipe).train
+            common = {k: v for k, v in train.items() if k not in (*OF_CELL, "width")}
         return {**common, **cell.options}
 
     def find_beginning(self, task: Task) -> Task:
@@ -228,7 +228,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Task(cell.name, task.seed, cell)
 
     def needs(self, task: Task) -> tuple[str, ...]:
-        """Return slugs of the tasks that come before: the tuning first seed and the beginning."""
+        """Return the slugs of tasks to finish first: the tuning seed, and the initial network."""
         cell = task.cell
         if cell is None or task.random:
             return ()
@@ -261,7 +261,7 @@ def read_grid(name: str | Path) -> Grid:
 
 
 def _check_grid(grid: Grid) -> None:
-    """Check what would otherwise fail after hours of training, or never."""
+    """Refuse a grid that would otherwise fail after hours of training, or unnoticed."""
     search, growth = grid.search, grid.growth
     if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
         raise ConfigError("a grid needs a cell, a seed and an update")

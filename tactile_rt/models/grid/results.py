@@ -178,7 +178,7 @@ def table(results: GridResults) -> str:
             f"{at.learning_rate:g}, {at.warmup:g}{'' if row.tuned else ' (not tuned)'}"
             if at
             else "",
-            _updates(row),
+            _format_updates(row),
             _format_percent(row.top1) if row.top1 else "failed" if row.failed else "",
             *(_format_percent(one) for one in (row.random, row.top5, row.noisy, row.known)),
             str(row.seeds),
@@ -202,7 +202,7 @@ def table(results: GridResults) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _updates(row: Row) -> str:
+def _format_updates(row: Row) -> str:
     if row.chosen is None:
         return ""
     return f"{row.chosen.updates:,}{'' if row.flat else ' +'}" if row.chosen.updates else "recipe"

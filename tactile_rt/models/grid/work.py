@@ -124,10 +124,10 @@ class Workbench:
         return self._score_test(found, best, self.grid.config(task, self.data))
 
     def _search(self, task: Task, report: Report) -> tuple[Training, ...]:
-        """Try every rate with the first warm-up, then the other warm-ups with the best.
+        """Try every learning rate with the first warm-up, then other warm-ups with the best.
 
-        Trials that see nothing are made twice as long; where the best rate is the first or the
-        last, the next one is tried, too.
+        If the trials cannot rank the rates, they are repeated twice as long; if the best rate is
+        the lowest or the highest, the next one beyond is tried, too.
         """
         search = self.grid.search
         chance = 1 / len(self.test.manifest.categories)

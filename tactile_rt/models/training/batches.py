@@ -200,7 +200,9 @@ class TrainingBatches:
         if faults.offset or faults.drift:
             self._add_drift(samples, rng, severity)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
-        samples.addcmul_(self._normal(samples.shape, rng), self._to_device(noise)[:, None, None])
+        samples.addcmul_(
+            self._draw_normal(samples.shape, rng), self._to_device(noise)[:, None, None]
+        )
         # The baseline: a mean and a spread over the quiet samples that happened to come before.
         quiet = rng.integers(20, 60, (n, 1, 1))
         per_channel = (n, elements, channels)
@@ -217,7 +219,7 @@ class TrainingBatches:
             return tensor
         return tensor.pin_memory().to(self._device, non_blocking=True)
 
-    def _normal(self, shape: Sequence[int], rng: np.random.Generator) -> Tensor:
+    def _draw_normal(self, shape: Sequence[int], rng: np.random.Generator) -> Tensor:
         if self._device == "cpu":
             return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
         generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**63)))

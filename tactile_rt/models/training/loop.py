@@ -267,7 +267,9 @@ class Validation:
         self._config, self._data, self._augmentation = config, data, augmentation
         self._share, self._device = share, device
         supervised = config.objective == "supervised"
-        self._measure: Callable[[Objective], Score] = self._top1 if supervised else self._loss
+        self._measure: Callable[[Objective], Score] = (
+            self._measure_top1 if supervised else self._measure_loss
+        )
         if supervised:
             # Cut once, since they are the same after every epoch.
             self._clean, self._noisy = (
@@ -288,7 +290,7 @@ class Validation:
         objective.eval()
         return self._measure(objective)
 
-    def _top1(self, objective: Objective) -> Score:
+    def _measure_top1(self, objective: Objective) -> Score:
         data, run = self._data, run_on(objective.model)
         labels, classes = data.sweeps.labels, len(data.manifest.categories)
         shares = []
@@ -311,7 +313,7 @@ class Validation:
         return samples, offset, sigma
 
     @torch.inference_mode()
-    def _loss(self, objective: Objective) -> Score:
+    def _measure_loss(self, objective: Objective) -> Score:
         data, config = self._data, self._config
         # Whole batches if possible: a contrast is harder in a larger batch.
         parts = max(len(self._usable) // config.batch, 1)

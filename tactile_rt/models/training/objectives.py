@@ -204,14 +204,14 @@ class Supervised(Objective):
         with _in_single_precision(answers):
             found = network.split(answers.float())
             if labels.dim() == 1:
-                return self._entropy(found["logits"], labels, self._smoothing)
+                return self._cross_entropy(found["logits"], labels, self._smoothing)
             classes, names, objects = labels.unbind(1)
-            loss = self._entropy(found["logits"], classes, self._smoothing)
+            loss = self._cross_entropy(found["logits"], classes, self._smoothing)
             if "names" in found:
                 inside = classes[:, None] == self.class_of  # (batch, name)
                 own = found["names"].masked_fill(~inside[:, None], OUTSIDE)
                 share = (names >= 0).float().mean().clamp(min=1 / len(names))
-                loss = loss + self._names * self._entropy(own, names, 0.0) / share
+                loss = loss + self._names * self._cross_entropy(own, names, 0.0) / share
             if self._identity:
                 rows = torch.cat([found["embedding"][:, -1], objects[:, None].float()], dim=1)
                 rows = _gather_rows(rows)
@@ -219,7 +219,7 @@ class Supervised(Objective):
                 loss = loss + self._identity * contrast
             return loss
 
-    def _entropy(self, logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
+    def _cross_entropy(self, logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
         if self._anytime:
             return anytime_loss(logits, labels, smoothing, self.model.network.lag)
         return last_loss(logits, labels, smoothing)

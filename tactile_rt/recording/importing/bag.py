@@ -190,7 +190,7 @@ def _describe(
     paths = {
         leaf: [s if isinstance(s, int) else names.setdefault(s, len(names)) for s in steps]
         for one in found
-        for leaf in islice(_leaves(one, ""), MOST)
+        for leaf in islice(_list_leaves(one, ""), MOST)
         for steps in [_split_path(leaf)]
     }
     listed = sorted(paths, key=paths.__getitem__)
@@ -205,14 +205,14 @@ def _split_path(path: str) -> list[int | str]:
     return [int(s) if s.isdecimal() else s for s in path.split(".")]
 
 
-def _leaves(value: Any, at: str) -> Iterator[str]:
+def _list_leaves(value: Any, at: str) -> Iterator[str]:
     if is_dataclass(value):
         for f in fields(value):
             if f.name != "__msgtype__":
-                yield from _leaves(getattr(value, f.name), f"{at}.{f.name}" if at else f.name)
+                yield from _list_leaves(getattr(value, f.name), f"{at}.{f.name}" if at else f.name)
     elif isinstance(value, np.ndarray | list | tuple):
         for k, one in enumerate(value):
-            yield from _leaves(one, f"{at}.{k}")
+            yield from _list_leaves(one, f"{at}.{k}")
     elif isinstance(value, int | float | np.number):
         yield at
 

@@ -56,7 +56,7 @@ def _write_text(name: str, manifest: SweepManifest, card: Card) -> str:
         _list_counts(manifest, card),
         _list_skipped(card),
         "## What was drawn",
-        _table(
+        _format_table(
             ("parameter", "least", "mean", "greatest"),
             [(key, *(f"{v:.4g}" for v in values)) for key, values in card.parameters.items()],
         ),
@@ -71,7 +71,7 @@ def _write_text(name: str, manifest: SweepManifest, card: Card) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
+def _format_table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
@@ -86,7 +86,7 @@ def _list_counts(manifest: SweepManifest, card: Card) -> str:
     named = (*manifest.categories, *manifest.withheld)
     rows = [(category, *(count(s, category) for s in splits)) for category in named]
     total = [f"{sum(card.objects[s].values())} / {sum(card.sweeps[s].values())}" for s in splits]
-    table = _table(("category", *splits), [*rows, ("all", *total)])
+    table = _format_table(("category", *splits), [*rows, ("all", *total)])
     return f"Objects / sweeps of each category in each split:\n\n{table}"
 
 
@@ -94,7 +94,7 @@ def _list_skipped(card: Card) -> str:
     if not card.skipped:
         return ""
     rows = sorted(card.skipped.items())
-    return f"{len(rows)} objects could not be made:\n\n" + _table(("object", "why"), rows)
+    return f"{len(rows)} objects could not be made:\n\n" + _format_table(("object", "why"), rows)
 
 
 def _describe_loads(card: Card) -> str:
@@ -103,8 +103,9 @@ def _describe_loads(card: Card) -> str:
     )
     largest, where = card.largest
     lines = [
-        f"- Largest load of a touched whisker in a sweep: median {_amount(card.median_load, card)}"
-        f"; the largest of all {_amount(largest, card)} ({where}).",
+        "- Largest load of a touched whisker in a sweep: median "
+        f"{_format_load(card.median_load, card)}; the largest of all "
+        f"{_format_load(largest, card)} ({where}).",
         f"- A sweep that touches, touches {card.whiskers_touched:.1f} whiskers on average.",
         f"- Sweeps without any touch: {card.without_touch}, of which {card.misses} pass beside "
         f"the array and {card.unstable} could not be simulated at this profile.",
@@ -115,7 +116,7 @@ def _describe_loads(card: Card) -> str:
     return "\n".join(lines)
 
 
-def _amount(value: float, card: Card) -> str:
+def _format_load(value: float, card: Card) -> str:
     """Return a load with its unit, e.g. 39 uN."""
     power = min(max(math.floor(math.log10(value) / 3), -4), 0) if value > 0 else 0
     return f"{value / 1000**power:.3g} {PREFIXES[power]}{card.unit}"
@@ -126,7 +127,7 @@ def _map_coverage(card: Card, spec: ArraySpec) -> str:
     cells = {cell: card.coverage[name] for cell, name in zip(spec.grid, spec.elements, strict=True)}
     shown = {cell: f"{100 * share:.0f}" for cell, share in cells.items()}
     lines = [(r, *(shown.get((r, c), "") for c in range(columns))) for r in range(rows)]
-    return _table(("row", *map(str, range(columns))), lines)
+    return _format_table(("row", *map(str, range(columns))), lines)
 
 
 def _list_accuracies(found: list[Separability]) -> str:
@@ -140,7 +141,7 @@ def _list_accuracies(found: list[Separability]) -> str:
         "Support vector machines (RBF) on the first second of contact, tested on objects that "
         "they never saw, as Chung et al. (2025) check their sets, of the classes that come nearest "
         "to theirs (cups, microwaves, chairs, trains).\n\n"
-        + _table(("classes", "right (%)", "chance (%)"), rows)
+        + _format_table(("classes", "right (%)", "chance (%)"), rows)
     )
 
 
@@ -178,7 +179,7 @@ def _draw_card(
 def _draw_loads(axes: Axes, card: Card) -> None:
     edges = np.array(card.load_edges)
     axes.stairs(card.load_counts, edges, fill=True, color="tab:blue", alpha=0.7)
-    median = f"median {_amount(card.median_load, card)}"
+    median = f"median {_format_load(card.median_load, card)}"
     axes.axvline(card.median_load, color="black", label=median)
     axes.axvline(card.clip, color="tab:red", linestyle="--", label="clip of the networks")
     if card.unit == "N":

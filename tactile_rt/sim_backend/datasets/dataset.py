@@ -97,7 +97,7 @@ def make_sweeps(
     engine: str = "processes",
     address: str | None = None,
 ) -> Generator[str, None, None]:
-    """Make what is missing of a sweep set; yield each object's name when finished.
+    """Make the missing sweeps of a set; yield each object's name when finished.
 
     Args:
         folder: the set's; on a cluster, on a file system that all of its machines share.
@@ -122,7 +122,7 @@ def make_sweeps(
         write_skipped(folder, skipped)
     done = finished_objects(folder, names)
     yield from done
-    todo = _spread(manifest, set(names) - set(done))
+    todo = _interleave_splits(manifest, set(names) - set(done))
     work = _Work(recipe, folder.resolve())
     if engine == "ray":
         outcomes = run_ray(work, todo, processes, address)
@@ -138,7 +138,7 @@ def make_sweeps(
     write_sums(folder)
 
 
-def _spread(manifest: SweepManifest, missing: set[str]) -> list[str]:
+def _interleave_splits(manifest: SweepManifest, missing: set[str]) -> list[str]:
     """Order objects so that all splits grow evenly, the test split twice as fast."""
     alike: dict[tuple[str, str], list[str]] = {}
     for side, names in manifest.split.items():

@@ -171,7 +171,7 @@ class MeshObjects:
                 sides["test"] += chain.from_iterable(groups)
                 continue
             validation, test = (
-                _count(n, len(groups)) for n in (self.choice.validation, self.choice.test)
+                _resolve_count(n, len(groups)) for n in (self.choice.validation, self.choice.test)
             )
             train = len(groups) - validation - test
             if train < 1:
@@ -228,7 +228,7 @@ def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
     return ShapeObjects(choice) if choice.generated else MeshObjects(choice)
 
 
-def _count(number: float, total: int) -> int:
+def _resolve_count(number: float, total: int) -> int:
     """Return `number`, or below 1 that fraction of `total`, at least one."""
     return max(1, round(number * total)) if 0 < number < 1 else int(number)
 

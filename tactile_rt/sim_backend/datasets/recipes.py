@@ -55,7 +55,7 @@ Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class Range(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Several values of a sweep's parameter: an interval to draw from, or each of some.
+    """Several values of a sweep's parameter: an interval to draw from, or a list.
 
     Attributes:
         between: The ends of the interval, the lower first.

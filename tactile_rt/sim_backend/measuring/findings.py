@@ -96,7 +96,7 @@ class ArrayFinding:
 
 
 def about(value: float, error: float) -> Figure:
-    """Make a figure from a value and its relative error, half the interval."""
+    """Make a figure from a value and the relative half width of its interval."""
     return Figure(value, value / (1 + error), value * (1 + error))
 
 

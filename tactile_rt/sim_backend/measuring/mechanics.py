@@ -117,7 +117,7 @@ def _combine_plucks(values: Sequence[float], errors: Sequence[float], off: float
 
 
 def _choose_stiffness(whisker: Whisker) -> tuple[str, str]:
-    """Return the stiffness that the resonance depends on most, and its damping."""
+    """Return the fields of the stiffness that most affects the resonance, and of its damping."""
     if whisker.mount_stiffness:
         stiffer = {
             field: _make_rod(_set_field(whisker, field, 1.1 * getattr(whisker, field))).resonance_hz

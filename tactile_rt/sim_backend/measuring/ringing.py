@@ -61,7 +61,7 @@ class Swing(NamedTuple):
 
 
 def find_swings(away: Sequence[NDArray[np.float32]], rate_hz: float) -> list[Swing]:
-    """Find the swings of all whiskers, except echoes of larger swings.
+    """Find the swings of all whiskers, except those that another's larger swing excites.
 
     Args:
         away: (n, channel) of every whisker, distance from rest in standard deviations of the noise.

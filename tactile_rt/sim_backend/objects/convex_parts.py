@@ -135,7 +135,7 @@ class SheetPieces:
         return len(self._joining)
 
     def join(self, tolerance: float) -> None:
-        """Join plates as far as a tolerance, in largest extents, allows."""
+        """Join plates as far as a tolerance, in units of the largest extent, allows."""
         self._tolerance = tolerance
         self._joining.join(self._join_pair)
 
@@ -205,7 +205,7 @@ class SolidPieces:
         return len(self._joining) if self._joining else 1
 
     def join(self, tolerance: float) -> None:
-        """Join pieces within a tolerance, in largest extents, larger at each call."""
+        """Join pieces within a tolerance, in units of the largest extent, larger at each call."""
         self._tolerance = tolerance
         if self._joining is None:
             if self._near_enough(_hull(self._mesh.vertices)):
@@ -215,7 +215,7 @@ class SolidPieces:
         self._joining.join(self._join_pair)
 
     def corners(self, spare: int) -> list[Floats]:
-        """Return the corners (n, 3) of each piece, at most `spare` in the middle last."""
+        """Return corners (n, 3) of each piece; the last, at most `spare`, fill the middle."""
         if self._joining is None:
             return [self._mesh.vertices]
         outer = [p for p in self._joining.patches if _hull(p) is not None]

@@ -188,7 +188,7 @@ class Stage:
                 arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
 
     def close(self) -> None:
-        """Free what the pictures were drawn with."""
+        """Free the OpenGL context."""
         if self._gl is not None:
             self._gl.make_current()
             self._context.free()
@@ -270,7 +270,7 @@ class Film:
         return map(self.picture, range(len(self.footage)))
 
     def close(self) -> None:
-        """Free what the pictures were drawn with."""
+        """Free the OpenGL context."""
         self._stage.close()
 
 

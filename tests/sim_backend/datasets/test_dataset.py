@@ -287,7 +287,7 @@ def test_categories_grow_alike_so_that_one_may_stop_any_time() -> None:
         RECIPE.objects, categories=("bottle", "chair", "mug"), per_category=9, validation=1, test=2
     )
     manifest = dataset.describe_set(replace(RECIPE, objects=objects))
-    order = dataset._spread(manifest, set(manifest.names()))
+    order = dataset._interleave_splits(manifest, set(manifest.names()))
     assert sorted(order) == sorted(manifest.names())
     for share in (2, 3):
         begun = order[: len(order) // share]

@@ -22,7 +22,7 @@ def chair(rng: Generator) -> list[Trimesh]:
     tip = -x - lean
 
     def back(z: float) -> float:
-        """Return x of the leaning back at height z."""
+        """Return x of the tilted backrest at height z."""
         return -x + (tip + x) * (z - seat) / (top - seat)
 
     pieces += [bar((-x, j * y, seat), (tip, j * y, top), leg, leg) for j in (-1, 1)]

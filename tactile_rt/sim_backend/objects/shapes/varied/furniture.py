@@ -101,7 +101,7 @@ def chair(rng: Generator) -> list[Trimesh]:
     back, post = -deep / 2 + 0.03, u(0.03, 0.08)
 
     def at(side: float, z: float) -> tuple[float, float, float]:
-        """Return a point of the leaning back at height z, side -1 to 1."""
+        """Return a point of the tilted backrest at height z; `side` is -1 to 1."""
         x = back - lean * (z - seat) / (top - seat)
         return (x, side * (wide - post) / 2 * 0.95, z)
 
