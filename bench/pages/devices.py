@@ -13,7 +13,7 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.drivers.catalogue import CODECS
+from tactile_rt.drivers.catalogue import CODECS, FRAMES
 from tactile_rt.drivers.codec import codec_class
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "devices.md"
@@ -107,9 +107,10 @@ def seen_by(codec: Any, facts: dict[str, str]) -> str:
 
 
 def source(name: str, codecs: list[Any], facts: dict[str, str]) -> str:
-    """Return where the protocol is from: a paragraph of a docstring."""
-    module = import_module(CODECS[codecs[0].wire, name].module)
-    docs = (cleandoc(thing.__doc__ or "") + "\n\n" for thing in (module, type(codecs[0])))
+    """Return where the protocol is from: a paragraph of a docstring, or of a frame's head."""
+    module, frame = import_module(CODECS[codecs[0].wire, name].module), FRAMES / f"{name}.toml"
+    docs = [cleandoc(thing.__doc__ or "") + "\n\n" for thing in (module, type(codecs[0]))]
+    docs += [re.sub("^# ?", "", frame.read_text(), flags=re.M)] if frame.exists() else []
     found = re.search(r"^Sources?: (.+?)\n\n", "".join(docs), re.M | re.S)
     said = " ".join((found[1] if found else facts["source"]).split())
     linked = re.sub(r"github\.com/([\w-]+/[\w.-]*\w)", r"[\1](https://github.com/\1)", said)

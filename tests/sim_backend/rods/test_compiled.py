@@ -11,10 +11,10 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from tactile_rt.sim_backend.rods import compiled as module
 
 TEXT = """\
-from tactile_rt.sim_backend.rods.compiled import compiled
+from tactile_rt.sim_backend.rods.compiled import compile_cached
 
 
-@compiled
+@compile_cached
 def doubled(x):
     return 2 * x
 """
