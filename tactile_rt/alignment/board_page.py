@@ -101,6 +101,6 @@ LIMITS = (
     f"it fit. The row “{ANOTHER}” is what one recorded animal, noise and all, says of the "
     "others: a bar that is too low, for a model has no noise. An animal counts where its "
     f"ceiling is at least {MINIMUM_CEILING} (a share of variance {MINIMUM_CEILING**2}); a dash "
-    "means that fewer than two do, or that the model tells nothing apart. Metrics are not on one "
+    "means that fewer than two do, or that the model distinguishes nothing. Metrics are not on one "
     "scale: compare down a column, not along a row.</p>"
 )

@@ -213,7 +213,7 @@ def calibrate(
         )
     if len(axes) > inputs:
         warnings.append(
-            f"{len(axes)} axes cannot be told apart by {inputs} channels: leave some out"
+            f"{len(axes)} axes cannot be separated by {inputs} channels: leave some out"
         )
     if rows < 2 * (inputs + 1):
         warnings.append(

@@ -70,7 +70,7 @@ class Mirror:
             return -1 if (component[1] == self.element_axis) == (unit in POLAR) else 1
         if unit in (*POLAR, *AXIAL, *UNTOLD):
             raise ConfigError(
-                f"mirror: nothing tells whether {channel} ({unit}) changes its sign; set "
+                f"mirror: it is not known whether {channel} ({unit}) changes its sign; set "
                 f"mirror.signs.{channel} to 1 or -1"
             )
         return 1

@@ -170,7 +170,7 @@ def _format_file(c: Calibration) -> str:
             f"element_axis = {_toml(c.mirror.element_axis)}",
         ]
         if c.mirror.signs:
-            lines += ["[mirror.signs]  # of channels whose name and unit do not tell"]
+            lines += ["[mirror.signs]  # of channels whose name and unit do not show it"]
             lines += [f"{_quote_key(channel)} = {sign}" for channel, sign in c.mirror.signs.items()]
     if c.gain:
         gain = f"gain = {_toml(c.gain)}  # of elements without a matrix: {_join(c.channels)}"

@@ -112,7 +112,7 @@ def try_model(
         until = time.monotonic() + limits.seconds
         while child.poll() is None:
             if stopped():
-                raise ModelError(f"{path}: nobody waits for its trial any more")
+                raise ModelError(f"{path}: its trial was abandoned")
             if time.monotonic() > until:
                 raise ModelError(
                     f"{path} is refused: more than limits.model_s = {limits.seconds:g} s to load "

@@ -247,7 +247,7 @@ def _explain_no_score(results: Any) -> str:
             f"the benchmark has {reliable} reliable animal, and a layer is chosen on the others: "
             "two are needed"
         )
-    return "in no layer do its responses tell the stimuli apart"
+    return "in no layer do its responses differ between stimuli"
 
 
 def _show_scores(results: Any) -> None:

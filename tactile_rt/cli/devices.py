@@ -69,7 +69,7 @@ def doctor(
     if udev is not None:
         write_whole(udev, lambda file: file.write(udev_rules(ports).encode()))
         console.print(
-            f"udev rules written to {escape(str(udev))}: its head tells how to install it"
+            f"udev rules written to {escape(str(udev))}: its first lines say how to install it"
         )
     if not all(f.good for f in findings):
         raise typer.Exit(1)

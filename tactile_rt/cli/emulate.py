@@ -145,7 +145,7 @@ def _watch(device: "EmulatedDevice") -> None:
     if console.is_terminal:
         with console.status("") as status:
             while not device.wait(LOOK_S):
-                note = "" if device.endpoint.heard else ", nobody listens"
+                note = "" if device.endpoint.heard else ", no host listens"
                 status.update(_describe_counts(device) + note)
     else:
         device.wait()

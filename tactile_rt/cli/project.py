@@ -22,7 +22,7 @@ def new(
     array: Annotated[
         str, option("TOML file, or a name of `array list`. Default: an example.")
     ] = "",
-    classes: Annotated[str, option("Object categories to tell apart, comma-separated.")] = "",
+    classes: Annotated[str, option("Object categories to distinguish, comma-separated.")] = "",
 ) -> None:
     """Begin a project: a model for your own array, by simulation."""
     with needing("sim"):

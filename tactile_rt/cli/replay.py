@@ -163,7 +163,7 @@ class _Replay:
         if checked.late:
             parts.append(f"{checked.late} at the end came too late for the recording")
         if not self._live.sha256:
-            parts.append("the recording does not tell the model's hash")
+            parts.append("the recording does not hold the model's hash")
         typer.echo("; ".join(parts))
         if checked.difference:
             typer.secho(checked.difference, err=True, fg="red")

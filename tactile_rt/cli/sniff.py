@@ -174,7 +174,8 @@ def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, out:
         if not frames:
             out.end_without_result(
                 f"nothing came from {url}",
-                "is the bit rate right?" + ("" if ask else " or try --ask: it may wait to be told"),
+                "is the bit rate right?"
+                + ("" if ask else " or try --ask: the device may wait for a command"),
             )
         _show_identifiers(frames, out)
         out.end_without_result(

@@ -198,7 +198,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     _say(lesson.taught.note)
     if not source.live and teacher.wanted:
         order = f"{teacher.each} touches of each, in this order: {', '.join(teacher.wanted)}"
-        _say(f"a recording is taken to hold {order}; --touches tells another number")
+        _say(f"a recording is taken to hold {order}; --touches sets another number")
     before = lesson.folder.glob("session-*.mcap") if not source.live else ()
     if any(Recording(one).description.source == url for one in before):
         raise ConfigError(

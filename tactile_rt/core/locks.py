@@ -122,7 +122,7 @@ def _lock(key: str) -> socket.socket:
             time.sleep(PAUSE_S)
             continue
         raise AlreadyRunning(f"{key} is in use by {who}")
-    raise AlreadyRunning(f"{key} is in use by a process that does not tell who it is")
+    raise AlreadyRunning(f"{key} is in use by an unknown process")
 
 
 def _make_name(key: str) -> bytes:

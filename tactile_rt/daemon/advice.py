@@ -39,13 +39,13 @@ ADVICE = {
     "old model": VERIFY,
     "no recording": "Look at disk, folder and permissions. It goes on by itself.",
     "not published": "Look at who reads it, and at its address or file. It goes on by itself.",
-    "no page": "Close browsers that nobody looks at, or free its port.",
+    "no page": "Close unused browser windows, or free its port.",
     "no metrics": "Free its port, or name another one.",
     "no log": "Look at the file's folder and disk; of stderr, at the program that reads it.",
     "no systemd": "Look at the unit: NotifyAccess and WatchdogSec.",
     "offset drifts": "Let the sensor warm up, then tare; keep draughts and heat off it.",
     "jitter grows": "Look at the load of host and bus; lower the USB adapter's latency timer.",
-    "memory full soon": "Start it again when nobody needs it, and tell its makers what it ran.",
+    "memory full soon": "Restart it when it is not needed, and report what it ran.",
     "disk full soon": "Move or delete recordings, or record less (see [recorder]).",
 }
 

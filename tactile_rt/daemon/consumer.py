@@ -137,7 +137,7 @@ class ConsumerPart(Part):
             details, diagnostic = self.consumer.details(), self.consumer.diagnose()
             on_disk, soon = self.consumer.on_disk(), self.consumer.foresee()
         except Exception as error:  # it must not break the snapshot of all others
-            diagnostic, on_disk = f"cannot tell how it is: {type(error).__name__}: {error}", {}
+            diagnostic, on_disk = f"cannot report its state: {type(error).__name__}: {error}", {}
             details, soon = {}, ""
         queue = self.box.state
         return ConsumerState(

@@ -149,7 +149,7 @@ def _diagnose_source(
         why = "its counter does not go on: what is lost cannot be seen"
         found.append(Diagnostic(name, "no counter", why))
     if source.clock_off:
-        why = "its clock runs at another speed than the host's: so do the rates that it tells"
+        why = "its clock runs at another speed than the host's: rates by it are as wrong"
         found.append(Diagnostic(name, "device clock", why))
     if source.restarts.second and not starved:
         why = "its counter began anew: what was lost meanwhile is not counted"

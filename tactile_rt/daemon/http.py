@@ -98,7 +98,7 @@ class Request:
             Refused: It is too large or too slow, breaks off, or does not state its length.
         """
         if "transfer-encoding" in self.headers:
-            raise Refused(411, "tell the length of the body")
+            raise Refused(411, "give the length of the body")
         length = self.headers.get("content-length", "0")
         if not re.fullmatch("[0-9]{1,15}", length):
             raise Refused(400, "content-length is no number")

@@ -54,7 +54,7 @@ class Metrics(Consumer):
         )
         if not is_loopback(host):
             view.report(
-                self._name, "exposed", f"whoever can reach {host} can read the state", "warning"
+                self._name, "exposed", f"anyone who can reach {host} can read the state", "warning"
             )
 
     def handle(self, items: list[Item]) -> None:
@@ -248,7 +248,7 @@ CONSUMER: tuple[Row, ...] = (
      "Age of the newest decision's newest sample when it had been published.",
      lambda x, _: x.decision_age_ms / 1e3 if x.latency.count else None),
     *_list_queue_rows("consumer_queue"),
-    ("consumer_detail", "detail", "What a consumer tells of itself, as it names it.",
+    ("consumer_detail", "detail", "Details that a consumer reports, by its own names.",
      lambda x, _: {k: v for k, v in sorted(x.details.items()) if not isinstance(v, str)}),
 )  # fmt: skip
 DISK: tuple[Row, ...] = (

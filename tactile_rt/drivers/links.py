@@ -318,7 +318,7 @@ def _explain_port_error(port: str, error: Exception) -> str:
     if number == errno.ENOENT or "No such file" in text:
         return "no such port: is it plugged in? `tactile-rt list` shows what there is"
     if number in (errno.EACCES, errno.EPERM):
-        return "no permission: `tactile-rt doctor` tells how to get it (group dialout, as a rule)"
+        return "no permission: `tactile-rt doctor` says how to get it (group dialout, as a rule)"
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
         return "in use by another program: close that first"
     if number in (errno.ENOTTY, errno.EISDIR, errno.EINVAL) or "configure port" in text:

@@ -142,7 +142,7 @@ def trained_on(
         )
         there = " and ".join(map(str, folders))
         raise SpecMismatch(
-            f"{checkpoint} tells other categories apart than {there} holds ({other}): name what "
+            f"{checkpoint} has other categories than {there} holds ({other}): name what "
             "it was trained on by --data"
         )
     return list(zip(folders, manifests, strict=True))

@@ -241,7 +241,7 @@ def label_of_file(path: Path) -> str:
     stem = re.sub(r"-\d{8}T\d{6}Z$", "", path.stem)  # time in the name of a rotated file
     label = re.sub(r"[-_ ]\d+$", "", stem)
     if why := check_name(label):
-        raise ConfigError(f"{path}: its name tells no label: {why}")
+        raise ConfigError(f"{path}: its name holds no label: {why}")
     return label
 
 

@@ -166,7 +166,7 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...]) -> Recorded:
     if (far := np.argwhere(np.abs(rows[:, 1:]) > LARGEST_DEG)).size:
         raise ConfigError(
             f"{path}:{lines[far[0, 0]]}: {columns[far[0, 1] + 1]} is beyond "
-            f"{LARGEST_DEG:g} degrees; it is the turn from rest that is wanted"
+            f"{LARGEST_DEG:g} degrees; give the rotation from rest"
         )
     turns = np.empty((len(times), len(whiskers), 3))
     for k, whisker in enumerate(whiskers):

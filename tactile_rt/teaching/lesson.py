@@ -200,7 +200,7 @@ class Lesson:
             ConfigError: the label does not exist, or the new one is invalid.
         """
         if old not in (*self.labels, *self.unfelt):
-            raise ConfigError(f"there is no {old!r}: `list` tells the names")
+            raise ConfigError(f"there is no {old!r}: `list` shows the names")
         if new:
             check_label(new)
         labels.relabel(self.folder / labels.LABELS, old, new)

@@ -175,7 +175,7 @@ class Teacher:
         lines += [f"{a} is taken for {b}" for a, b in others[:3]]
         learnt = self.lesson.taught_enough
         if learnt and not lines:
-            lines = [f"{learnt[0]} is the only class: teach another, to see if they are told apart"]
+            lines = [f"{learnt[0]} is the only class: teach another to compare"]
         refused, count = self.progress.others
         if count and learnt:
             lines.append(f"{ANYTHING_ELSE}: {refused} of {count} touches refused, leave-one-out")

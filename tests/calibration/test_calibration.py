@@ -649,7 +649,7 @@ def test_a_weight_always_at_the_same_lever_is_named() -> None:
 
 @pytest.mark.parametrize(
     ("loads_made", "channels", "said"),
-    [(8, 6, "8 loads are few"), (60, 2, "6 axes cannot be told")],
+    [(8, 6, "8 loads are few"), (60, 2, "6 axes cannot be separated")],
 )
 def test_a_fit_of_too_little_is_doubted(loads_made: int, channels: int, said: str) -> None:
     raw, loads, _, _ = bench(np.random.default_rng(24), n=loads_made)

@@ -195,7 +195,7 @@ def test_a_model_to_which_all_is_the_same_has_no_score_and_it_says_so(call, froz
     np.savez(tmp_path / "same.npz", layer=np.ones((6, 20)))
     code, out, err = call("align", "score", tmp_path / "same.npz", "--benchmark", frozen / "6.json")
     assert code == 0 and "- ± -" in out
-    assert "same: no score: in no layer do its responses tell the stimuli apart\n" in err
+    assert "same: no score: in no layer do its responses differ between stimuli\n" in err
 
 
 def test_a_model_has_no_score_for_want_of_animals_and_it_says_so(call, frozen):

@@ -86,7 +86,7 @@ def test_who_does_what_it_should_is_not_named():
         ({"device": Health(State.STREAMING, 1, counts=False)},
          "no counter: source.a: its counter does not go on: what is lost cannot be seen"),
         ({"clock_off": True}, "device clock: source.a: its clock runs at another speed than the "
-         "host's: so do the rates that it tells"),
+         "host's: rates by it are as wrong"),
         ({"restarts": Losses(1, 1)},
          "restarted: source.a: its counter began anew: what was lost meanwhile is not counted"),
         ({"repeats": Losses(11, 11)},

@@ -110,7 +110,7 @@ def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(
     resplit(moved, categories=manifest.categories[::-1])
     said = refused("export", run / "best.pt", model, "--data", moved)
     assert not model.exists()
-    assert "best.pt tells other categories apart than" in said
+    assert "best.pt has other categories than" in said
     assert "(the same in another order): name what it was trained on by --data" in said
 
     resplit(moved, categories=manifest.categories)

@@ -118,5 +118,5 @@ def test_a_file_s_name_tells_its_label(tmp_path, name, label):
 
 
 def test_a_name_that_tells_none_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match=r"unknown-1.mcap: its name tells no label"):
+    with pytest.raises(ConfigError, match=r"unknown-1.mcap: its name holds no label"):
         label_of_file(tmp_path / "unknown-1.mcap")

@@ -380,9 +380,7 @@ def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
         features = rng.normal(size=(22, lesson.taught.network.size)).astype(np.float32)
         teacher.take("press", features, "session-1.mcap", (k, k + 1))
     assert teacher.label == ANYTHING_ELSE and teacher.progress.right == (0, 0)
-    assert teacher.summary() == [
-        "press is the only class: teach another, to see if they are told apart"
-    ]
+    assert teacher.summary() == ["press is the only class: teach another to compare"]
 
 
 def test_a_class_may_be_a_number_and_none_is_made_of_one(tmp_path):

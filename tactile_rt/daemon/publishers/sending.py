@@ -268,5 +268,5 @@ def tell_exposed(view: View, name: str, host: str) -> None:
     if not is_loopback(host):
         view.report(
             f"publisher.{name}", "exposed",
-            f"whoever can reach {host or 'this computer'} can read what is published", "warning",
+            f"anyone who can reach {host or 'this computer'} can read what is published", "warning",
         )  # fmt: skip

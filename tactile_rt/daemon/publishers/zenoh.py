@@ -49,7 +49,7 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
             if protocol in ON_PORTS and port != "0" and not is_port(port):
                 raise ValueError(f"{endpoint}: a port is a number from 0 to 65535, not {port}")
         if not (self.listen or self.connect or self.scouting or self.config_file):
-            raise ValueError("nobody could be reached: give listen, connect, scouting or a file")
+            raise ValueError("no peer could be reached: give listen, connect, scouting or a file")
 
 
 class ZenohPublisher(Sender):

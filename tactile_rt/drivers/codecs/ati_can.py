@@ -176,7 +176,7 @@ class AtiCan(CanCodec):
         if self._never_empty > NEVER_EMPTY:
             self._drop_first()
         if self._matrix is None:
-            self.complaint = "it has not told its matrix, which it does when it is started"
+            self.complaint = "it has not sent its matrix, which it sends at its start"
             return
         self.complaint = ""
         batch.values.append(self._matrix @ (g0, g1, g2, g3, g4, g5))

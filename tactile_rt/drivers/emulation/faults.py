@@ -54,7 +54,7 @@ KINDS = {
     "bit_flip": Kind(1, "bits inverted in the sample's packet; on CAN in its data"),
     "truncate": Kind(1, "bytes missing from the packet's end; frames, on CAN"),
     "duplicate": Kind(1, "further copies of the packet"),
-    "burst": Kind(16, "random bytes before the packet; on CAN, frames that nobody knows"),
+    "burst": Kind(16, "random bytes before the packet; on CAN, frames of unknown identifiers"),
     "stall": Kind(0, "", lasts=True),
     "drop": Kind(1, "samples in succession that are not sent"),
     "clock_drift": Kind(100, "parts per million", lasts=True, whole=False),

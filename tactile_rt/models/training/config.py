@@ -234,7 +234,7 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
         theirs = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
     except FileNotFoundError:
         raise ConfigError(
-            f"{path} is gone, so that nobody knows what run this is: choose another folder, or "
+            f"{path} is missing, so that this run cannot be identified: choose another folder, or "
             f"delete {folder / 'last.pt'} to begin anew"
         ) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:

@@ -113,7 +113,7 @@ def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
     except (UnicodeDecodeError, csv.Error, IndexError, KeyError, TypeError, ValueError):
         whole = False
     if not whole:
-        raise ModelError(f"{path} is damaged: delete it to go on without what it tells")
+        raise ModelError(f"{path} is damaged: delete it to go on without its contents")
     return [line for line, epoch in zip(lines, epochs, strict=True) if epoch < until]
 
 

@@ -112,7 +112,7 @@ def csv_form(
     if not fits:
         raise RecordingError(
             f"{path} is no table of numbers: no delimiter cuts most of its lines into as many "
-            "numbers (--delimiter, --skip and --lines tell how it is written)"
+            "numbers (--delimiter, --skip and --lines say how it is written)"
         )
     _, form = max(fits, key=lambda fit: round(fit[0], 9))
     _check_layout(path, head, form)

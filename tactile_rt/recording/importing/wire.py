@@ -92,7 +92,7 @@ def import_wire(
             made.said_hz = None
             return made
     elif not claimed:
-        account.notes.append(f"nothing tells their rate: {account.rate_hz:g} Hz, or say --rate")
+        account.notes.append(f"their rate is not known: {account.rate_hz:g} Hz, or say --rate")
     account.said_hz = account.rate_hz if claimed else None
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
         account.notes.append(
@@ -280,4 +280,4 @@ def _explain_empty(log: LineLog, codec: Codec[Any], name: str) -> str:
         f"{stats.intact} intact and {stats.corrupt} damaged frames, {stats.skipped} "
         f"{'bytes' if codec.wire == 'serial' else 'frames'} beside them"
     )
-    return f"no whole {name} sample ({guess}); `tactile-rt sniff {log.path}` tells what fits"
+    return f"no whole {name} sample ({guess}); `tactile-rt sniff {log.path}` lists what fits"

@@ -173,7 +173,7 @@ def load_array(name: str) -> WhiskerArray:
     """
     arrays = load_animals(name)
     if len(arrays) > 1:
-        raise ConfigError(f"{name}: holds {len(arrays)} animals where one array is wanted")
+        raise ConfigError(f"{name}: holds {len(arrays)} animals where one array is needed")
     return arrays[0]
 
 

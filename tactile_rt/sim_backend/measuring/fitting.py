@@ -52,7 +52,7 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
         channels = ", ".join(f"{c} ({u})" for c, u in zip(spec.channels, spec.units, strict=True))
         raise ConfigError(
             f"{path} has no [sensor]: add rate_hz and a [[sensor.channel]] for each of {channels}, "
-            "with its unit, its range, which no recording tells, and a guess of its noise_density"
+            "with its unit, its range, which no recording shows, and a guess of its noise_density"
         )
     ours = device_spec((array,))
     where = f"the recording is not of {path}"

@@ -101,7 +101,7 @@ def _read_gltf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     for buffer in (binary, *_read_buffers(path, scene)):
         for match in re.finditer(DRACO, buffer):
             if max(_read_draco_sizes(buffer[match.start() : match.start() + 64])) > MOST_POINTS:
-                raise ValueError(f"Draco's data tells of more than {MOST_POINTS} points")
+                raise ValueError(f"Draco's data declares more than {MOST_POINTS} points")
     expected = -1
     with suppress(*NO_GLTF):
         expected = _count_triangles(scene)

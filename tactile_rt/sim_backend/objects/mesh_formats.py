@@ -64,7 +64,7 @@ def load_meshes(path: Path, content: bytes, expected: int = -1) -> Meshes:
     meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]
     number = sum(len(mesh.faces) for mesh in meshes)
     if expected not in (-1, number):
-        raise ValueError(f"it tells {expected} triangles, {number} of them can be read")
+        raise ValueError(f"it declares {expected} triangles, {number} of them can be read")
     for mesh in meshes:
         _check_corners(mesh.vertices, mesh.faces)
     return meshes
@@ -85,7 +85,7 @@ def _make_mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> 
     if len(sizes) and sizes.min() < 3:
         raise ValueError(f"face {sizes.argmin() + 1} has {sizes.min()} corners; is it cut short?")
     if len(corners) != sizes.sum():
-        raise ValueError("cut short: a face has fewer corners than it tells")
+        raise ValueError("cut short: a face has fewer corners than it declares")
     _check_corners(vertices, corners, base)
     faces = cut_polygons(vertices, corners.astype(np.int64), sizes.astype(np.int64))
     return trimesh.Trimesh(vertices, faces, process=False)
@@ -144,7 +144,7 @@ def read_off(path: Path, content: bytes) -> Meshes:
     points, faces = int(rows[0][0]), int(rows[0][1])
     if len(rows) - 1 != points + faces:
         raise ValueError(
-            f"{'cut short: ' * (len(rows) <= points + faces)}its header tells {points} vertices "
+            f"{'cut short: ' * (len(rows) <= points + faces)}its header declares {points} vertices "
             f"and {faces} faces, {len(rows) - 1} rows follow"
         )
     vertices = np.array([row[:3] for row in rows[1 : points + 1]], float).reshape(points, 3)
@@ -174,7 +174,7 @@ def read_ply(path: Path, content: bytes) -> Meshes:
     for name, (count, properties) in elements.items():
         found[name], at = _read_rows(name, data, at, count, properties)
     if at != len(data):
-        raise ValueError(f"its header tells of {at} bytes, {len(data)} are there")
+        raise ValueError(f"its header declares {at} bytes, {len(data)} are there")
     points = elements.get("vertex", (0, {}))[1]
     if missing := [axis for axis in "xyz" if axis not in points]:
         raise ValueError(f"its vertices have no {missing[0]}")
@@ -206,7 +206,7 @@ def _read_rows(
         there = (len(data) - at) // np.dtype(fields).itemsize if len(fields) >= len(kinds) else 0
         if not there:
             raise ValueError(
-                f"cut short: its header tells {count} rows of {element!r}, {count - left} are there"
+                f"cut short: it declares {count} rows of {element!r}, {count - left} are there"
             )
         rows = np.frombuffer(data, fields, min(step, left, there), at)
         same = np.ones(len(rows), bool)
@@ -234,7 +234,7 @@ def read_stl(path: Path, content: bytes) -> Meshes:
     raise ValueError(
         "cut short, or no STL: neither text nor a header"
         if size < 0
-        else f"{'cut short: ' * (size < 50 * count)}its header tells {count} triangles of 50 bytes,"
+        else f"{'cut short: ' * (size < 50 * count)}it declares {count} triangles of 50 bytes,"
         f" {size} bytes are there"
     )
 
@@ -293,5 +293,5 @@ def _make_meshes(geometry: Any) -> Iterator[trimesh.Trimesh]:
         if primitive.xmlnode.tag.endswith(("triangles", "polylist")):
             count = int(primitive.xmlnode.get("count", count))
         if count != len(sizes):
-            raise ValueError(f"it tells {count} faces where {len(sizes)} are; cut short?")
+            raise ValueError(f"it declares {count} faces where {len(sizes)} are; cut short?")
         yield _make_mesh(primitive.vertex, index.ravel(), sizes)

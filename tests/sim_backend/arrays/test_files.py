@@ -328,7 +328,7 @@ def test_a_toml_file_places_several_animals(tmp_path: Path) -> None:
     assert (rat.name, bot.name, bot.whiskers[0].name) == ("1.rat-both", "2.bot", "2.A0")
     assert rat.mount == load_array("rat-both").mount
     assert bot.mount.position == (80, 0, 0) and bot.whiskers[0].row == 5
-    assert "holds 2 animals where one array is wanted" in refusal(load_array, path)
+    assert "holds 2 animals where one array is needed" in refusal(load_array, path)
 
 
 @settings(max_examples=150, deadline=None)

@@ -181,7 +181,7 @@ def test_relative_numbers_of_obj_count_back_from_their_row(tmp_path):
 def test_counts_of_the_header_hold(tmp_path, suffix):
     there = "6" if suffix == ".ply" else "14"
     refuse(write(tmp_path, suffix, BOX, QUADS, faces=8), "cut short", "8", there)
-    refuse(write(tmp_path, suffix, BOX, QUADS, faces=4), "its header tells")
+    refuse(write(tmp_path, suffix, BOX, QUADS, faces=4), "its header declares")
     refuse(write(tmp_path, suffix, BOX, [*QUADS, (0, 1, 9)]), "vertex 9, of 8")
     refuse(write(tmp_path, suffix, BOX, [*QUADS, (0, 1, -1)]), "vertex -1, of 8")
     whole = write(tmp_path, suffix, BOX, QUADS).read_bytes()
@@ -194,7 +194,7 @@ def test_stl_of_another_length_than_it_tells_is_refused(tmp_path):
     path, mesh = tmp_path / "a.stl", trimesh.creation.box()
     whole = mesh.export(file_type="stl")
     for content, said in (
-        (whole + bytes(33), "tells 12 triangles of 50 bytes, 633 bytes"),
+        (whole + bytes(33), "declares 12 triangles of 50 bytes, 633 bytes"),
         (whole[:-20], "cut short"),
         (whole[:70], "cut short"),
         (mesh.export(file_type="stl_ascii")[:-300].encode(), "cut short"),
@@ -203,7 +203,7 @@ def test_stl_of_another_length_than_it_tells_is_refused(tmp_path):
         refuse(path, said)
     text = mesh.export(file_type="stl_ascii")
     path.write_text(text.replace("vertex", "vertx", 3) + text)
-    refuse(path, "tells 24 triangles, 23")
+    refuse(path, "declares 24 triangles, 23")
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_the_axis_that_collada_says_is_up(tmp_path, axis, extents):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (dae(triangles(count="20"), BOX), "tells 20 faces where 12"),
+        (dae(triangles(count="20"), BOX), "declares 20 faces where 12"),
         (dae(triangles(index="0 1 9"), BOX), "mesh or its scene"),
         (dae(triangles() + "<linestrips/>", BOX), "linestrips"),
         (dae("<polygons><ph/></polygons>".replace("/>", "></ph>"), BOX), "holes"),
@@ -264,7 +264,7 @@ def change(path: Path, **changes: object) -> dict:
         ({"buffers__0__uri": "other.bin"}, "other.bin, which it names, is not beside it"),
         ({"buffers__0__byteLength": 1000}, "cut short"),
         ({"nodes__0__camera": 0, "cameras": [{"type": "perspective", "perspective": {
-            "yfov": 1, "znear": 1, "aspectRatio": 1}}]}, "tells 12 triangles, 0"),
+            "yfov": 1, "znear": 1, "aspectRatio": 1}}]}, "declares 12 triangles, 0"),
     ],
 )  # fmt: skip
 def test_gltf_says_what_is_not_supported(tmp_path, changes, said):
