@@ -97,7 +97,7 @@ def _look_at_daemon(url: str) -> list[Any]:
 
 
 def _quote_log(name: str) -> str:
-    """Return the newest warning or error of a log."""
+    """Return a log file's name with its newest warning or error."""
     if not name:
         return "on stderr, which systemd keeps: `journalctl -u tactile-rt`"
     try:

@@ -73,7 +73,7 @@ def show(file: File, json: Json = None) -> None:
     table.add_column(overflow="fold")
     for what, text in rows.items():
         if text:
-            # The file may be anybody's: its text must not control the terminal.
+            # The file may come from anywhere: its text must not control the terminal.
             lines = "\n".join(one_line(line) for line in text.splitlines())
             table.add_row(what, escape(lines))
     print_table(table)
