@@ -116,7 +116,7 @@ def _hide_name(path: Path) -> Path:
 
 
 def _raise_for(error: BaseException, hidden: Path, path: Path) -> None:
-    """Re-raise an OSError that names `hidden`, or no file, with `path`. Ignore other errors."""
+    """Raise an OSError that names `hidden`, or no file, as one of `path`. Ignore other errors."""
     if not isinstance(error, OSError) or not error.errno:
         return
     named = error.filename  # a number if the file was opened by its descriptor

@@ -31,7 +31,7 @@ class AlreadyRunning(TactileError):
 
 def lock_keys(config: Path, urls: list[str]) -> list[str]:
     """List the lock keys of a daemon, for its configuration and each device."""
-    # By its given name, too: a link may lead to another file when a second daemon starts.
+    # The given name is locked, too: a link may lead to another file when a second daemon starts.
     paths = [os.path.realpath(config), os.path.abspath(config)]
     return list(dict.fromkeys([*(f"configuration {p}" for p in paths), *device_keys(urls)]))
 

@@ -35,8 +35,8 @@ CLIP = {"N": 5e-3, "N m": 5e-6}
 SCALE = {"N": 3e-5, "N m": 1.5e-7}
 CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
 SILENT = 0.2  # smallest noise assumed by the detector, in parts of a described sensor's noise
-# Likewise in parts of the drift: an offset that has wandered for 10 s since the baseline (by 0.6 of
-# its spread, if it forgets in a minute) is then no endless contact, also for the worst of dozens.
+# Likewise in parts of the drift: an offset that wanders for 10 s after the baseline (by 0.6 of its
+# spread, at a correlation time of a minute) causes no endless contact, even in the worst of dozens.
 WANDERED = 1.5
 ROUNDING = 1 / math.sqrt(12)  # standard deviation of a rounding error, in steps
 
@@ -271,10 +271,10 @@ def channel_limits(
             "array's file, which says how noisy they are"
         )
 
-    def of(table: Mapping[str, float]) -> NDArray[np.float32]:
+    def fill(table: Mapping[str, float]) -> NDArray[np.float32]:
         return np.array([table[unit] for unit in spec.units], dtype=np.float32)
 
-    return ChannelLimits(of(RATED_NOISE), of(CHANNEL_FLOOR), of(CLIP), of(SCALE))
+    return ChannelLimits(fill(RATED_NOISE), fill(CHANNEL_FLOOR), fill(CLIP), fill(SCALE))
 
 
 def _noise_factor(rate_hz: float, period_ns: int) -> float:
