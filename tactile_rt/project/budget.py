@@ -24,8 +24,8 @@ from tactile_rt.sim_backend.transducer import device_spec
 
 SWEEPS_SHARE = 0.45  # of the given time; training gets about as much, and the report the rest
 PILOTS = 5  # sweeps that are timed
-AT_ONCE = 0.85  # share of its speed that each further core adds
-ENOUGH = 60  # objects of a category, before each is swept more often
+AT_ONCE = 0.85  # speed that each further core adds, in parts of the first core's
+ENOUGH = 60  # objects of a category above which each object is swept more often
 FEWEST = 5  # objects of a category: three for training, one for validation, one for test
 TEST_OBJECTS = 60  # of all categories together, if there is time for them
 TEST_SHARE, VALIDATION_SHARE = 0.18, 0.12  # of the objects of a category
@@ -73,7 +73,7 @@ def write_budget(project: Project, budget: Budget) -> None:
 
 
 def budget_sweeps(project: Project, seconds: float) -> Budget:
-    """Time some sweeps; return the budget of objects and sweeps that fits in `seconds`."""
+    """Time some sweeps; return the budget that fits if all stages take `seconds`."""
     recipe = project.recipe()
     each_s = _time_sweep(recipe)
     cores = 1 + AT_ONCE * ((os.cpu_count() or 1) - 1)

@@ -45,7 +45,7 @@ RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
 NO_NAME = re.compile(r"[^\w.+-]+")  # characters with a meaning of their own in a URL or TOML
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
-# mm/s, for objects of 40 mm. Larger ones are faster: a window then covers as much of the array.
+# mm/s, for objects of 40 mm. Larger objects move faster: a window then covers as much of the array.
 SPEEDS = (28, 40)
 
 

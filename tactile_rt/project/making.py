@@ -203,7 +203,7 @@ def _train(
 
 
 def _time_update(project: Project, config: TrainingConfig, splits: Splits) -> float:
-    """Train some updates; return the time of one, s, with its share of validation."""
+    """Run some training updates; return the time of one, s, with its share of validation."""
     at: list[float] = []
     with TemporaryDirectory(dir=project.build) as folder:
         pilot = replace(config, updates=PILOT)

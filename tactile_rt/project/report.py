@@ -72,7 +72,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
 def list_confusions(
     table: NDArray[np.int64], labels: Sequence[str], share: float = CONFUSED
 ) -> list[tuple[str, str, float]]:
-    """List frequent confusions: (true kind, decided kind, share of the true kind's sweeps).
+    """List frequent confusions, worst first: (true kind, decided kind, share of true kind).
 
     Args:
         table: counts of sweeps, shape (true, decided).
