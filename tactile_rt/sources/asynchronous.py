@@ -10,7 +10,7 @@ from contextlib import suppress
 
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-LOOK_S = 0.1  # longest wait until a source is read again although no data came
+LOOK_S = 0.1  # longest wait for data before a source is read again
 
 
 async def chunks(source: Source) -> AsyncIterator[Chunk]:

@@ -55,8 +55,8 @@ class LoopReport:
     identical: int  # decisions with the same bits on both paths, except for latency
     same_label: int  # decisions of the same touch and step with the same label
     finals: int  # last decisions of a touch on the direct path
-    finals_same: int  # those of them with the same label on both paths
-    passed: int  # simulated objects that passed; 0 if the source does not know them
+    finals_same: int  # last decisions of a touch with the same label on both paths
+    passed: int  # simulated objects that passed; 0 if the source does not report them
     right: int  # objects whose first touch ended, on the driver's path, with the right name
     exact: bool  # whether all decisions must be identical; else 99 % must have the same label
     faulty: bool  # whether faults were injected: then only the counts of losses must be right
