@@ -77,7 +77,7 @@ class ArraySource(Source):
         for chunk in chunks:
             if chunk.values.shape[1:] != spec.shape:
                 raise ValueError(f"chunk of shape {chunk.values.shape}, not (n, *{spec.shape})")
-        self._left = list(chunks)[::-1]  # the next one last
+        self._left = list(chunks)[::-1]  # reversed: the next chunk is the last item
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         if not self._left:
