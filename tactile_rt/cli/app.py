@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tactile_rt.core.stream import Source
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
-SLOW_WORK = "tactile_rt.sim_backend.objects"  # its logger
+SLOW_WORK = "tactile_rt.sim_backend.objects"  # logger of work that takes seconds
 
 COLUMNS, BOXED = shutil.get_terminal_size().columns, 100
 
@@ -63,7 +63,7 @@ def _options(
 ) -> None:
     if context.invoked_subcommand is None:
         typer.echo(WELCOME)
-    if sys.stderr.isatty():  # a terminal shows what takes seconds; a log file stays clean
+    if sys.stderr.isatty():  # a terminal shows slow work; a log file stays clean
         logger = logging.getLogger(SLOW_WORK)
         logger.addHandler(logging.StreamHandler())
         logger.setLevel(logging.INFO)
@@ -72,7 +72,7 @@ def _options(
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """Raise KeyboardInterrupt on Ctrl-C even if a library swallows it or raises another error."""
+    """Raise KeyboardInterrupt in the block on Ctrl-C, even if a library swallows the signal."""
     interrupted = False
 
     def note(number: int, frame: FrameType | None) -> None:

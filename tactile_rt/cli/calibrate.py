@@ -170,7 +170,7 @@ def _load_existing(path: Path, device: str) -> "Calibration | None":
 
 
 def _read_samples(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
-    """Read the raw samples up to a table's last time, and their array's spec."""
+    """Read a recording's raw samples up to a table's last time; return its spec, too."""
     from tactile_rt.calibration.tare_measurement import record
     from tactile_rt.core.stream import concatenate
 

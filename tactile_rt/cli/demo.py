@@ -37,7 +37,7 @@ WIDTH = 80
 HEIGHT = 15  # of the upper panels
 DROPPED = 0.02  # share of lost samples above which the score says little about the model
 REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
-END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
+END_NS = 50_000_000  # the demo ends so long before the recording: the last samples may be lost
 LATENCIES_KEPT = 10_000  # newest steps in the latency percentiles: a demo may run for days
 
 # Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 PICTURES: Final = (".png", ".svg", ".pdf")
 ROWS, NAMED, NOTES = 12, 8, 4  # channels, elements in the legend, notes that are drawn
-BINS, PAUSE = 2000, 5  # stretches of time, drawn by their extremes; steps that make a gap
+BINS, PAUSE = 2000, 5  # time bins, drawn by their extremes; usual periods that make a gap
 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")

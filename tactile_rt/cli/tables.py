@@ -130,7 +130,7 @@ def _convert(value: Any) -> Any:
         return str(value)
     if isinstance(value, Mapping):
         return dict(value)
-    return value.tolist()  # of numpy
+    return value.tolist()  # NumPy's array or scalar
 
 
 @contextmanager

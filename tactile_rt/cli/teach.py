@@ -29,7 +29,7 @@ REST_S = 2.0  # at rest, to measure the noise
 HINT_S = 20.0  # without a touch, before a hint on the readings' strength; then twice as long
 SILENT_S = 3.0  # without a sample during a lesson, before a warning
 RESTS = 3  # attempts to measure at rest
-PAGE_S = 1.5  # for a page, which asks twice a second, to get the last state
+PAGE_S = 1.5  # for a page, which polls twice a second, to get the last state
 DEAF_S = 10.0  # without a first sample, before the device counts as silent
 RESTING = f"touch nothing for {REST_S:g} s"
 HELP = (
@@ -184,7 +184,7 @@ class Orders:
 
 
 def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
-    """Add touches until the lesson is complete, the stream ends, or the user stops."""
+    """Collect touches until the lesson is complete, the stream ends, or the user stops."""
     from tactile_rt.core.stream import EndOfStream
     from tactile_rt.recording import Recording, StreamWriter
     from tactile_rt.teaching.lesson import BEFORE_NS
