@@ -1,4 +1,4 @@
-"""tactile_rt: whisker and taxel arrays in, what they touch out, in real time.
+"""tactile_rt: recognition of the objects that whisker and taxel arrays touch, in real time.
 
     from tactile_rt import Classifier, Session, open_source, shipped_model
 

@@ -42,13 +42,13 @@ class CalibratedSource(Source):
 
 
 def declare(source: Source, array: ArraySpec) -> Source:
-    """Declare that a source is of an array, which gives its elements names and places.
+    """Return the source with its elements named and placed as in an array.
 
-    A codec describes its device by generic names and places. Once declared, the stream has those of
+    A codec gives its device's elements generic names and places. The returned source has those of
     the array that the device was built into, and keeps its own rate; see `Calibration.array`.
 
     Returns:
-        The source itself, if it is of that array already; else a source whose closing closes it.
+        The source itself if it has that array already; else a new source, which closes it.
 
     Raises:
         SpecMismatch: the source has another number of elements, or lacks a channel.
@@ -61,6 +61,6 @@ def declare(source: Source, array: ArraySpec) -> Source:
 
 
 def declare_calibration(spec: ArraySpec, array: ArraySpec) -> Calibration:
-    """Return a calibration that changes only the array that samples belong to."""
+    """Return a calibration that only gives samples the names and places of an array."""
     device = re.sub(r"[^\w.:+-]+", "-", spec.name, flags=re.ASCII).strip(".-") or "device"
     return replace(Calibration.of(device, spec), array=array)

@@ -30,7 +30,7 @@ WEAK = 0.01  # least singular value of loads, relative to the largest; 1 / the l
 
 @dataclass(frozen=True, eq=False)
 class LoadTable:
-    """Table of known loads, one per row.
+    """Table of known loads and of a sensor's readings under them, one load per row.
 
     Attributes:
         axes: Names of the axes that were loaded, in the order of `AXES`.
@@ -51,7 +51,7 @@ class LoadTable:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the axes."""
+        """Unit of each loaded axis, N or N m."""
         return tuple(AXES[a] for a in self.axes)
 
 
@@ -84,7 +84,7 @@ def read_loads(path: Path) -> LoadTable:
 def raw_readings(
     table: LoadTable, recorded: Chunk, spec: ArraySpec, element: str
 ) -> NDArray[np.float64]:
-    """Return the (row, channel) median readings of an element under each load of a table.
+    """Return the median reading of an element under each load of a table, (row, channel).
 
     Args:
         recorded: raw samples; the table's times count from the first sample.
@@ -143,7 +143,7 @@ class Fit:
             them are magnified.
         load_condition: Condition number of the scaled loads: 1 if every axis is loaded
             independently of the others.
-        worst: Rows with the largest residuals relative to full scale, the worst first.
+        worst: Indices of the rows with the largest residuals relative to full scale, largest first.
         warnings: Reasons to doubt the matrix, a sentence each.
     """
 
@@ -171,7 +171,7 @@ def calibrate(
     Args:
         raw: (row, channel) readings.
         loads: (row, axis) known loads, N and N m.
-        channels: names of the readings, for messages; empty: numbers from 0.
+        channels: names of the readings, for messages; empty for numbers from 0.
 
     Raises:
         ConfigError: fewer rows than the fit has unknowns per axis, sizes that disagree, values that

@@ -29,7 +29,7 @@ HISTORY = 20  # entries kept, so that the file of a robot that tares every morni
 
 @dataclass(frozen=True)
 class Mirror:
-    """Mirror image of an array, as of a left array for a right array's model.
+    """Reflection of an array, so that a left array can use a right array's model.
 
     Bases are reflected along an axis n of the mount frame, S = 1 - 2 n n^T. This makes the frame R
     of an element left-handed; flipping an axis a of its own, T = 1 - 2 a a^T, makes it
@@ -58,7 +58,7 @@ class Mirror:
                 raise ConfigError(f"mirror.signs.{channel} is 1 or -1, not {sign}")
 
     def sign(self, channel: str, unit: str) -> int:
-        """Return the factor, 1 or -1, of a channel's values.
+        """Return the factor, 1 or -1, by which the reflection multiplies a channel.
 
         Raises:
             ConfigError: neither name and unit nor `signs` determine the factor.
@@ -78,25 +78,25 @@ class Mirror:
     def pose(
         self, position: tuple[float, float, float], orientation: Quaternion
     ) -> tuple[tuple[float, float, float], Quaternion]:
-        """Mirror a position (m) and a unit quaternion (w, x, y, z), w >= 0."""
+        """Reflect a position, m, and a unit quaternion (w, x, y, z). The result has w >= 0."""
         x, y, z = (0.0 - p if a == self.axis else p for a, p in zip(AXES, position, strict=True))
         # S and T are half turns about their axes times -1, and the two -1 cancel in S R T.
-        turned = quaternion_product(_half_turn(self.axis), orientation)
-        w, *v = quaternion_product(turned, _half_turn(self.element_axis)).tolist()
+        rotated = quaternion_product(_make_half_turn(self.axis), orientation)
+        w, *v = quaternion_product(rotated, _make_half_turn(self.element_axis)).tolist()
         # The first non-zero component is positive, so that equal rotations have equal quaternions.
         flip = next((q < 0 for q in (w, *v) if q), False)
         a, b, c, d = ((0.0 - q if flip else q) + 0.0 for q in (w, *v))
         return (x, y, z), (a, b, c, d)
 
 
-def _half_turn(axis: str) -> Quaternion:
+def _make_half_turn(axis: str) -> Quaternion:
     x, y, z = (float(a == axis) for a in AXES)
     return 0.0, x, y, z
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Conversion of a device's raw samples to the output of its array, in SI units.
+    """Conversion of a device's raw samples to calibrated samples of an array, in SI units.
 
     For each element, output = M (raw - tare). M is the element's matrix, else the diagonal gain,
     else the identity if the output has the raw channels and units. Otherwise the element is
@@ -108,15 +108,15 @@ class Calibration:
         units: Units of the raw channels, which may be counts (``1``).
         output_channels: Names of the output channels; empty for the raw ones.
         output_units: Units of the output channels; empty for the raw ones.
-        gain: (channel,) output unit per raw unit, for elements without a matrix; empty: none.
+        gain: (channel,) output unit per raw unit, for elements without a matrix; empty for none.
         tare: (channel,) offset in raw units, by raw element; 0 for elements without an entry.
         noise: (channel,) standard deviation in raw units, by raw element, during the tare.
-        changes: share of readings that differed from the one before, during the tare; see `Tare`.
+        changes: share of readings that differed from the previous one, during the tare; see `Tare`.
         matrices: (output channel, channel) output unit per raw unit, by raw element.
-        mapping: Raw element by output element, in the order of the output; empty: elements are
+        mapping: Raw element by output element, in the order of the output; empty if elements are
             output as the device sends them.
-        mirror: Reflection that makes the output the array's mirror image; None: no reflection.
-        array: Array that the output is declared to be of; None for the device's own. Its elements
+        mirror: Reflection that makes the output the array's mirror image; None for no reflection.
+        array: Array whose samples the output is declared to be; None for the device's. Its elements
             are matched by name or, if the names are not all the same, by order. Its channels are
             matched by name and unit; others are left out.
 
@@ -143,7 +143,7 @@ class Calibration:
 
     @classmethod
     def of(cls, device: str, spec: ArraySpec) -> "Calibration":
-        """Make a calibration of a device that changes nothing yet."""
+        """Make a calibration that changes nothing, for a device and its raw spec."""
         return cls(device, spec.elements, spec.channels, spec.units)
 
     def __post_init__(self) -> None:
@@ -188,7 +188,7 @@ class Calibration:
 
     @property
     def output(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Channels and units of the output."""
+        """Names and units of the output channels."""
         return self.output_channels or self.channels, self.output_units or self.units
 
     @property
@@ -207,7 +207,7 @@ class Calibration:
         return tuple(e for e in used if e not in self.matrices)
 
     def output_spec(self, raw: ArraySpec) -> ArraySpec:
-        """Return the spec of the output for a device's raw spec.
+        """Return the array spec of the calibrated samples, given the device's raw spec.
 
         Raises:
             SpecMismatch: the calibration is for another device.
@@ -240,7 +240,7 @@ class Calibration:
         """Calibrate a chunk of samples.
 
         Args:
-            chunk: of the raw spec; it is not modified.
+            chunk: samples of the raw spec; it is not modified.
 
         Returns:
             A chunk of `output_spec`. An invalid element stays invalid; one whose output is not
@@ -327,10 +327,10 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """Arrays of a calibration, by output element; `matrix` is (element, channel, output).
+    """Arrays that `Calibration.apply` computes with, in the order of the output elements.
 
-    If each output is a multiple of one channel, `channels` (output,) and `gain` (element, output)
-    are these channels and factors; else `gain` is None.
+    `matrix` is (element, channel, output). If each output is a multiple of one channel, `channels`
+    (output,) and `gain` (element, output) are these channels and factors; else `gain` is None.
     """
 
     shape: tuple[int, int]

@@ -127,58 +127,58 @@ def _format_file(c: Calibration) -> str:
         f"# Calibration of the tactile sensor {c.device}, for tactile-rt.",
         "# Of every element: output = matrix @ (raw - tare); then mapped, then mirrored.",
         f"version = {VERSION}",
-        f"device = {_toml(c.device)}",
-        f"changes = {_toml(c.changes)}  # share of readings that differ from the one before, tared",
+        f"device = {_dump(c.device)}",
+        f"changes = {_dump(c.changes)}  # share of readings that differ from the one before, tared",
         "history = [",
-        *(f"  {_toml(line)}," for line in c.history),
+        *(f"  {_dump(line)}," for line in c.history),
         "]",
         "",
         "[raw]  # what the device sends; a unit of 1 are counts",
-        f"elements = {_toml(c.elements)}",
-        f"channels = {_toml(c.channels)}",
-        f"units = {_toml(c.units)}",
+        f"elements = {_dump(c.elements)}",
+        f"channels = {_dump(c.channels)}",
+        f"units = {_dump(c.units)}",
         "",
         "[output]  # what programs get; what is left out is as in [raw]",
     ]
     if c.output_channels:
-        lines.append(f"channels = {_toml(c.output_channels)}")
+        lines.append(f"channels = {_dump(c.output_channels)}")
     if c.output_units:
-        lines.append(f"units = {_toml(c.output_units)}")
+        lines.append(f"units = {_dump(c.output_units)}")
     if c.mapping:
         lines += ["", "[mapping]  # output element = raw element, in the order of the output"]
-        lines += [f"{_quote_key(new)} = {_toml(old)}" for new, old in c.mapping.items()]
+        lines += [f"{_quote_key(new)} = {_dump(old)}" for new, old in c.mapping.items()]
     for what, rows, meaning in (
         ("tare", c.tare, "raw reading at no load"),
         ("noise", c.noise, "standard deviation of the raw reading at no load"),
     ):
         if rows:
             lines += ["", f"[{what}]  # {meaning}: {_join(c.channels)}"]
-            lines += [f"{_quote_key(element)} = {_toml(row)}" for element, row in rows.items()]
+            lines += [f"{_quote_key(element)} = {_dump(row)}" for element, row in rows.items()]
     if c.matrices:
         lines += ["", "[matrix]  # a row per output channel: output unit per raw unit"]
     for element, matrix in c.matrices.items():
         lines += [f"{_quote_key(element)} = [  # columns: {_join(c.channels)}"]
         lines += [
-            f"  {_toml(row)},  # {_join(of)}" for of, row in zip(outputs, matrix, strict=True)
+            f"  {_dump(row)},  # {_join(of)}" for of, row in zip(outputs, matrix, strict=True)
         ]
         lines += ["]"]
     if c.mirror:
         lines += [
             "",
             "[mirror]  # reflect the mount frame's axis, flip the element frame's",
-            f"axis = {_toml(c.mirror.axis)}",
-            f"element_axis = {_toml(c.mirror.element_axis)}",
+            f"axis = {_dump(c.mirror.axis)}",
+            f"element_axis = {_dump(c.mirror.element_axis)}",
         ]
         if c.mirror.signs:
             lines += ["[mirror.signs]  # of channels whose name and unit do not show it"]
             lines += [f"{_quote_key(channel)} = {sign}" for channel, sign in c.mirror.signs.items()]
     if c.gain:
-        gain = f"gain = {_toml(c.gain)}  # of elements without a matrix: {_join(c.channels)}"
+        gain = f"gain = {_dump(c.gain)}  # of elements without a matrix: {_join(c.channels)}"
         lines.insert(lines.index("history = ["), gain)
     return "\n".join(lines) + "\n"
 
 
-def _toml(value: object) -> str:
+def _dump(value: object) -> str:
     # JSON's strings, numbers and lists are valid TOML, except for one control character that JSON
     # does not escape. Numbers are the shortest text that reads back as the same.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
@@ -186,8 +186,8 @@ def _toml(value: object) -> str:
 
 def _join(names: Iterable[str]) -> str:
     # for a comment: a name that a device sends may contain a line break
-    return ", ".join(_toml(name)[1:-1] for name in names)
+    return ", ".join(_dump(name)[1:-1] for name in names)
 
 
 def _quote_key(name: str) -> str:
-    return name if BARE.fullmatch(name) else _toml(name)
+    return name if BARE.fullmatch(name) else _dump(name)

@@ -26,19 +26,19 @@ BLOCKS = 8
 LEAST_SAMPLES = 8 * BLOCKS  # a block's median must be more accurate than the limits below
 TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
 TOUCH, DRIFT = 3.0, 2.0  # largest differences of block and quarter medians, in units of noise
-TAP, TAP_SAMPLES = 8.0, 5  # likewise of single samples, and how many in a row
+TAP, TAP_SAMPLES = 8.0, 5  # likewise for single samples, and the number of them in a row
 PATIENCE_S = 3.0  # wait in addition to the requested seconds
 SLICE_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Tare:
-    """Readings of an untouched array.
+    """Offset and noise of each channel of an untouched array.
 
     Attributes:
         offset: (element, channel) median, raw units; 0 for an element with too few valid samples.
         noise: (element, channel) standard deviation of a sample, raw units; 0 likewise.
-        changes: share of readings unlike the one before, of the element that repeats most.
+        changes: share of readings that differ from the previous one; the least of all elements.
         samples: (element,) number of valid samples.
         seconds: Time from the first sample to the last one, s.
     """
@@ -52,7 +52,7 @@ class Tare:
 
     @property
     def untared(self) -> tuple[str, ...]:
-        """Elements with too few valid samples."""
+        """Names of the elements with too few valid samples for a tare."""
         return tuple(
             e for e, n in zip(self.spec.elements, self.samples, strict=True) if n < LEAST_SAMPLES
         )
@@ -62,7 +62,7 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
     """Measure the tare of an array while nothing touches it.
 
     Args:
-        source: of raw samples; if it is calibrated, its raw source is read.
+        source: source of raw samples; of a calibrated source, the raw source is read.
         seconds: duration by the stream's own time.
 
     Raises:
@@ -101,7 +101,7 @@ def tare(source: Source, seconds: float = 2.0) -> Tare:
 
 
 def record(source: Source, seconds: float) -> list[Chunk]:
-    """Read the first seconds of a stream by its own time, at least one chunk."""
+    """Read chunks of a stream until its own time has advanced by `seconds`."""
     chunks: list[Chunk] = []
     end = None
     patience = time.monotonic() + seconds + PATIENCE_S
@@ -134,7 +134,7 @@ def _measure_rest(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
 
 
 def _diagnose(values: Floats, offset: Floats, noise: Floats, t_s: Floats, spec: ArraySpec) -> str:
-    """Describe an element's touch or drift by its worst channel; empty text if at rest."""
+    """Describe the touch or drift of an element's worst channel; empty text if at rest."""
     scale = np.where(noise > 0, noise, 1.0)  # without noise, no reading has changed, either
     medians = np.stack([np.median(b, axis=0) for b in _split_blocks(values)])
     quarter = len(values) // 4

@@ -24,7 +24,7 @@ AGAIN_S = 0.01  # delay before a signal is raised again, if Python dropped its e
 
 
 def main() -> None:
-    """Run the command line."""
+    """Run `tactile-rt` with the arguments of this process."""
     _open_streams()
     if sys.argv[1:2] == ["run"] and not any(a.startswith("--source") for a in sys.argv):
         # The daemon also obeys signals that come before everything is imported.
@@ -126,7 +126,7 @@ def _run(received: list[int]) -> None:
 
 
 class _ErrorStream(io.FileIO):
-    """The error output, which ignores write errors such as the full disk of a log."""
+    """Stream to stderr that ignores write errors, such as the full disk of a log."""
 
     def write(self, data: "ReadableBuffer") -> int:
         with suppress(OSError):
@@ -145,7 +145,7 @@ def _open_streams() -> None:
         sys.stdin = open(0, closefd=False)
     if sys.stdout is None:
         sys.stdout = open(1, "w", closefd=False)
-    if sys.stderr is not sys.__stderr__:  # somebody has replaced it
+    if sys.stderr is not sys.__stderr__:  # replaced by the calling program
         return
     stream = io.BufferedWriter(_ErrorStream(2, "w", closefd=False))
     coding = getattr(sys.stderr, "encoding", None)

@@ -22,7 +22,7 @@ INPUT_ERROR = 3  # exit code of the gate, whose 1 and 2 mean fail and inconclusi
 
 
 class GateCommand(TyperCommand):
-    """A command whose usage errors are input errors, not inconclusive tests."""
+    """Command that exits with `INPUT_ERROR` on a usage error, as 2 means inconclusive."""
 
     def make_context(self, *arguments: Any, **more: Any) -> Any:
         try:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tactile_rt.core.stream import Source
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
-SLOW_WORK = "tactile_rt.sim_backend.objects"  # its logger
+SLOW_WORK = "tactile_rt.sim_backend.objects"  # logger of work that takes seconds
 
 COLUMNS, BOXED = shutil.get_terminal_size().columns, 100
 
@@ -48,7 +48,7 @@ def _print_version(asked: bool) -> None:
 
 
 def add_group(name: str, help: str) -> typer.Typer:
-    """Return a new group of commands of the application."""
+    """Add a group of commands to the application; return the group."""
     made = typer.Typer(cls=PanelGroup, help=help, no_args_is_help=True)
     app.add_typer(made, name=name)
     return made
@@ -63,7 +63,7 @@ def _options(
 ) -> None:
     if context.invoked_subcommand is None:
         typer.echo(WELCOME)
-    if sys.stderr.isatty():  # a terminal shows what takes seconds; a log file stays clean
+    if sys.stderr.isatty():  # a terminal shows slow work; a log file stays clean
         logger = logging.getLogger(SLOW_WORK)
         logger.addHandler(logging.StreamHandler())
         logger.setLevel(logging.INFO)
@@ -72,12 +72,12 @@ def _options(
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """Let Ctrl-C end the block even if a library swallows it or raises another error."""
-    asked = False
+    """Raise KeyboardInterrupt in the block on Ctrl-C, even if a library swallows the signal."""
+    interrupted = False
 
     def note(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked = True
+        nonlocal interrupted
+        interrupted = True
         if callable(before):
             before(number, frame)
         raise KeyboardInterrupt
@@ -85,18 +85,18 @@ def starting() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, note)
     try:
         yield
-    except Exception:  # raised by a library in place of Ctrl-C, if `asked`
-        if asked:
+    except Exception:  # raised by a library in place of Ctrl-C, if `interrupted`
+        if interrupted:
             raise KeyboardInterrupt from None
         raise
     finally:
         signal.signal(signal.SIGINT, before)
-    if asked:  # swallowed, as by trimesh while it is imported
+    if interrupted:  # swallowed, as by trimesh while it is imported
         raise KeyboardInterrupt
 
 
 def open_url(url: str) -> "Source":
-    """Open a source of samples; Ctrl-C ends it even where a library swallows it."""
+    """Open the source that a URL names. Stop on Ctrl-C even if a library swallows it."""
     from tactile_rt.sources.opening import open_source
 
     with starting():
@@ -112,7 +112,7 @@ def needing(extra: str) -> Iterator[None]:
 
 @contextmanager
 def leaving(seconds: float | None) -> Iterator[None]:
-    """Leave the block without an error at Ctrl-C, SIGTERM, hangup, broken pipe or timeout."""
+    """Leave the block without an error on Ctrl-C, SIGTERM, hangup, broken pipe or timeout."""
     handled = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
     if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup sets it
         handled.append(signal.SIGHUP)
@@ -136,7 +136,7 @@ def check_output(file: Path | None) -> None:
     """Refuse a file that cannot be written, now rather than after minutes of work.
 
     Raises:
-        ConfigError: it is a folder, or the folder around it is missing or not writable.
+        ConfigError: the path is a folder, or its parent folder is missing or not writable.
     """
     if file is None:
         return
@@ -152,7 +152,7 @@ def check_folder(folder: Path) -> None:
     """Refuse a folder that is not writable, now rather than after seconds of work.
 
     Raises:
-        ConfigError: it is a file, or it or its nearest existing parent is not writable.
+        ConfigError: the path is a file, or the folder (or its nearest parent) is not writable.
     """
     above = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
     if not above.is_dir():
@@ -171,14 +171,14 @@ def check_text(*names: Path | None) -> None:
 
 
 def check_named_once(file: Path) -> None:
-    """Refuse to write a file that two arguments of the command line name."""
+    """Refuse an output file that two arguments of the command line name."""
     where = file.resolve()
     if sum(where in _list_files(word) for word in sys.argv[1:]) > 1:
         raise ConfigError(f"{file} is another file of this command: name a new one")
 
 
 def _list_files(word: str) -> set[Path]:
-    """Return the files that an argument may name: alone, in an option or URL."""
+    """Return the paths that an argument may name, alone or within an option or URL."""
     parts = (word, *map(unquote, re.split("[:?&=@,]", word)))
     return {Path(part).resolve() for part in parts if part and "\0" not in part}
 
@@ -193,8 +193,8 @@ def check_new(file: Path, force: bool) -> None:
     """Refuse to overwrite a file that exists, is an input or is being recorded.
 
     Raises:
-        ConfigError: as `check_output`; or the file exists without ``force``, the command line
-            names it twice, or a process is recording into it.
+        ConfigError: the file cannot be written, exists without ``force``, is named twice in the
+            command line, or is being recorded by a process.
     """
     check_output(file)
     if not file.exists():

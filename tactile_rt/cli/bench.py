@@ -65,7 +65,7 @@ def bench(
 
 
 def _load_rig(area: str, module: str = "area") -> Any:
-    """Import the module that measures an area, or a part of it, from the checkout."""
+    """Import a module that measures an area, from the checkout's ``bench`` folder."""
     if not (CHECKOUT / "bench" / area / "area.py").is_file():  # another `bench` may exist
         raise ConfigError(
             f"bench {area} measures from a checkout (pip install --editable): "

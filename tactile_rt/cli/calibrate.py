@@ -153,7 +153,7 @@ def calibrate(
 
 
 def _find_id(source: "Source") -> str:
-    """Return a device's id, else its array's name, as a valid file name."""
+    """Return a device's id, or else its array's name, as a valid file name."""
     own = str(getattr(source, "device_id", "") or source.spec.name)
     return re.sub(r"[^\w.:+-]+", "-", own).lstrip(".")
 
@@ -170,7 +170,7 @@ def _load_existing(path: Path, device: str) -> "Calibration | None":
 
 
 def _read_samples(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
-    """Return the raw samples up to the last time of a table, and their array."""
+    """Read a recording's raw samples up to a table's last time; return its spec, too."""
     from tactile_rt.calibration.tare_measurement import record
     from tactile_rt.core.stream import concatenate
 
@@ -182,7 +182,7 @@ def _read_samples(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, Ar
 
 
 def _find_raw(source: "Source", url: str) -> "tuple[Source, Calibration | None]":
-    """Return the source of raw samples below a calibrated one, and the calibration."""
+    """Return the raw source inside a calibrated source, and its calibration or None."""
     from tactile_rt.calibration import CalibratedSource
 
     known = None
@@ -194,7 +194,7 @@ def _find_raw(source: "Source", url: str) -> "tuple[Source, Calibration | None]"
 
 
 def _match_channels(channels: tuple[str, ...], known: "Calibration") -> list[int]:
-    """Return the column in the table of each raw channel of a device."""
+    """Return the table's column of each raw channel that the calibration has."""
     for channel in (*known.channels, *channels):
         if channel in channels and channel in known.channels:
             continue

@@ -231,7 +231,7 @@ def ros2_messages(
 
 
 def _print_or_write(text: str, output: Path | None, then: str) -> None:
-    """Print a text, or write it into a new file."""
+    """Print a text, or write it into a new file and print the hint `then`."""
     check_output(output)
     if output is None:
         typer.echo(text, nl=False)
@@ -287,7 +287,7 @@ def install_service(
 
 
 def _find_program() -> list[str]:
-    """Return the words that start this program in any folder and environment."""
+    """Return the argument list that starts this program in any folder and environment."""
     script = Path(sys.executable).with_name("tactile-rt")
     if script.exists():
         return [str(script)]

@@ -37,7 +37,7 @@ WIDTH = 80
 HEIGHT = 15  # of the upper panels
 DROPPED = 0.02  # share of lost samples above which the score says little about the model
 REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
-END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
+END_NS = 50_000_000  # the demo ends so long before the recording: the last samples may be lost
 LATENCIES_KEPT = 10_000  # newest steps in the latency percentiles: a demo may run for days
 
 # Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises
@@ -60,11 +60,11 @@ GREEN, RED, GREY = "#2f9e62", "#d64545", "#8a8fa3"
 
 @dataclass(frozen=True)
 class SweepOutcome:
-    """An object that has passed, and the model's decision on it."""
+    """Outcome of an object's pass: its true category and the model's final decision."""
 
     name: str
     category: str
-    said: str | None = None  # None: it passed without a decision
+    said: str | None = None  # decided class; None: the object passed without a decision
     probability: float = 0.0
     names: tuple[str, ...] = ()  # possible kinds within that class
 
@@ -88,7 +88,7 @@ def describe(label: str, names: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class RecordedPass:
-    """An object's pass in the recording; `start_ns` counts from the first sample."""
+    """Pass of an object in the recording; `start_ns` counts from the first sample."""
 
     start_ns: int
     name: str
@@ -147,7 +147,7 @@ def demo(
 
 
 class Demonstration:
-    """A model that runs on the simulated or recorded array, and its score.
+    """Run of a model on the simulated or recorded array, with the model's score.
 
     The score counts objects, not touches: only the first episode of each object's pass, by its
     final decision. An episode belongs to the pass in which it began, even if its last steps come
@@ -155,7 +155,7 @@ class Demonstration:
 
     Args:
         model: an ``.onnx`` file made for the mouse array.
-        sweeps: objects that pass before the end; 0: endless.
+        sweeps: objects that pass before the end; 0 for an endless run.
         fast: as fast as the simulation goes, instead of in real time.
         recorded: play the recording instead.
 
@@ -200,7 +200,7 @@ class Demonstration:
         self._began = self._now = 0.0  # wall time, s
 
     def _open_recording(self, sweeps: int) -> "Source":
-        """Play the recording on an emulated serial device and open that."""
+        """Play the recording on an emulated serial device; return the device's source."""
         from tactile_rt.drivers.emulation.device import EmulatedSerial
         from tactile_rt.recording import Recording
         from tactile_rt.recording.replay import DEMO
@@ -220,7 +220,7 @@ class Demonstration:
         return open_source(device.url)
 
     def run(self) -> Iterator[list[SweepOutcome]]:
-        """Run to the end; after every chunk, yield the outcomes that it has settled."""
+        """Run the model to the end; after each chunk, yield the new outcomes."""
         from tactile_rt.core.stream import NS_PER_S
 
         for chunk, decisions in self._session:
@@ -238,12 +238,12 @@ class Demonstration:
             if self._now_ns - self._base_ns >= self._ends_ns:
                 break
         settled = len(self.outcomes)
-        self._settle_missed(len(self.passes))
+        self._add_missed(len(self.passes))
         yield self.outcomes[settled:]
 
     @property
     def right(self) -> int:
-        """Number of objects recognised."""
+        """Number of objects recognised correctly."""
         return sum(o.right for o in self.outcomes)
 
     @property
@@ -258,17 +258,17 @@ class Demonstration:
 
     @property
     def dropped(self) -> int:
-        """Number of samples dropped because they were not taken in time."""
+        """Number of samples dropped because they were not read in time."""
         return self._session.dropped + self._source.stats.dropped
 
     def latency_ms(self, percentile: float) -> float:
-        """Return a percentile of a model step's time, ms; NaN before the first step."""
+        """Return a percentile of the time per model step, ms; NaN before the first step."""
         import numpy as np
 
         return 1e3 * float(np.percentile(self._latencies or [np.nan], percentile))
 
     def summary(self) -> str:
-        """Return the figures so far, in one line."""
+        """Return score, step times, speed and losses so far, in one line."""
         done, wall = len(self.outcomes), self._now - self._began
         share = f" ({100 * self.right / done:.0f} %)" if done else ""
         return (
@@ -282,20 +282,20 @@ class Demonstration:
         number = bisect_right(self.passes, onset_ns, key=lambda p: p.start_ns) - 1
         if number < len(self.outcomes):
             return  # touched again: only the first episode counts
-        self._settle_missed(number)
+        self._add_missed(number)
         self.target, self.decision = self.passes[number], decision
         if decision.final:
-            self._settle(self.target, decision.label, decision.probability, decision.names)
+            self._add_outcome(self.target, decision.label, decision.probability, decision.names)
 
-    def _settle_missed(self, number: int) -> None:
+    def _add_missed(self, number: int) -> None:
         for missed in self.passes[len(self.outcomes) : number]:
-            self._settle(missed)
+            self._add_outcome(missed)
 
-    def _settle(self, passed: Any, *decision: Any) -> None:
+    def _add_outcome(self, passed: Any, *decision: Any) -> None:
         self.outcomes.append(SweepOutcome(passed.name, self.true_class(passed), *decision))
 
     def true_class(self, passed: Any) -> str:
-        """Return the class of a pass: a shape, if the model's classes are shapes."""
+        """Return the true class of a pass's object, among the model's classes."""
         return str(self._class_of.get(passed.category, passed.category))
 
     def __enter__(self) -> Self:
@@ -307,7 +307,7 @@ class Demonstration:
 
 
 def watch(demo: Demonstration, console: Console) -> None:
-    """Run the demonstration and redraw as it goes."""
+    """Run the demonstration, and redraw its view in the terminal while it runs."""
     with Live(console=console, auto_refresh=False) as live:
         due = 0.0
         try:
@@ -320,7 +320,7 @@ def watch(demo: Demonstration, console: Console) -> None:
 
 
 def draw(demo: Demonstration) -> RenderableType:
-    """Draw the view at this moment."""
+    """Draw the present view of the demonstration: forces, guess and score."""
     whiskers = "30 recorded whiskers" if demo.recorded else "30 simulated whiskers"
     head = Text.assemble((" tactile_rt", "bold"), f"  {whiskers}, and what the model makes of it")
     half = WIDTH // 2
@@ -332,7 +332,7 @@ def draw(demo: Demonstration) -> RenderableType:
 
 
 def _draw_forces(demo: Demonstration) -> Text:
-    """Draw the array as a heat map, its columns from rear to nose."""
+    """Draw the forces on the array as a heat map, columns from rear to nose."""
     import numpy as np
 
     spec = demo.classifier.card.array
@@ -382,7 +382,7 @@ def _draw_guess(demo: Demonstration) -> Text:
 
 
 def _draw_score(demo: Demonstration) -> Text:
-    """Draw the figures since the start, and the newest outcomes."""
+    """Draw the score since the start, and the newest outcomes."""
     text = Text(f"{demo.summary()}\n", no_wrap=True, overflow="ellipsis")
     blind = 100 / len(demo.classifier.card.classes)
     how = "of a recording" if demo.recorded else "simulated"

@@ -14,7 +14,7 @@ from tactile_rt.cli.options import STDOUT, Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import show_table, told_as_json
 
 WINDOW_S = 1.0
-LOG_BYTES = 1 << 16  # of a log's end that are searched for the newest warning
+LOG_BYTES = 1 << 16  # size of a log's end that is searched for the newest warning
 
 
 @app.command("list", epilog="tactile-rt list")
@@ -97,7 +97,7 @@ def _look_at_daemon(url: str) -> list[Any]:
 
 
 def _quote_log(name: str) -> str:
-    """Return the newest warning or error of a log."""
+    """Return a log file's name with its newest warning or error."""
     if not name:
         return "on stderr, which systemd keeps: `journalctl -u tactile-rt`"
     try:

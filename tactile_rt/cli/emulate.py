@@ -117,10 +117,10 @@ def emulate(
 
 
 def open_project(folder: Path) -> "Project":
-    """Open the folder of a project.
+    """Return the project in a folder.
 
     Raises:
-        TactileError: it is no project, or the extra that it needs is not installed.
+        TactileError: the folder is no project, or the needed extra is not installed.
     """
     with needing("sim"):
         from tactile_rt.project.folder import Project
@@ -128,7 +128,7 @@ def open_project(folder: Path) -> "Project":
 
 
 def codec_options(given: list[str]) -> dict[str, str]:
-    """Split ``KEY=VALUE`` options of a codec into fields."""
+    """Split ``KEY=VALUE`` options of a codec into a dict."""
     fields = {}
     for pair in given:
         name, equals, value = pair.partition("=")
@@ -238,7 +238,7 @@ def hil(
 
 
 def _find_model(project: "Project") -> Path:
-    """Return a project's model file; print a note if its array has changed."""
+    """Return a project's model file; print a note if the project's array has changed."""
     from tactile_rt.project.budget import read_budget
 
     if not project.model.exists():
@@ -251,7 +251,7 @@ def _find_model(project: "Project") -> Path:
 
 
 def _add_option(url: str, name: str, value: str) -> str:
-    """Return the URL with this option added, unless the URL has it."""
+    """Add an option to a URL, unless the URL has it; return the URL."""
     _, mark, query = url.partition("?")
     if any(key == name for key, _ in parse_qsl(query, keep_blank_values=True)):
         return url
@@ -262,18 +262,18 @@ def _make_table(report: "LoopReport", source: str, title: str) -> Table:
     decisions = max(report.direct, report.wire)
     stats, health = report.stats, report.health
 
-    def share(n: int, of: int) -> str:
+    def format_share(n: int, of: int) -> str:
         return f"{n} of {of}" + (f" ({100 * n / of:.2f} %)" if of else "")
 
     rows = {
         "source": source.partition("?")[0],
         "samples": f"{report.samples}, {stats.delivered} through the driver",
-        "identical samples": share(report.identical_samples, report.samples),
+        "identical samples": format_share(report.identical_samples, report.samples),
         "decisions": f"{report.direct} direct, {report.wire} through the driver",
-        "identical decisions": share(report.identical, decisions),
-        "same labels": share(report.same_label, decisions),
-        "same final labels": share(report.finals_same, report.finals),
-        "objects named right": share(report.right, report.passed) if report.passed else "",
+        "identical decisions": format_share(report.identical, decisions),
+        "same labels": format_share(report.same_label, decisions),
+        "same final labels": format_share(report.finals_same, report.finals),
+        "objects named right": format_share(report.right, report.passed) if report.passed else "",
         "lost": f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
         f"{stats.duplicates} duplicates; {'all' if report.accounted else 'NOT all'} accounted for",
         "clock": f"{health.clock_steps} steps, {health.counter_resets} resets of the counter",

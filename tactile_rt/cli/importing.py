@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 PICTURES: Final = (".png", ".svg", ".pdf")
 ROWS, NAMED, NOTES = 12, 8, 4  # channels, elements in the legend, notes that are drawn
-BINS, PAUSE = 2000, 5  # stretches of time, drawn by their extremes; steps that make a gap
+BINS, PAUSE = 2000, 5  # time bins, drawn by their extremes; usual periods that make a gap
 
 
 @app.command("import", epilog="tactile-rt import capture.bin --as codec=bota")
@@ -137,7 +137,7 @@ def _list_odd(made: "Import") -> list[str]:
 
 
 def codec_fields(text: str, option: str) -> dict[str, str]:
-    """Split ``codec=NAME&OPTION=VALUE``, written as in a URL, into fields.
+    """Split ``codec=NAME&OPTION=VALUE``, written as in a URL, into a dict.
 
     Raises:
         ConfigError: an option is given twice, or the codec is missing.
@@ -150,7 +150,7 @@ def codec_fields(text: str, option: str) -> dict[str, str]:
 
 
 def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> None:
-    """Draw the samples of an imported recording, with gaps, invalid samples and notes."""
+    """Draw an imported recording with gaps, invalid samples and notes into a picture file."""
     import numpy as np
     from matplotlib.figure import Figure
 
@@ -167,9 +167,9 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
     usual = float(np.median(steps)) if len(steps) else 1.0
     lost = np.flatnonzero((np.diff(chunk.seq) > 1) | (steps > PAUSE * usual))
     bad = np.concatenate([[False], ~chunk.valid.all(axis=1), [False]])
-    turns = np.flatnonzero(np.diff(bad)).reshape(-1, 2)  # where a stretch begins and ends
+    spans = np.flatnonzero(np.diff(bad)).reshape(-1, 2)  # start and end of invalid stretches
     marks = {
-        "invalid": ("tab:red", [(t_s[a], t_s[b - 1] + usual - t_s[a]) for a, b in turns.tolist()]),
+        "invalid": ("tab:red", [(t_s[a], t_s[b - 1] + usual - t_s[a]) for a, b in spans.tolist()]),
         "missing": ("tab:orange", [(t_s[k], t_s[k + 1] - t_s[k]) for k in lost.tolist()]),
     }
     rows = spec.channels[:ROWS]
@@ -181,10 +181,10 @@ def draw_import(path: Path, made: "Import", odd: Sequence[str], out: Path) -> No
         for e, name in enumerate(spec.elements):
             both = [f.reduceat(values[:, e, c], edges) for f in (np.fmin, np.fmax)]
             axis.plot(at, np.stack(both, 1).ravel(), lw=0.8, marker=".", ms=2, label=name)
-        for what, (color, spans) in marks.items():
-            if spans:
+        for what, (color, bars) in marks.items():
+            if bars:
                 whole = {"transform": axis.get_xaxis_transform(), "alpha": 0.3, "label": what}
-                axis.broken_barh(spans, (0, 1), color=color, **whole)
+                axis.broken_barh(bars, (0, 1), color=color, **whole)
         axis.set_ylabel(f"{spec.channels[c]} [{spec.units[c]}]")
         axis.grid(alpha=0.3)
     labels = dict(zip(*axes[0].get_legend_handles_labels()[::-1], strict=True))

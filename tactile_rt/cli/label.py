@@ -114,7 +114,7 @@ def _parse_shares(text: str) -> tuple[float, ...]:
 
 
 def _check_out(folder: Path, force: bool) -> None:
-    """Refuse a folder with files, unless it is a recorded set to be replaced."""
+    """Refuse a folder with files, unless ``force`` replaces a recorded set in it."""
     from tactile_rt.sets.manifest import MANIFEST, SweepManifest, object_path
     from tactile_rt.sim_backend.datasets.inventory import SUMS
 

@@ -73,7 +73,7 @@ def show(file: File, json: Json = None) -> None:
     table.add_column(overflow="fold")
     for what, text in rows.items():
         if text:
-            # The file may be anybody's: its text must not control the terminal.
+            # The file may come from anywhere: its text must not control the terminal.
             lines = "\n".join(one_line(line) for line in text.splitlines())
             table.add_row(what, escape(lines))
     print_table(table)
@@ -95,26 +95,26 @@ def verify(file: File, json: Json = None) -> None:
     card, contents, data = read_model(file)
     results: dict[str, str] = {}
 
-    def tell(what: str, says: str) -> None:
+    def report(what: str, says: str) -> None:
         results[what] = says
         if json != STDOUT:
             typer.echo(f"{what}: {says}")
 
-    tell("sha256", hashlib.sha256(data).hexdigest())
+    report("sha256", hashlib.sha256(data).hexdigest())
     operators = sum(contents.operators.values())
-    tell("structure", f"{operators} operators, nothing outside the file")
+    report("structure", f"{operators} operators, nothing outside the file")
     if card.kind == "step":
         found = try_model(file)
-        tell(
+        report(
             "trial",
             f"warm after {found.load_s:.2f} s, {found.memory_mb:.0f} MB, "
             f"{1e3 * found.step_s:.2f} ms a step",
         )
     _, card = load_model(file, kind=None)
-    tell("metadata", f"version {card.version}, agrees with the graph")
+    report("metadata", f"version {card.version}, agrees with the graph")
     for line in verify_model(file):
         what, _, says = line.partition(": ")
-        tell(what, says)
+        report(what, says)
     told_as_json(results, json)
 
 

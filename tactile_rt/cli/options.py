@@ -29,7 +29,7 @@ def option(help: str, *names: str, **more: Any) -> Any:
 
 
 def argument(help: str, **more: Any) -> Any:
-    """Return an argument of a command."""
+    """Return a positional argument of a command."""
     return typer.Argument(help=help, **more)
 
 

@@ -33,7 +33,7 @@ WHOLE = 1000  # characters: no sentence is cut
 
 
 class PanelGroup(TyperGroup):
-    """A group that shows its commands in panels, also where help is plain text.
+    """Command group whose help shows the commands in panels, also in plain text.
 
     The epilog of a command is an example of one shell line.
     """
@@ -52,7 +52,7 @@ class PanelGroup(TyperGroup):
                 command.epilog = start + command.epilog
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a section for each panel, and each command's whole first sentence."""
+        """Write a help section per panel, with the whole first sentence of each command."""
         panels: dict[str, list[tuple[str, str]]] = {}
         wide = max(map(len, self.commands))
         command: Any

@@ -176,7 +176,7 @@ def convert(
 
 
 def _print_results(results: dict[str, Any], json: Path | None) -> None:
-    """Print how much was written, and where, or write it as JSON."""
+    """Print the output's path and the numbers written, or write them as JSON."""
     if not told_as_json(results, json):
         counts = ", ".join(f"{n} {what}" for what, n in results.items() if what != "output")
         typer.echo(f"{results['output']}: {counts}")
@@ -189,7 +189,7 @@ MARKS = {"ros2": "metadata.yaml", "lerobot": "meta/info.json"}
 def _write_folder(
     to: str, files: list[Path], fps: int, task: str, video: list[str], force: bool
 ) -> dict[str, Any]:
-    """Write a bag or a dataset; return its path and the numbers written."""
+    """Write a ROS 2 bag or a LeRobot dataset. Return its path and the numbers written."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording.as_lerobot import write_dataset
     from tactile_rt.recording.conversion import write_bag

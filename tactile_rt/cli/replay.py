@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from tactile_rt.core.stream import Chunk
     from tactile_rt.recording import Recording
 
-DIFFERENT = 1
+DIFFERENT = 1  # exit code
 RECORDED = "recorded"  # the codec and options by which packets were decoded live
 TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # keys of a decision that differ between runs
 
@@ -69,7 +69,7 @@ def replay(
 
 
 class _Replay:
-    """Recordings that are replayed through a classifier."""
+    """Replay of the recordings of one source through a classifier."""
 
     def __init__(
         self,
@@ -101,13 +101,13 @@ class _Replay:
             )
 
     def write(self, file: BinaryIO | None) -> None:
-        """Write all lines into a file; with None, only run the model."""
+        """Write a line of JSON per decision into a file. With None, only run the model."""
         for line in self.lines():
             if file is not None:
                 file.write(line + b"\n")
 
     def lines(self) -> Iterator[bytes]:
-        """Yield a line of JSON for each decision, as soon as it is due."""
+        """Yield a line of JSON for each decision, at the speed of the replay."""
         import msgspec
 
         from tactile_rt.recording.replay import prepare_replay
@@ -130,14 +130,14 @@ class _Replay:
                         yield msgspec.json.encode(message)
 
     def _decide(self, classifier: "Classifier", chunk: "Chunk") -> "list[Classification]":
-        """Classify those samples of a chunk that the model also got live."""
+        """Classify the samples of a chunk that the model also received live."""
         from tactile_rt.recording.checking import samples_given
 
         given = samples_given(chunk, self._skips)
         return classifier.push(given) if given is not None else []
 
     def compare(self) -> None:
-        """Print whether the decisions are the recorded ones; exit with `DIFFERENT` if not."""
+        """Compare the decisions with the recorded ones; exit with `DIFFERENT` if they differ."""
         from tactile_rt.recording.checking import check_decisions
 
         assert self._live is not None
@@ -212,7 +212,7 @@ def _open_in_order(files: list[Path]) -> "list[Recording]":
     if folders:
         raise ConfigError(f"{folders[0]} is a folder: {_list_sources(folders[0])}")
     found = [Recording(path) for path in files]
-    names = dict.fromkeys(map(_source_of, found))
+    names = dict.fromkeys(map(_find_source, found))
     if len(names) > 1:
         raise ConfigError(
             f"recordings of several sources: {name_some(names)}; replay one at a time"
@@ -238,7 +238,7 @@ def _list_sources(folder: Path) -> str:
     names: dict[str, str] = {}
     for path in sorted(folder.glob("*.mcap")):
         try:
-            names.setdefault(_source_of(Recording(path)), path.name)
+            names.setdefault(_find_source(Recording(path)), path.name)
         except RecordingError:
             continue
     if not names:
@@ -247,7 +247,7 @@ def _list_sources(folder: Path) -> str:
     return f"name the files of one source; it has recordings of {sources}"
 
 
-def _source_of(recording: "Recording") -> str:
+def _find_source(recording: "Recording") -> str:
     about = recording.description
     return about.session.get("daemon_source", about.source)
 
@@ -272,7 +272,7 @@ def _parse_speed(text: str) -> str:
 
 
 def _parse_codec(codec: str) -> dict[str, str]:
-    """Return the `replay:` options to decode raw packets; none to replay samples."""
+    """Return the `replay:` options that decode raw packets, or {} to replay samples."""
     if codec in ("", RECORDED):
         return {"from": "wire"} if codec else {}
     chosen, _, query = codec.partition("?")

@@ -73,14 +73,14 @@ def sniff(
 
 
 class _Output:
-    """Output of findings, printed as they come, or as JSON at the end."""
+    """Writer of findings: prints each as it comes, and writes JSON at the end."""
 
     def __init__(self, target: str, json: Path | None) -> None:
         self._json, self._alone = json, json == STDOUT
         self._all: dict[str, Any] = {"target": target, "fits": [], "said": [], "command": None}
 
     def show(self, what: str, value: Any, table: "Table") -> None:
-        """Print a table, and store its data for the JSON."""
+        """Print a table, and store its data for the JSON under the key `what`."""
         self._all[what] = value
         if not self._alone:
             print_table(table)
@@ -91,14 +91,14 @@ class _Output:
             typer.echo(text)
 
     def end_with_command(self, *words: object) -> None:
-        """Print the last line: the command to continue with."""
+        """Print the command to continue with as the last line; write the JSON."""
         self._all["command"] = command = shlex.join(["tactile-rt", *map(str, words)])
         if not self._alone:
             typer.echo(command)
         told_as_json(self._all, self._json)
 
     def end_without_result(self, what: str, hint: str = "") -> NoReturn:
-        """Print the last line, that nothing was found, and exit."""
+        """Print that nothing was found, write the JSON, and exit with `NOTHING`."""
         self.say(f"{what}{f': {hint}' if hint else ''}")
         told_as_json(self._all, self._json)
         raise typer.Exit(NOTHING)
@@ -130,10 +130,10 @@ def _sniff_port(
                 return SerialLink(port, speed or codec.baud, codec.parity)
 
             for _, data in ask_devices("serial", connect, seconds):
-                found += [(fit, speed or _usual_baud(fit)) for fit in sniff_bytes(data, further)]
+                found += [(fit, speed or _find_baud(fit)) for fit in sniff_bytes(data, further)]
     found.sort(
         key=lambda one: (
-            one[0].explained * (1 + one[0].proof), one[1] == _usual_baud(one[0]), one[0].intact
+            one[0].explained * (1 + one[0].proof), one[1] == _find_baud(one[0]), one[0].intact
         ),
         reverse=True,
     )  # fmt: skip
@@ -142,7 +142,7 @@ def _sniff_port(
         _show([fit for fit, _ in found], out, [baud for _, baud in found])
         fit, baud = found[0]
         # over USB the bytes are the same at every speed
-        usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
+        usual = any(b == _find_baud(fit) for one, b in found if one.codec == fit.codec)
         _propose_run(url, fit, {} if usual else {"baud": str(baud)}, out)
         return
     printed = [(propose_line_columns(data), baud) for baud, data in texts]
@@ -193,7 +193,7 @@ def _propose_run(url: str, fit: "CodecFit", further: dict[str, str], out: _Outpu
     out.end_with_command("run", "--source", f"{url}{sign}{_make_query(fields)}")
 
 
-def _usual_baud(fit: "CodecFit") -> int:
+def _find_baud(fit: "CodecFit") -> int:
     from tactile_rt.drivers.opening import make_codec
 
     codec: Any = make_codec("serial", fit.codec, dict(fit.options))
@@ -244,7 +244,7 @@ def _sniff_file(path: Path, further: "list[Tried]", out: _Output) -> None:
 
 
 def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
-    """Propose columns of a table or of printed lines; return whether any exist."""
+    """Propose columns for a table or for printed lines; return False if none fit."""
     from tactile_rt.recording.importing.table_guess import propose_columns, propose_line_columns
 
     try:
@@ -268,7 +268,7 @@ def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
 
 
 def _describe_lack(data: bytes) -> str:
-    """Return a note that text has too few rows; empty if enough or not text."""
+    """Return a note if text has too few rows of numbers, else empty text."""
     from tactile_rt.drivers.codecs.ascii_text import fields, is_text, number
     from tactile_rt.recording.importing.table_guess import LEAST
 

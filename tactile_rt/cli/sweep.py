@@ -93,7 +93,7 @@ def _write_card(folder: Path) -> None:
 
 
 def _choose_recipe(folder: Path, name: str | None, sets: list[str]) -> "SweepRecipe":
-    """Return the recipe of an existing or a new set, with the values of ``sets``."""
+    """Return an existing set's recipe, or the named recipe, with the values of ``sets``."""
     from tactile_rt.sets.manifest import SweepManifest
     from tactile_rt.sim_backend.datasets.recipe_files import (
         DEFAULT_RECIPE,

@@ -33,11 +33,11 @@ Update = Callable[..., None]
 def show_table(
     records: Sequence[Mapping[str, Any]], headings: Mapping[str, str], json: Path | None = None
 ) -> None:
-    """Print one line for each record, or write them all as JSON.
+    """Print a table with a line for each record, or write the records as JSON.
 
     Args:
-        records: may have more keys than are printed.
-        headings: the heading of every column, by the key of the records that it prints.
+        records: mappings, which may have more keys than are printed.
+        headings: heading of each printed column, by the key of its values in the records.
         json: file to write, `STDOUT`, or None for a printed table.
     """
     if told_as_json(list(records), json):
@@ -49,10 +49,10 @@ def show_table(
 
 
 def show_records(records: "list[Record]", json: Path | None) -> bool:
-    """Print figures beside their bars (limits), or write them as JSON.
+    """Print measured values beside their limits, or write them as JSON.
 
     Returns:
-        True if stdout took the JSON, where nothing else may be printed then.
+        True if the JSON went to stdout, where nothing else may be printed then.
     """
     from tactile_rt.models.evaluation.records import as_dicts, as_table
 
@@ -63,7 +63,7 @@ def show_records(records: "list[Record]", json: Path | None) -> bool:
 
 
 def print_table(table: Table, console: Console | None = None) -> None:
-    """Print a table: complete in a pipe, one cell a line on a narrow terminal."""
+    """Print a table in full width; on a narrow terminal, print a cell per line."""
     console = console or Console()
     if console.is_terminal:
         console.print(fitting(table, console))
@@ -73,7 +73,7 @@ def print_table(table: Table, console: Console | None = None) -> None:
 
 
 def fitting(table: Table, console: Console) -> RenderableType:
-    """Return the table, or its cells as lines if its longest words do not fit."""
+    """Return the table, or a line per cell if the console is too narrow."""
     needs = Measurement.get(console, console.options.update(max_width=WIDE), table)
     return table if needs.minimum <= console.width else _list_cells(table)
 
@@ -86,7 +86,7 @@ def told_as_json(what: Any, json: Path | None) -> bool:
         json: file to write, `STDOUT`, or None to write nothing.
 
     Returns:
-        True if stdout took the JSON, where nothing else may be printed then.
+        True if the JSON went to stdout, where nothing else may be printed then.
     """
     if json is None:
         return False
@@ -99,7 +99,7 @@ def told_as_json(what: Any, json: Path | None) -> bool:
 
 
 def _list_cells(table: Table) -> Text:
-    """Return every cell on a line of its own, as "heading: cell"."""
+    """Return a table's cells as text, a line ``heading: cell`` each."""
     columns = [(str(column.header), list(column.cells)) for column in table.columns]
     lines = [Text(str(table.title), style="bold")] if table.title else []
     for row in range(table.row_count):
@@ -130,7 +130,7 @@ def _convert(value: Any) -> Any:
         return str(value)
     if isinstance(value, Mapping):
         return dict(value)
-    return value.tolist()  # of numpy
+    return value.tolist()  # NumPy's array or scalar
 
 
 @contextmanager
@@ -142,17 +142,17 @@ def progress_bar(
     timed: bool = True,
     console: Console | None = None,
 ) -> Iterator[Update]:
-    """Show a bar with the time left, which disappears when the block ends.
+    """Show a progress bar with the time left while the block runs.
 
-    Without a terminal, a line takes its place after `LINE_S` seconds, and then ever more rarely, so
+    Without a terminal, print a line after `LINE_S` seconds instead, and then ever more rarely, so
     that a log file shows that the work continues. Shorter work prints nothing.
 
     Args:
         total: amount of work; None if unknown.
         completed: amount that was done before and does not count for the time left.
-        counted: show how many of the total are done, not the share.
+        counted: show the number done of the total, not the share.
         timed: show the time left; False if the description contains it.
-        console: None: standard error.
+        console: console to draw on; None for standard error.
 
     Yields:
         The function that updates the bar: rich's `Progress.update` without the task
@@ -188,7 +188,7 @@ def progress_bar(
 
 @contextmanager
 def share_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """Show a bar; yield the function that sets the share done, 0 to 1."""
+    """Show a progress bar; yield a function that sets the finished share, 0 to 1."""
     with progress_bar(what, total=1.0) as update:
         yield lambda share: update(completed=share)
 
@@ -204,7 +204,7 @@ def _print_lines(
 
 
 def describe_task(task: progress.Task, counted: bool, timed: bool = True) -> str:
-    """Return a line with the progress, the time so far and the time left."""
+    """Return a line with a task's progress, the time so far and the time left."""
     line = f"{task.description}:"
     if task.total and counted:
         line += f" {task.completed:.0f} of {task.total:.0f},"
@@ -216,7 +216,7 @@ def describe_task(task: progress.Task, counted: bool, timed: bool = True) -> str
 
 
 def _format_time(seconds: float) -> str:
-    """Format a time in seconds below two minutes, then in minutes, then in hours."""
+    """Format a time, given in s, in seconds, minutes or hours."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     if seconds < 7200:

@@ -29,7 +29,7 @@ REST_S = 2.0  # at rest, to measure the noise
 HINT_S = 20.0  # without a touch, before a hint on the readings' strength; then twice as long
 SILENT_S = 3.0  # without a sample during a lesson, before a warning
 RESTS = 3  # attempts to measure at rest
-PAGE_S = 1.5  # for a page, which asks twice a second, to get the last state
+PAGE_S = 1.5  # for a page, which polls twice a second, to get the last state
 DEAF_S = 10.0  # without a first sample, before the device counts as silent
 RESTING = f"touch nothing for {REST_S:g} s"
 HELP = (
@@ -133,10 +133,10 @@ def teach(
 
 
 class Orders:
-    """Queue of the user's orders, such as ``undo``, from stdin and a page's buttons.
+    """Queue of the user's commands, such as ``undo``, from stdin and a page's buttons.
 
     Args:
-        at: host and port of the page; None: no page.
+        at: host and port of the page; None for no page.
     """
 
     def __init__(self, at: tuple[str, int] | None) -> None:
@@ -149,7 +149,7 @@ class Orders:
         if self._at is not None:
             from tactile_rt.teaching.page import TeachingPage
 
-            self._page = TeachingPage(*self._at, self._state, self._orders.put)
+            self._page = TeachingPage(*self._at, self._get_state, self._orders.put)
             typer.echo(f"buttons: {self._page.url}")
         return self
 
@@ -158,20 +158,20 @@ class Orders:
             self._page.close()
 
     def end(self, message: str) -> None:
-        """Show on the page how the lesson ended; wait while the page fetches it."""
+        """Show on the page how the lesson ended; wait while the page fetches the message."""
         if self.teacher is not None:
             self.teacher.ended = message
             time.sleep(PAGE_S if self._page else 0)
 
     def listen(self) -> None:
-        """Start a thread that takes orders from stdin."""
-        threading.Thread(target=self._take_lines, daemon=True).start()
+        """Start a thread that reads commands from stdin into the queue."""
+        threading.Thread(target=self._read_lines, daemon=True).start()
 
     def next(self) -> str:
-        """Return the user's next order; empty text if none waits."""
+        """Remove and return the oldest command; return empty text if none waits."""
         return "" if self._orders.empty() else self._orders.get()
 
-    def _take_lines(self) -> None:
+    def _read_lines(self) -> None:
         try:
             for line in sys.stdin or ():
                 if order := line.strip():
@@ -179,12 +179,12 @@ class Orders:
         except (OSError, ValueError):
             return  # closed
 
-    def _state(self) -> dict[str, Any]:
+    def _get_state(self) -> dict[str, Any]:
         return self.teacher.state() if self.teacher else {"prompt": RESTING}
 
 
 def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
-    """Take touches until there are enough, the stream ends, or the user stops."""
+    """Collect touches until the lesson is complete, the stream ends, or the user stops."""
     from tactile_rt.core.stream import EndOfStream
     from tactile_rt.recording import Recording, StreamWriter
     from tactile_rt.teaching.lesson import BEFORE_NS
@@ -255,7 +255,7 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
 
 
 def _receive(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":
-    """Yield chunks with the orders that came; a thread reads a live source."""
+    """Yield (chunk or None, command or empty text); read a live source in a thread."""
     waiting = queue.SimpleQueue[tuple["Chunk | None", str] | Exception]()
     over = threading.Event()
 
@@ -263,7 +263,7 @@ def _receive(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None,
         try:
             while not over.is_set():
                 waiting.put((source.read(POLL_S), orders.next()))
-        except Exception as error:  # raised again where the chunks are taken
+        except Exception as error:  # raised again below, in the thread that reads the chunks
             waiting.put(error)
 
     while not source.live:
@@ -280,10 +280,10 @@ def _receive(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None,
 
 
 def _load_lesson(folder: Path, base: Path | None) -> "Lesson | None":
-    """Load the lesson of a folder; None if the folder has no lesson.
+    """Load the lesson of a folder; return None if the folder has no lesson.
 
     Args:
-        base: network to enrol objects on, or None; a new one embeds the recordings again.
+        base: network to enrol objects on; if it is a new one, it embeds the recordings again.
     """
     from tactile_rt.classifier.model_file import hash_of
     from tactile_rt.core.locks import alone_in
@@ -320,7 +320,7 @@ def _parse_address(given: str) -> tuple[str, int]:
 
 
 def _begin(folder: Path, source: "Source") -> "Lesson":
-    """Begin a lesson; measure the noise of the array at rest."""
+    """Create a lesson in a folder, after measuring the noise of the array at rest."""
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.listener import find_motion, measure_changes, measured_floor
     from tactile_rt.teaching.model import FewShot

@@ -62,7 +62,7 @@ def top(
 
 
 def snapshot_at(url: str) -> "Snapshot":
-    """Ask a daemon for its state over HTTP.
+    """Request the state of a daemon over HTTP, and return it.
 
     Raises:
         ConfigError: the URL is not http, or the answer is not a daemon's.
@@ -100,7 +100,7 @@ def snapshot_at(url: str) -> "Snapshot":
 
 
 def read_snapshots(lines: Iterator[bytes]) -> "Iterator[Snapshot]":
-    """Read the state messages among lines of JSON; pass over others."""
+    """Yield the state of each state message among lines of JSON; skip other lines."""
     import msgspec
 
     from tactile_rt.daemon.messages import StateMessage
@@ -131,7 +131,7 @@ def _poll_snapshots(where: str) -> "Iterator[Snapshot]":
 
 
 def picture(now: "Snapshot") -> Group:
-    """Draw a state as lines and tables, one below the other."""
+    """Draw a daemon's state as lines and tables, one below the other."""
     parts: list[RenderableType] = [_draw_head(now)]
     parts += [Text(f"  {line}", style="red", overflow="ellipsis") for line in now.degraded]
     for table in (_draw_sources(now), _draw_models(now), _draw_consumers(now)):
@@ -155,7 +155,7 @@ def _draw_head(now: "Snapshot") -> Text:
 
 
 def _make_table(headings: str) -> Table:
-    """Return a table with these headings; those that begin with > are right-aligned."""
+    """Return an empty table; headings that begin with > are of right-aligned columns."""
     table = Table(box=None, header_style="bold", pad_edge=False, padding=(0, 2, 0, 0))
     *names, last = headings.split(", ")
     for name in names:
@@ -178,7 +178,7 @@ def _draw_sources(now: "Snapshot") -> Table:
         why = s.part.reason or (s.device.reason if s.device is not None else "")
         age = f"{(now.t_ns - s.newest_ns) / 1e6:.0f}" if s.newest_ns else ""
         table.add_row(
-            _short_name(s.part), state, rate, f"{s.rate_hz:g}" if s.rate_hz else "", f"{s.samples}",
+            _name_part(s.part), state, rate, f"{s.rate_hz:g}" if s.rate_hz else "", f"{s.samples}",
             _draw_loss(s.stats.missing), _draw_loss(s.stats.corrupt), _draw_loss(s.stats.dropped),
             f"{s.stats.duplicates}", _draw_loss(s.losses.minute), age, _draw_line(shape, why),
         )  # fmt: skip
@@ -195,7 +195,7 @@ def _draw_models(now: "Snapshot") -> Table:
         if m.touching and not m.part.reason:
             newest.append(" touching", style="green")
         table.add_row(
-            _short_name(m.part), _draw_state(m.part), f"{m.decisions}", f"{m.final}",
+            _name_part(m.part), _draw_state(m.part), f"{m.decisions}", f"{m.final}",
             *_format_latency(m.latency), f"{m.step.p50_ms:.1f}" if m.step.count else "",
             _draw_loss(m.late), _draw_loss(m.skipped), _draw_loss(sum(m.queue.dropped.values())),
             newest,
@@ -234,11 +234,11 @@ def _draw_loss(count: int) -> Text:
     return Text(f"{count}", style="red" if count else "")
 
 
-def _short_name(part: "PartState") -> str:
+def _name_part(part: "PartState") -> str:
     return part.name.partition(".")[2]
 
 
 def _draw_line(text: str, diagnostic: str = "") -> Text:
-    """Draw a text, or in red the diagnostic that takes its place."""
+    """Draw a text or, if a diagnostic is given, the diagnostic in red instead."""
     style = "red" if diagnostic else ""
     return Text(diagnostic or text, style=style, no_wrap=True, overflow="ellipsis")

@@ -108,7 +108,7 @@ def view(
 
 @dataclass(frozen=True)
 class Spacing:
-    """Placement of the stimuli."""
+    """Options of the stimuli's places, for ``--set``."""
 
     radius_mm: float = 63.6  # radius of the stimuli's arc, mm
     step_mm: str = "1,1,0"  # vector from a stimulus to the next further one: ``x,y,z``, mm

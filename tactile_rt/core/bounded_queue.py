@@ -10,9 +10,9 @@ kind and a count, e.g. 9 samples; at every moment, for each kind,
     put = taken + dropped + waiting
 
 One lock guards all. Nothing slow is done under it, so that no reader delays a writer. A reader
-takes one item (`get`) or all that wait (`take`). If many items come, waking up for each costs more
-than the item itself; so `take` may gather items for a while, unless an urgent one comes. A writer
-that must not lose anything waits for room before it puts.
+removes one item (`get`) or all waiting ones (`take`). If many items come, waking up for each costs
+more than the item itself; so `take` may gather items for a while, unless an urgent one comes. A
+writer that must not lose anything waits for room before it puts.
 
 Many threads may put; one reads. In an event loop the loop's own thread may do both, and wakes its
 reader by itself.
@@ -33,7 +33,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class QueueState:
-    """Counts of a queue's items by kind. For each, put = taken + dropped + waiting.
+    """Counts of a queue's items by kind. For each kind, put = taken + dropped + waiting.
 
     Attributes:
         oldest_s: The time that the oldest waiting item has waited, s; 0 if none waits.
@@ -52,18 +52,18 @@ def _count_one(item: Any) -> tuple[str, int, int]:
 
 
 class BoundedQueue(Generic[T]):
-    """Queue of items that wait for one reader.
+    """Thread-safe queue of limited length for one reader; a full queue drops its oldest items.
 
     Args:
-        size: largest number of waiting bytes; a single item may be larger.
-        measure: returns kind, count and bytes of an item; None: the item is ignored, uncounted. By
-            default every item is one of ``items``, of no size.
+        items, size: largest numbers of waiting items and bytes; a single item may be larger.
+        measure: returns kind, count and bytes of an item, or None to ignore it. By default an item
+            has the kind ``items``, the count 1 and no bytes.
         kinds: all kinds that `measure` returns.
         urgent: kinds for which `take` returns at once.
         gather_s: time for which `take` gathers items that are not urgent, s.
 
     Attributes:
-        taking: Whether a reader takes items; if not, `wait_for_room` returns at once.
+        taking: True while a reader takes items; if False, `wait_for_room` returns at once.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class BoundedQueue(Generic[T]):
         self._seen = self._count_items()
 
     def put(self, item: T) -> None:
-        """Add an item; drop the oldest items if necessary."""
+        """Append an item; drop the oldest items if the queue is over its limits."""
         found = self._measure(item)
         if found is None:
             return
@@ -114,7 +114,7 @@ class BoundedQueue(Generic[T]):
                 self._changed.notify_all()
 
     def get(self, timeout: float | None = None) -> T | None:
-        """Take the oldest item, waiting for one if necessary; None: timeout or closed."""
+        """Remove and return the oldest item; wait if empty. Return None on timeout or closure."""
         with self._lock:
             if not self._queue:
                 self._wait(lambda: self._queue or self._closed, timeout)
@@ -130,7 +130,7 @@ class BoundedQueue(Generic[T]):
             return item
 
     def take(self, timeout: float | None = None) -> list[T]:
-        """Take all waiting items, waiting for one if necessary; empty: timeout or closed."""
+        """Remove and return all items; wait if empty. Return [] on timeout or closure."""
         with self._lock:
             if not self._queue:
                 self._wait(lambda: self._queue or self._closed, timeout)
@@ -150,16 +150,16 @@ class BoundedQueue(Generic[T]):
             return items
 
     def wait_for_room(self, timeout: float | None = None) -> None:
-        """Wait until the queue is at most half full, not read, closed, or timed out."""
+        """Wait until the queue is at most half full, or closed, or has no reader."""
         if not self._has_room():  # checked without the lock, so as not to delay busy writers
             with self._lock:
                 self._wait(self._has_room, timeout)
 
     def close(self, drop: bool = False) -> None:
-        """Accept no more items; `get` and `take` wait no more.
+        """Close the queue: drop all later items, and wake up the reader and the writers.
 
         Args:
-            drop: whether to drop the waiting items, too; else they can still be taken.
+            drop: whether to drop the waiting items, too; otherwise they can still be read.
         """
         with self._lock:
             self._closed = True
@@ -180,7 +180,7 @@ class BoundedQueue(Generic[T]):
 
     @property
     def state(self) -> QueueState:
-        """Present counts. If a thread hangs with the lock, those of the last call are given."""
+        """Current counts; the previous ones if another thread holds the lock for `LOOK_S`."""
         if self._lock.acquire(timeout=LOOK_S):
             try:
                 self._seen = self._count_items()
@@ -198,7 +198,7 @@ class BoundedQueue(Generic[T]):
         )
 
     def _wait(self, until: Callable[[], object], timeout: float | None) -> None:
-        """Wait for a condition, as one of the threads that `put` and others notify."""
+        """Wait until a condition holds; count this thread as waiting, so that `put` notifies it."""
         self._waiting += 1
         try:
             self._changed.wait_for(until, timeout)

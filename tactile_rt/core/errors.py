@@ -24,12 +24,12 @@ def name_some(items: Iterable[str], most: int = 3, between: str = ", ") -> str:
 
 
 def length(message: str) -> int:
-    """Count the characters of a message: at most 40 per word, none for a path."""
+    """Count a message's characters, at most 40 per word and none of a path."""
     return sum(min(len(word), WORD // 2) + 1 for word in message.split(" ") if "/" not in word)
 
 
 def shorten(message: str) -> str:
-    """Shorten a message that is too long: first words that are no paths, then all."""
+    """Cut the middle out of long words, except paths, then out of a long message."""
     words = [
         word if len(word) <= WORD or "/" in word else f"{word[:30]}...{word[-20:]}"
         for word in message.split(" ")
@@ -63,7 +63,7 @@ class ModelError(TactileError):
 
 
 def describe_error(error: BaseException, most: int | None = None) -> str:
-    """Describe an error in one line: by its message, or by its type if without.
+    """Return an error's message in one line, or its type if it has no message.
 
     Args:
         most: Largest number of characters of the message.
@@ -75,10 +75,10 @@ def describe_error(error: BaseException, most: int | None = None) -> str:
 def explain_errors(
     kind: type[TactileError], before: str, after: str = ")", most: int | None = None
 ) -> Iterator[None]:
-    """Turn any error in the block into `kind`, with its message between two texts.
+    """Convert any error in the block to `kind`; a `TactileError` passes unchanged.
 
     Args:
-        most: Largest number of characters of the message.
+        before, after, most: Texts around the error's message, and its largest length, characters.
     """
     try:
         yield

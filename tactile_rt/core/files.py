@@ -32,7 +32,7 @@ def check_no_pointer(path: Path) -> None:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a regular file to read. Refuse a pipe, socket or device without waiting.
+    """Open a regular file for reading. Refuse a pipe, socket or device without waiting.
 
     Raises:
         ConfigError: the file is a Git LFS pointer.
@@ -58,10 +58,10 @@ def _check_regular(path: Path, status: os.stat_result) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder to the medium, so that its files' names survive a power cut.
+    """Sync a folder to the disk, so that its files' names survive a power cut.
 
     Raises:
-        OSError: the medium failed, or no such folder exists.
+        OSError: the disk failed, or no such folder exists.
     """
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -77,13 +77,13 @@ def sync_folder(folder: Path) -> None:
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file by `write(file)`; it gets its name only when complete.
+    """Write a file atomically by `write(file)`: it gets its name only when complete.
 
     Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder. After a failure nothing has
     changed. A path that is no regular file, as ``/dev/null`` or a pipe, is written to directly.
 
     Raises:
-        OSError: names `path`: its folder cannot be written into, or the medium is full.
+        OSError: names `path`: its folder cannot be written into, or the disk is full.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
         try:
@@ -99,7 +99,7 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 @contextmanager
 def _write_hidden(path: Path, hidden: Path, mode: str) -> Iterator[BinaryIO]:
-    """Yield a hidden file that takes its name when the block ends without an error."""
+    """Yield a new file `hidden`; rename it to `path` when the block succeeds."""
     try:
         with cast(BinaryIO, hidden.open(mode)) as file:
             yield file
@@ -116,7 +116,7 @@ def _hide_name(path: Path) -> Path:
 
 
 def _raise_for(error: BaseException, hidden: Path, path: Path) -> None:
-    """Raise an OSError that names the hidden file, or none, as one of `path`. Ignore others."""
+    """Raise an OSError that names `hidden`, or no file, as one of `path`. Ignore other errors."""
     if not isinstance(error, OSError) or not error.errno:
         return
     named = error.filename  # a number if the file was opened by its descriptor
@@ -126,13 +126,13 @@ def _raise_for(error: BaseException, hidden: Path, path: Path) -> None:
 
 @contextmanager
 def replace_file(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file that is synced and takes its name when the block ends.
+    """Yield a new file, which is synced and replaces `path` when the block succeeds.
 
-    Until then it is ``STEM.partial`` beside it, so that killed processes leave at most one; the
+    Until then it is called ``STEM.partial``, so that killed processes leave at most one; the
     folder must be locked (`locks.alone_in`). If the block fails, nothing has changed.
 
     Raises:
-        OSError: names `path`: the medium is full, or failed.
+        OSError: names `path`: the disk is full, or failed.
     """
     with _write_hidden(path, path.with_suffix(".partial"), "wb") as file:
         yield file
@@ -142,12 +142,12 @@ def replace_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a folder to fill, which replaces the one at `path` when the block ends.
+    """Yield a new folder to fill, which replaces `path` when the block succeeds.
 
     Until then it is hidden: ``.NAME.XXXXXXXX`` beside it. If the block fails, nothing has changed.
 
     Raises:
-        OSError: names `path` or a file in it; for example, the medium is full.
+        OSError: names `path` or a file in it; for example, the disk is full.
     """
     made = _hide_name(path)
     try:

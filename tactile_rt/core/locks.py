@@ -19,25 +19,25 @@ from urllib.parse import unquote, urlsplit
 from tactile_rt.core.errors import ConfigError, TactileError
 
 DEVICES = ("serial", "can")
-TRIES = 20  # to lock a name whose holder does not answer: it has just begun, or has just ended
+TRIES = 20  # to lock a name whose holder does not answer: it has just started, or has just ended
 PAUSE_S = 0.01
 CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
-WAITING = 4096  # length of the queue of processes that asked for the pid: it is never emptied
+WAITING = 4096  # length of the queue of processes that request the pid: it is never emptied
 
 
 class AlreadyRunning(TactileError):
-    """Another process has locked the configuration or device; the message names it."""
+    """Another process has locked the configuration, device or folder; the message names it."""
 
 
 def lock_keys(config: Path, urls: list[str]) -> list[str]:
-    """List the locks of a daemon: its configuration, and every device."""
-    # By its given name, too: a link may lead to another file when a second daemon starts.
+    """List the lock keys of a daemon, for its configuration and each device."""
+    # The given name is locked, too: a link may lead to another file when a second daemon starts.
     paths = [os.path.realpath(config), os.path.abspath(config)]
     return list(dict.fromkeys([*(f"configuration {p}" for p in paths), *device_keys(urls)]))
 
 
 def device_keys(urls: list[str]) -> list[str]:
-    """List the locks of the devices of some sources. Two names of a port are one device."""
+    """List the lock keys of the devices in some URLs. Links to one port give one key."""
     keys = []
     for url in urls:
         parts = urlsplit(url, allow_fragments=False)
@@ -56,11 +56,11 @@ def device_keys(urls: list[str]) -> list[str]:
 def alone_in(folder: Path) -> Iterator[None]:
     """Lock a folder for this process while the block runs.
 
-    It need not exist yet, and links to it are resolved. Only processes of one computer see locks.
+    The folder need not exist yet; links are resolved. Only processes of one computer see the lock.
 
     Raises:
         ConfigError: another process has locked the folder.
-        TactileError: as `Locks.hold`.
+        TactileError: the kernel refuses the lock; see `Locks.hold`.
     """
     locks = Locks()
     try:
@@ -74,7 +74,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 class Locks:
-    """Locks that are held until they are closed, or the process ends in any way."""
+    """Named locks of this process, which the kernel releases when the process ends."""
 
     def __init__(self) -> None:
         self._held: dict[str, socket.socket] = {}
@@ -83,7 +83,7 @@ class Locks:
         """Hold exactly these locks: acquire the missing ones, then release all others.
 
         Raises:
-            AlreadyRunning: another process has one; the locks held before are still held.
+            AlreadyRunning: another process holds one of them; this process keeps its present locks.
             TactileError: the kernel refuses a lock, for example because it forbids Unix sockets.
         """
         got: dict[str, socket.socket] = {}
@@ -126,14 +126,14 @@ def _lock(key: str) -> socket.socket:
 
 
 def _make_name(key: str) -> bytes:
-    """Make a lock's socket name; it differs in a container, where paths differ, too."""
+    """Return a lock's socket name, which differs between containers, as their paths do."""
     root = os.stat("/")
     text = f"{root.st_dev} {root.st_ino} {key}"
     return b"\0tactile-rt/" + hashlib.sha256(os.fsencode(text)).hexdigest()[:32].encode()
 
 
 def _describe_holder(name: bytes) -> str:
-    """Describe the process that listens at a name, by the kernel's credentials."""
+    """Describe the holder of a lock by the pid and user that the kernel reports."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
         try:

@@ -37,12 +37,12 @@ SOURCES = "tactile_rt.sources"
 
 
 def added_names(group: str) -> tuple[str, ...]:
-    """List the names that other packages add to a group, sorted. Nothing is imported."""
+    """List the names that other packages add to an entry-point group; import nothing."""
     return tuple(sorted(metadata.entry_points(group=group).names))
 
 
 def import_addition(group: str, name: str) -> Any:
-    """Import the object that another package adds to a group by this name, or None.
+    """Import the object that another package adds by this name; return None if none does.
 
     Raises:
         ConfigError: The import fails; the message names the package.
@@ -58,16 +58,16 @@ def import_addition(group: str, name: str) -> Any:
 
 
 def install_extra(extra: str) -> str:
-    """Return the command that adds an extra to this installation, such as ``sim,view``."""
+    """Return the shell command that installs extras, such as ``sim,view``."""
     if (ROOT / "pyproject.toml").is_file():
         return install_line(f"{ROOT}[{extra}]", "--editable ")
     return install_line(f"tactile-rt[{extra}]")
 
 
 def install_line(requirement: str, option: str = "") -> str:
-    """Return the command that installs a package for the running Python.
+    """Return the shell command that installs a package for the running Python.
 
-    It is one of uv where the environment has no pip, as one that uv made.
+    The command uses uv if the environment has no pip, as environments made by uv.
     """
     python = Path(sys.executable)
     if find_spec("pip") is None:
@@ -82,7 +82,7 @@ def install_line(requirement: str, option: str = "") -> str:
 
 @contextmanager
 def require_extra(what: str, extra: str) -> Iterator[None]:
-    """Raise the error of `lacking` if an import in the block fails."""
+    """Turn a failed import in the block into an error that names the extra."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -90,7 +90,7 @@ def require_extra(what: str, extra: str) -> Iterator[None]:
 
 
 def lacking(what: str, extra: str, error: ModuleNotFoundError) -> ConfigError:
-    """Make an error for a failed import that names the package and its installation.
+    """Make a `ConfigError` that names a missing package and the command that installs it.
 
     Args:
         what: The words before the package's name, such as "recordings need".

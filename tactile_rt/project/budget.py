@@ -24,8 +24,8 @@ from tactile_rt.sim_backend.transducer import device_spec
 
 SWEEPS_SHARE = 0.45  # of the given time; training gets about as much, and the report the rest
 PILOTS = 5  # sweeps that are timed
-AT_ONCE = 0.85  # share of its speed that each further core adds
-ENOUGH = 60  # objects of a category, before each is swept more often
+AT_ONCE = 0.85  # speed that each further core adds, in parts of the first core's
+ENOUGH = 60  # objects of a category above which each object is swept more often
 FEWEST = 5  # objects of a category: three for training, one for validation, one for test
 TEST_OBJECTS = 60  # of all categories together, if there is time for them
 TEST_SHARE, VALIDATION_SHARE = 0.18, 0.12  # of the objects of a category
@@ -36,8 +36,8 @@ class Budget(msgspec.Struct, forbid_unknown_fields=True):
     """The numbers of objects, sweeps and updates chosen for a project.
 
     Attributes:
-        per_category, validation, test: The number of objects of a category, and of those held out.
-        updates: The number of training updates; 0: not chosen yet.
+        per_category, validation, test: Objects per category: in all, for validation, for test.
+        updates: Number of training updates; 0 until it is chosen.
     """
 
     described: str  # fingerprint of array.toml and sweeps.toml
@@ -49,7 +49,7 @@ class Budget(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_budget(project: Project) -> Budget | None:
-    """Return the stored budget of a project; None if it has none yet."""
+    """Return the stored budget of a project, or None if none is stored yet."""
     path, anew = project.build / "budget.json", f"remove {project.build} to begin anew"
     if not path.exists():
         return None
@@ -73,7 +73,7 @@ def write_budget(project: Project, budget: Budget) -> None:
 
 
 def budget_sweeps(project: Project, seconds: float) -> Budget:
-    """Time some sweeps, and return a budget of objects and sweeps that fit."""
+    """Time some sweeps; return the budget that fits if all stages take `seconds`."""
     recipe = project.recipe()
     each_s = _time_sweep(recipe)
     cores = 1 + AT_ONCE * ((os.cpu_count() or 1) - 1)
@@ -101,7 +101,7 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
 
 
 def apply_budget(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
-    """Return the recipe with the budget's numbers of objects and sweeps."""
+    """Return a copy of the recipe with the budget's numbers of objects and sweeps."""
     objects = recipe.objects
     if budget.test:
         counts = {k: getattr(budget, k) for k in ("per_category", "validation", "test")}
@@ -110,7 +110,7 @@ def apply_budget(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
 
 
 def _time_sweep(recipe: SweepRecipe) -> float:
-    """Return the mean time of a sweep in s, without the first, which compiles."""
+    """Simulate some sweeps; return their mean time, s, without the first, which compiles."""
     objects = choose_objects(recipe.objects)
     names = objects.split["train"][: PILOTS + 1]
     times = []

@@ -45,13 +45,13 @@ RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
 NO_NAME = re.compile(r"[^\w.+-]+")  # characters with a meaning of their own in a URL or TOML
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
-# mm/s, for objects of 40 mm. Larger ones are faster: a window then covers as much of the array.
+# mm/s, for objects of 40 mm. Larger objects move faster: a window then covers as much of the array.
 SPEEDS = (28, 40)
 
 
 @dataclass(frozen=True)
 class DeviceLine:
-    """The line from which a project's robot reads its device.
+    """Serial port or CAN bus of a project's device, and the codec that reads it.
 
     Attributes:
         wire: ``serial`` or ``can``.
@@ -65,7 +65,7 @@ class DeviceLine:
 
 
 class Project:
-    """The folder of a project.
+    """Project folder: an array, its sweeps, its robot, and the model made for them.
 
     Attributes:
         array: The file that describes the array, array.toml.
@@ -88,21 +88,21 @@ class Project:
         self.build, self.report = folder / "build", folder / "report"
 
     def write_spec(self) -> None:
-        """Write array.json, the array as sources and models describe it."""
+        """Write the array's spec, which devices and models must match, into array.json."""
         spec = device_spec(load_animals(str(self.array)))
         _write(self.folder / "array.json", spec.to_json())
 
     def recipe(self) -> SweepRecipe:
-        """Read the sweep recipe; its numbers of objects and sweeps are upper limits."""
+        """Read sweeps.toml; its numbers of objects and sweeps are upper limits."""
         recipe = read_recipe(str(self.folder / "sweeps.toml"), self.folder)
         if Path(recipe.array).resolve() != self.array.resolve():
             raise ConfigError(f'{self.folder / "sweeps.toml"}: array must be "array.toml"')
         return recipe
 
     def source_url(self, objects: Sequence[str], seed: int = 0, **options: object) -> str:
-        """Return the ``sim:`` URL of the array with these objects, as its device reads it.
+        """Return the ``sim:`` URL of a source that sweeps these objects past the array.
 
-        The objects are swept past the array as sweeps.toml says.
+        The sweeps are as in sweeps.toml, the samples as the array's device measures them.
         """
         meshes = choose_objects(self.recipe().objects).mesh_options
         recipe = self.folder / "sweeps.toml"
@@ -112,7 +112,7 @@ class Project:
         return f"sim:{quote(str(self.array))}?{query}"
 
     def unseen(self) -> tuple[str, ...]:
-        """Return objects that the model was not trained on, named as in ``sim:`` URLs.
+        """List the objects that the model was not trained on, named as in ``sim:`` URLs.
 
         Without a model, these are the test objects of sweeps.toml.
         """
@@ -123,7 +123,7 @@ class Project:
         return tuple(objects.target(name) for name in names)
 
     def full_scale(self, codec: str) -> dict[str, str]:
-        """Return range options of the native codec from the sensor; empty for other codecs."""
+        """Return the sensor's ranges as options of the native codec; {} for other codecs."""
         sensor = sensor_of(load_animals(str(self.array)))
         if codec != "native" or sensor is None:
             return {}
@@ -134,7 +134,7 @@ class Project:
         return {name: f"{value:g}" for name, value in largest.items()}
 
     def line(self) -> DeviceLine:
-        """Return the line and codec of the first source in robot.toml."""
+        """Return the port or bus, and the codec, of the first source in robot.toml."""
         file = self.folder / "robot.toml"
         url = load_config(file).config.source[0].url
         scheme, target, fields = split_url(url)
@@ -153,8 +153,8 @@ class Project:
         """Return the name of the device's codec, and the codec's options.
 
         Args:
-            codec: replaces that of robot.toml.
-            options: replace those of robot.toml, or add to them.
+            codec: name that replaces the codec of robot.toml.
+            options: options that replace those of robot.toml, or are added to them.
         """
         line = self.line()
         codec = codec or line.codec
@@ -166,8 +166,8 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
     """Create a project in a new or an empty folder.
 
     Args:
-        array: name of an array, or a .toml file. A file, or that of a robot's array, is copied.
-            Empty: an example, eight nylon whiskers on a plate, to be edited.
+        array: name of an array, or a .toml file. The file, also of a named robot's array, is
+            copied. Empty for an example to edit: eight nylon whiskers on a plate.
 
     Raises:
         ConfigError: the folder is not empty, the array or a category is unknown, or the array

@@ -58,11 +58,11 @@ Splits = tuple[SweepSet, SweepSet]
 
 @dataclass(frozen=True)
 class MakeProgress:
-    """The progress of making a project.
+    """Progress of a stage of `make`.
 
     Attributes:
-        done, of: The finished amount and the total amount of the stage called ``name``.
-        left_s: The rest of the given time, for all stages, s.
+        done, of: Finished amount and total amount of the stage called ``name``.
+        left_s: Time left for all stages, s.
     """
 
     name: str
@@ -79,7 +79,7 @@ Tell = Callable[[MakeProgress], None]
 
 
 def preview_sweeps(project: Project, picture: Path) -> dict[str, Tally]:
-    """Simulate and count some sweeps of each kind; draw the first touches (.png)."""
+    """Simulate some sweeps per kind; return counts, and draw the first touches into `picture`."""
     recipe, end = project.recipe(), time.monotonic() + PREVIEW_S
     objects, animals = choose_objects(recipe.objects), load_animals(recipe.array)
     kinds: dict[str, list[str]] = {}
@@ -126,9 +126,9 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
         tell(MakeProgress("timing sweeps", 0, 1, 60 * minutes))
         budget = budget_sweeps(project, 60 * minutes)
         write_budget(project, budget)
-    begun = end - 60 * minutes
-    sweeps = _sweep(project, budget, begun + SWEPT_BY * 60 * minutes, end, tell)
-    best = _train(project, budget, sweeps, begun + TRAINED_BY * 60 * minutes, end, tell)
+    start = end - 60 * minutes
+    sweeps = _sweep(project, budget, start + SWEPT_BY * 60 * minutes, end, tell)
+    best = _train(project, budget, sweeps, start + TRAINED_BY * 60 * minutes, end, tell)
     tell(MakeProgress("exporting", 0, 1, end - time.monotonic()))
     project.write_spec()
     release(best, project.model, project.folder.resolve().name)
@@ -141,7 +141,7 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
 
 
 def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tell) -> Path:
-    """Make the sweep set, or as much as time permits; return its folder."""
+    """Make the sweep set, or the part that time permits; return its folder."""
     folder = project.build / "sweeps"
     recipe = apply_budget(project.recipe(), budget)
     manifest = describe_set(recipe)
@@ -203,7 +203,7 @@ def _train(
 
 
 def _time_update(project: Project, config: TrainingConfig, splits: Splits) -> float:
-    """Return the time of an update in s, with its share of validation."""
+    """Run some training updates; return the time of one, s, with its share of validation."""
     at: list[float] = []
     with TemporaryDirectory(dir=project.build) as folder:
         pilot = replace(config, updates=PILOT)

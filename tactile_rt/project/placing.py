@@ -21,13 +21,13 @@ _make_object = lru_cache(2 * TRIALS)(make_object)  # the same objects pass at ev
 
 @dataclass(frozen=True)
 class ObjectPlacing:
-    """Sizes and places of objects that touch an array.
+    """Size and places of objects that touch an array.
 
     Attributes:
-        size_mm: The largest extent of an object.
-        distance_mm: The least and the largest distance from the bases of the whiskers.
-        height_mm: The least and the largest height.
-        touching: The share of sweeps at these places in which an object touches a whisker.
+        size_mm: Largest extent of an object.
+        distance_mm: Least and largest distance from the bases of the whiskers.
+        height_mm: Least and largest height.
+        touching: Share of sweeps at these places in which an object touches a whisker.
     """
 
     size_mm: float
@@ -37,7 +37,7 @@ class ObjectPlacing:
 
 
 def place_objects(animals: tuple[WhiskerArray, ...], kinds: Sequence[str]) -> ObjectPlacing:
-    """Find sizes and places at which nearly all sweeps touch; else those where most do.
+    """Find the farthest places at which nearly all sweeps touch, or else most sweeps.
 
     Objects are as large as the tips are apart, at the height of the tips, and no nearer than
     needed: nearer objects jam stiff whiskers.
@@ -66,7 +66,7 @@ def _share_touching(
     distance_mm: tuple[float, float],
     height_mm: tuple[float, float],
 ) -> float:
-    """Return the share of sweeps of new objects that touch, without a simulation."""
+    """Return the share of random sweeps in which an object touches; no sweep is simulated."""
     rng, touching = np.random.default_rng(0), 0
     for number in range(TRIALS):
         distance, height = float(rng.uniform(*distance_mm)), float(rng.uniform(*height_mm))

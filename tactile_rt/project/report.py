@@ -31,11 +31,11 @@ HEADLINES = {
     "calibration error": "how far its probabilities are from what they promise",
     "time to the final decision": "from the first touch until the decision stands",
 }
-CONFUSED = 0.05  # least share of a kind's sweeps taken for another that is reported
+CONFUSED = 0.05  # least share of a kind's sweeps decided as another kind that is reported
 
 
 def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> Path:
-    """Write ``report/report.html`` and confusion.png beside the pictures of `evaluate_model`."""
+    """Write ``report/report.html`` and its confusion.png; return the path of the page."""
     session, card = load_model(project.model)
     test = SweepSet.read(sweeps, "test")
     run = measures.run_steps(session, card)
@@ -72,7 +72,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
 def list_confusions(
     table: NDArray[np.int64], labels: Sequence[str], share: float = CONFUSED
 ) -> list[tuple[str, str, float]]:
-    """Return (kind, kind it is taken for, share of its sweeps), worst first.
+    """List frequent confusions, worst first: (true kind, decided kind, share of true kind).
 
     Args:
         table: counts of sweeps, shape (true, decided).

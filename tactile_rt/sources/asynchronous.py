@@ -10,14 +10,14 @@ from contextlib import suppress
 
 from tactile_rt.core.stream import Chunk, EndOfStream, Source
 
-LOOK_S = 0.1  # longest wait until a source is read again although no data came
+LOOK_S = 0.1  # longest wait for data before a source is read again
 
 
 async def chunks(source: Source) -> AsyncIterator[Chunk]:
-    """Yield the chunks of a source as they come, until it ends. The caller closes it.
+    """Yield the chunks of a source as they come, until it ends. The caller closes the source.
 
-    If the source has a file descriptor, the loop waits for that and no thread is needed. A source
-    without one, or with a lost line, is read in a thread, 0.1 s at a time.
+    If the source has a file descriptor, the event loop waits for it, without a thread. A source
+    without a descriptor, or with a lost line, is read in a thread, 0.1 s at a time.
 
     Raises:
         SourceError: the device broke.

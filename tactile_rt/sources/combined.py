@@ -47,12 +47,12 @@ SLICE_S = 0.005
 
 
 class MemberArray(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One of several arrays to combine.
+    """Array to combine with others: the URL of its source, and its pose.
 
     Attributes:
-        name: The name of the array, put before the names of its elements.
+        name: Name of the array, put before the names of its elements.
         position: Origin of the array's mount frame in the combined mount frame, m.
-        orientation: Unit quaternion (w, x, y, z) that turns the array's mount frame into the
+        orientation: Unit quaternion (w, x, y, z) that rotates the array's mount frame into the
             combined one.
     """
 
@@ -73,7 +73,7 @@ _READING: ContextVar[tuple[str, ...]] = ContextVar("_READING", default=())
 
 
 def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
-    """Prepare to open the arrays that a TOML file lists.
+    """Check a TOML file of arrays to combine; return a `Prepared` that opens them.
 
     Raises:
         ConfigError: the file cannot be read, is not of the layout above, or a URL in it is wrong.
@@ -117,7 +117,7 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
 def combine_specs(
     specs: list[ArraySpec], parts: Sequence[MemberArray], name: str, rate_hz: float
 ) -> ArraySpec:
-    """Combine specs into one, with each array's rows below those of the previous array.
+    """Combine array specs into one, with each array's grid rows below the previous array's.
 
     Raises:
         ConfigError: the arrays do not measure the same channels, or two have one name.
@@ -134,11 +134,11 @@ def combine_specs(
     for spec, part in zip(specs, parts, strict=True):
         grid += [(rows + r, c) for r, c in spec.grid]
         rows += spec.grid_shape[0]
-        turn = np.array(part.orientation)
-        if abs(np.linalg.norm(turn) - 1) > 1e-6:
+        orient = np.array(part.orientation)
+        if abs(np.linalg.norm(orient) - 1) > 1e-6:
             raise ConfigError(f"{part.name}: orientation {part.orientation} is no unit quaternion")
-        positions += [tuple(rotation_matrices(turn) @ p + part.position) for p in spec.positions]
-        orientations += [tuple(quaternion_product(turn, q)) for q in spec.orientations]
+        positions += [tuple(rotation_matrices(orient) @ p + part.position) for p in spec.positions]
+        orientations += [tuple(quaternion_product(orient, q)) for q in spec.orientations]
     return replace(
         specs[0],
         name=name,
@@ -155,7 +155,7 @@ def combine_specs(
 
 @dataclass
 class _Feed:
-    """State of one source on the common time grid."""
+    """Resampler and undelivered samples of one source of a `CombinedSource`."""
 
     source: Source
     resampler: Resampler
@@ -166,10 +166,10 @@ class _Feed:
 
 
 class CombinedSource(Source):
-    """Source of the samples of several sources, resampled to common times.
+    """Source that joins the samples of several sources, resampled to common times.
 
     An array that is more than 0.2 s behind, lost or at its end is left out: its elements are
-    invalid until it comes again. The stream ends when all sources have ended.
+    invalid until its samples come again. The stream ends when all sources have ended.
 
     Args:
         sources: The sources to combine; closed with this one.
@@ -213,7 +213,7 @@ class CombinedSource(Source):
             source.close()
 
     def _read_on(self, patience_s: float) -> None:
-        """Read the source that is furthest behind; if it has no samples, the others too."""
+        """Read the source that is furthest behind, then the others until one has samples."""
         running = [feed for feed in self._feeds if not feed.ended]
         running.sort(key=lambda feed: -1 if feed.newest is None else feed.newest)
         for feed in running:
@@ -242,17 +242,17 @@ class CombinedSource(Source):
         return True
 
     def _take_ready(self) -> Chunk | None:
-        """Return the samples that are complete, or whose missing sources lag too far."""
-        begun = [feed.newest for feed in self._feeds if feed.newest is not None]
-        if not begun:
+        """Remove and return the combined samples that are complete or overdue."""
+        reached = [feed.newest for feed in self._feeds if feed.newest is not None]
+        if not reached:
             return None
         if self._next is None:
             waiting = any(f.newest is None and not f.ended for f in self._feeds)
-            span = max(begun) - min(min(f.rows) for f in self._feeds if f.rows)
+            span = max(reached) - min(min(f.rows) for f in self._feeds if f.rows)
             if waiting and span * self._period_ns < LATEST_NS:
                 return None
             self._next = self._first = max(min(f.rows) for f in self._feeds if f.rows)
-        newest = max(begun)
+        newest = max(reached)
         behind = LATEST_NS // self._period_ns
         ready = min(
             newest if f.ended else max(newest - behind, -1 if f.newest is None else f.newest)

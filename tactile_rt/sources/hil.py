@@ -46,7 +46,7 @@ SAME_EPISODE_NS: Final = 100_000_000  # largest difference between onsets of the
 
 @dataclass(frozen=True)
 class LoopReport:
-    """Result of a loop, in numbers of samples and decisions."""
+    """Result of a hardware-in-the-loop test: counts of samples and decisions on both paths."""
 
     samples: int
     identical_samples: int  # with the same bits
@@ -55,8 +55,8 @@ class LoopReport:
     identical: int  # decisions with the same bits on both paths, except for latency
     same_label: int  # decisions of the same touch and step with the same label
     finals: int  # last decisions of a touch on the direct path
-    finals_same: int  # those of them with the same label on both paths
-    passed: int  # simulated objects that passed; 0 if the source does not know them
+    finals_same: int  # last decisions of a touch with the same label on both paths
+    passed: int  # simulated objects that passed; 0 if the source does not report them
     right: int  # objects whose first touch ended, on the driver's path, with the right name
     exact: bool  # whether all decisions must be identical; else 99 % must have the same label
     faulty: bool  # whether faults were injected: then only the counts of losses must be right
@@ -72,7 +72,7 @@ class LoopReport:
 
     @property
     def failure(self) -> str:
-        """Requirement that is not met; empty: none."""
+        """Message about the requirement that is not met; empty if all are met."""
         decisions = max(self.direct, self.wire)
         if not self.accounted:
             return f"{self.sent} packets were sent, and the driver's account does not add up"
@@ -90,7 +90,7 @@ class LoopReport:
 
 
 class _Tee(Source):
-    """Source that also keeps its chunks."""
+    """Source that returns another source's chunks and stores them in `kept`, too."""
 
     def __init__(self, inner: Source) -> None:
         super().__init__(inner.spec)
@@ -108,7 +108,7 @@ class _Tee(Source):
 
 
 class Loop:
-    """Comparison of a source's direct path with that through an emulated device and its driver.
+    """Test that compares a model's decisions with and without an emulated device and driver.
 
     Args:
         source: The signal that the device measures; the loop closes it.
@@ -118,7 +118,7 @@ class Loop:
         seconds: Length of the source's stream to send, s; None to send all.
 
     Attributes:
-        complete: Whether the loop has run to the end; only then is a report judged.
+        complete: True once the loop has run to its end; until then, reports are partial.
 
     Raises:
         ConfigError: an unknown wire, codec or option.
@@ -164,7 +164,7 @@ class Loop:
         self.complete = False
 
     def run(self) -> LoopReport:
-        """Run to the source's end, or to an interrupt, after which `report` gives partial results.
+        """Run to the end of the source; return the report. After an interrupt, call `report`.
 
         Raises:
             SourceError: the source, the device or the driver broke.
@@ -196,7 +196,7 @@ class Loop:
         return self.report()
 
     def report(self) -> LoopReport:
-        """Return the result of the loop so far."""
+        """Return the counts of the samples and decisions so far."""
         driver: Any = self._driver
         if driver is None:
             raise SourceError("the loop has not been closed: there is nothing to report")
@@ -224,18 +224,18 @@ class Loop:
 
     @property
     def _passes(self) -> "list[tuple[int, str]]":
-        """Start of each object's pass, in the driver's time, ns, and its class."""
+        """Start time (driver's clock, ns) and class of each object's pass."""
         began_ns, class_of = self._first_ns or 0, self._direct.card.class_of
         passes = getattr(self._tee.inner, "passes", ())
         return [(p.start_ns - began_ns, class_of.get(p.category, p.category)) for p in passes]
 
     def _space_evenly(self, chunk: Chunk, numbers: NDArray[np.int64]) -> Chunk:
-        """Return a chunk whose samples, of these numbers, are a period apart."""
+        """Return the chunk with new times: the sample numbers times the sample period."""
         t_ns = np.round(numbers * self._period_ns).astype(np.int64)
         return Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
 
     def _push_direct(self) -> None:
-        """Push the samples that the device has taken since into the direct classifier."""
+        """Classify, on the direct path, the new samples that the device has read."""
         while self._tee.kept:
             chunk = self._tee.kept.popleft()
             if self._first_ns is None:
@@ -251,7 +251,7 @@ class Loop:
             self._decided[0].extend(self._direct.push(chunk))
 
     def _compare(self, chunk: Chunk) -> None:
-        """Compare received samples with sent ones of the same number."""
+        """Count the received samples that are identical to the sent ones of equal number."""
         for i, number in enumerate(chunk.seq.tolist()):
             while self._pending and self._pending[0][0] + len(self._pending[0][1]) <= number:
                 self._pending.popleft()
@@ -266,7 +266,7 @@ class Loop:
 
 
 def check_line(wire: str, codec: str, options: dict[str, str]) -> None:
-    """Refuse a line that `Loop` cannot emulate, before a source is opened.
+    """Refuse a wire, a codec or options that `Loop` cannot emulate.
 
     Raises:
         ConfigError: an unknown wire, codec or option.
@@ -293,7 +293,7 @@ def named_right(passes: Sequence[tuple[int, str]], decisions: Sequence[Classific
 def pair(
     direct: Sequence[Classification], wire: Sequence[Classification]
 ) -> list[tuple[Classification, Classification]]:
-    """Pair the decisions of both paths on the same step of the same touch."""
+    """Pair the decisions of both paths that belong to the same touch and step."""
     by_step: dict[int, list[Classification]] = {}
     for decision in wire:
         by_step.setdefault(decision.step, []).append(decision)

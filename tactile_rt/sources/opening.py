@@ -23,10 +23,10 @@ from tactile_rt.core.settings import nearest, split_url, take_options
 from tactile_rt.core.stream import ArraySpec, Source
 from tactile_rt.drivers.opening import Prepared
 
-# scheme: (module, name, needed extra). The name is that of a class, made of the target and its
-# dataclass `Options`; its `check`, if any, takes both and returns the array without opening. Or it
-# is that of a function of the target and the options as text, which checks both and returns a
-# `Prepared`.
+# scheme: (module, name, needed extra). The name is that of a class, constructed from the target and
+# its dataclass `Options`; its `check`, if any, has these arguments and returns the array without
+# opening. Or the name is that of a function of the target and the options as text, which checks
+# both and returns a `Prepared`.
 SCHEMES = {
     "sim": ("tactile_rt.sim_backend.source", "SimSource", "sim"),
     "whisking": ("tactile_rt.sim_backend.whisking_source", "WhiskingSource", "sim"),
@@ -43,8 +43,8 @@ def open_source(url: str, *, calibration: str = "", array: str = "") -> Source:
     """Open the source that a URL names.
 
     Args:
-        calibration: a file, or the id of a calibrated device: it is applied to the samples.
-        array: a file of the array that the source is declared to be, if the URL names none.
+        calibration: file, or id of a device, whose calibration is applied to the samples.
+        array: file of the array that the source is declared to be, if the URL names none.
 
     Raises:
         ConfigError: unknown scheme, unknown or ill-typed option, or an extra is not installed.
@@ -55,11 +55,11 @@ def open_source(url: str, *, calibration: str = "", array: str = "") -> Source:
 
 
 def check_source(url: str, *, calibration: str = "", array: str = "") -> ArraySpec | None:
-    """Refuse a URL that `open_source` would refuse with any device. Nothing is opened except the
-    files that the URL names.
+    """Check a URL without opening a device; return the source's array. Refuse what `open_source`
+    would refuse with any device. Only files that the URL names are opened.
 
     Returns:
-        The array of the source; None if only the device knows it.
+        The array of the source, or None if only the device knows it.
     """
     return _prepare_source(url, calibration, array, check=True).spec
 
@@ -70,7 +70,7 @@ def is_made_up(url: str) -> bool:
 
 
 def check_model(model: Path, url: str) -> None:
-    """Refuse a model of another array than the URL's, if that array is known."""
+    """Refuse a model whose array differs from the URL's, if the URL's is known."""
     from tactile_rt.classifier.model_file import fit_source, read_model
 
     card, spec = read_model(model)[0], check_source(url)

@@ -38,7 +38,7 @@ class SyntheticOptions:
     Attributes:
         seconds: Length of the stream, s; 0 for an endless one.
         pace: ``realtime`` delivers samples when they are due, ``fast`` at once.
-        touches: Whether bumps pass over the array; if not, it is at rest, with noise only.
+        touches: True if bumps pass over the array; False for an array at rest, with noise only.
     """
 
     rate_hz: float = 1000.0
@@ -74,11 +74,11 @@ def synthetic_spec(elements: int, channels: int, rate_hz: float) -> ArraySpec:
 
 
 class SyntheticSource(Source):
-    """Half-sine bumps that pass over the array from row to row, with a little noise.
+    """Source of half-sine bumps that pass over an array row by row, with noise.
 
     Args:
-        size: ``ELEMENTSxCHANNELS``, e.g. ``35x6``; empty: ``5x6``; ``mouse`` for the array of the
-            model that comes with the package.
+        size: ``ELEMENTSxCHANNELS``, e.g. ``35x6``; empty for ``5x6``; ``mouse`` for the array of
+            the model that comes with the package.
     """
 
     Options = SyntheticOptions
@@ -96,7 +96,7 @@ class SyntheticSource(Source):
         self._sent, self._start_ns, self._closed = 0, -1, False
 
     def like(self, spec: ArraySpec) -> "SyntheticSource":
-        """Return a source of similar bumps on another array, at its rate and typical loads."""
+        """Return a synthetic source for another array, at that array's rate and typical loads."""
         source = SyntheticSource("", replace(self._options, rate_hz=spec.rate_hz))
         Source.__init__(source, spec)
         source._peak = np.array([LOADS.get(unit, 1.0) for unit in spec.units])
@@ -106,7 +106,7 @@ class SyntheticSource(Source):
 
     @staticmethod
     def check(size: str, options: SyntheticOptions) -> ArraySpec:
-        """Return the spec of a source, or raise the `ConfigError` that opening would raise."""
+        """Return the spec of the source, or raise the `ConfigError` that opening would raise."""
         return _make_spec(size, options)
 
     def read(self, timeout: float | None = None) -> Chunk | None:
@@ -135,7 +135,7 @@ class SyntheticSource(Source):
         self._closed = True
 
     def _make_values(self, t_s: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the values (n, element, channel) at times since the start, s."""
+        """Compute the samples (n, element, channel) at times (n,) since the start, s."""
         phase = (t_s[:, None] - self._at) % EVERY_S / BUMP_S  # (n, element)
         bump = np.where(phase < 1, np.sin(np.pi * np.minimum(phase, 1)), 0.0)
         share = np.cos(np.arange(len(self._peak)) * 1.1)  # channels differ in size and sign

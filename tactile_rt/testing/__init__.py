@@ -60,12 +60,12 @@ def cut_chunks(
 
 
 class ArraySource(Source):
-    """Source of chunks in memory: one per read, at once, then the end.
+    """Source that delivers chunks from memory, one per read, without waiting.
 
     Args:
         spec: Description of the samples.
         chunks: The chunks to deliver, in order.
-        live: Whether to claim to be a device, so that a `Session` reads in a thread of its own.
+        live: True to act as a device, which a `Session` reads in a thread of its own.
 
     Raises:
         ValueError: A chunk does not have the shape of `spec`.
@@ -77,7 +77,7 @@ class ArraySource(Source):
         for chunk in chunks:
             if chunk.values.shape[1:] != spec.shape:
                 raise ValueError(f"chunk of shape {chunk.values.shape}, not (n, *{spec.shape})")
-        self._left = list(chunks)[::-1]  # the next one last
+        self._left = list(chunks)[::-1]  # reversed: the next chunk is the last item
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         if not self._left:
@@ -108,8 +108,8 @@ class _SignalDevice(EmulatedDevice):
 
 
 class FakeSerial(_SignalDevice, EmulatedSerial):
-    """Device on a serial port, plugged in inside the ``with`` block: see `EmulatedSerial`. The
-    line's speed is unlimited, unless an option ``baud`` gives it.
+    """Emulated device on a serial port, plugged in during its ``with`` block. See
+    `EmulatedSerial`. The line's speed is unlimited, unless an option ``baud`` gives it.
 
     Args:
         signal: The measured signal: (n, element, channel) in SI units, or a source.
@@ -119,10 +119,10 @@ class FakeSerial(_SignalDevice, EmulatedSerial):
 
 
 class FakeCan(_SignalDevice, EmulatedCan):
-    """Device on a CAN bus, plugged in inside the ``with`` block: see `EmulatedCan`. The bus's speed
-    is unlimited, unless an option ``bitrate`` gives it.
+    """Emulated device on a CAN bus, plugged in during its ``with`` block. See `EmulatedCan`. The
+    bus's speed is unlimited, unless an option ``bitrate`` gives it.
 
-    The arguments are those of `FakeSerial`, and `EmulatedCan` has further options.
+    The arguments are those of `FakeSerial`; `further` are options of `EmulatedCan`.
     """
 
 

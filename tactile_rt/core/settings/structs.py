@@ -48,7 +48,7 @@ def convert(
     top: Any = None,
     lax: bool = False,
 ) -> Any:
-    """Convert the value at a path of a tree to a type.
+    """Convert the part of a settings tree at a path to the type `kind`.
 
     Args:
         top: the type of the whole tree, to recognize a table of the file that is nested wrongly;
@@ -72,14 +72,14 @@ def convert(
 
 
 def refusal(root: SettingNode, path: Sequence[str | int], why: str) -> ConfigError:
-    """Make the error for the value at a path."""
+    """Make the error about a value, from its file and line, its key, and `why`."""
     node, name = root.at(path), format_path(path)
     where = node.where if node.line or node.file != root.file else root.where
     return ConfigError(f"{where}: {name}: {why}" if name else f"{where}: {why}")
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Suggest a name for a message's end: ``did you mean X?``, or list known names."""
+    """Return ``did you mean X?`` for an unknown name, or a list of known names."""
     names = list(known)
     plain = {n.casefold(): n for n in names}
     near = difflib.get_close_matches(name.casefold(), plain, 1, 0.6)
@@ -92,12 +92,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:
-    """Make a whole message: ``no recipe 'defualt'; did you mean default?``"""
+    """Return an error message: ``no recipe 'defualt'; did you mean default?``"""
     return f"no {what} {name!r}; {nearest(name, known)}"
 
 
 def hint(key: str, known: Sequence[str]) -> str:
-    """Suggest the nearest key; with its unit in words if only the unit differs."""
+    """Suggest the known key nearest to `key`, with its unit if only the units differ."""
     for alike in ALIKE:
         found = re.search(rf"_({'|'.join(alike)})$", key.lower())
         if not found:
@@ -113,7 +113,7 @@ def hint(key: str, known: Sequence[str]) -> str:
 
 
 def types_of(kind: Any) -> dict[str, Any]:
-    """Return the types of a struct's or dataclass's keys, by the keys as written."""
+    """Return the types of a struct's or dataclass's keys, by their names in files."""
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         return {f.encode_name: f.type for f in msgspec.structs.fields(kind)}
     if dataclasses.is_dataclass(kind):
@@ -123,19 +123,19 @@ def types_of(kind: Any) -> dict[str, Any]:
 
 
 def is_list(kind: Any, path: Sequence[str | int]) -> bool:
-    """Return whether a path of a struct is a list of tables."""
-    return _find_struct(_kind_at(kind, path))[1]
+    """Return whether the type `kind` has a list of tables at a path."""
+    return _find_struct(_find_kind(kind, path))[1]
 
 
 def is_text(kind: Any, path: Sequence[str | int]) -> bool:
-    """Return whether a path of a struct is text."""
-    found = _strip_type(_kind_at(kind, path))
+    """Return whether the type `kind` has text at a path."""
+    found = _strip_type(_find_kind(kind, path))
     return found is str or (
         typing.get_origin(found) is Literal and isinstance(typing.get_args(found)[0], str)
     )
 
 
-def _kind_at(kind: Any, path: Sequence[str | int]) -> Any:
+def _find_kind(kind: Any, path: Sequence[str | int]) -> Any:
     for step in path:
         if isinstance(step, int):
             continue
@@ -151,7 +151,7 @@ def _is_table(kind: Any) -> bool:
 
 
 def _find_struct(kind: Any) -> tuple[Any, bool]:
-    """Return a key's struct (None: none), and whether its value is a list of these."""
+    """Return a type's struct or None, and whether the type is a list of structs."""
     bare = _strip_type(kind)
     if _is_table(bare):
         return bare, False
@@ -163,7 +163,7 @@ def _find_struct(kind: Any) -> tuple[Any, bool]:
 
 
 def _strip_type(kind: Any, value: Any = None) -> Any:
-    """Strip annotations and None from a type, and choose from a union by the value."""
+    """Strip annotations and None from a type; choose from a union by the value."""
     while True:
         origin = typing.get_origin(kind)
         if origin is Annotated:
@@ -180,7 +180,7 @@ def _strip_type(kind: Any, value: Any = None) -> Any:
 
 
 def _is_same_sort(kind: Any, value: Any) -> bool:
-    """Return whether value and type are of one sort: table, list or neither."""
+    """Return whether a type and a value are both tables, both lists, or neither."""
     origin = typing.get_origin(kind)
     if isinstance(value, dict):
         return _is_table(kind) or origin is dict
@@ -188,7 +188,7 @@ def _is_same_sort(kind: Any, value: Any) -> bool:
 
 
 def _walk_values(node: SettingNode, kind: Any) -> Iterator[tuple[str | int, SettingNode, Any]]:
-    """Yield (step, node, type) of a table's or list's values; nothing for a wrong type."""
+    """Yield (key or index, node, type) of each value in a table or list."""
     bare = _strip_type(kind, node.value)
     origin, arguments = typing.get_origin(bare), typing.get_args(bare)
     if isinstance(node.value, dict):
@@ -209,7 +209,7 @@ def _walk_values(node: SettingNode, kind: Any) -> Iterator[tuple[str | int, Sett
 
 
 def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -> None:
-    """Refuse unknown keys, values in place of tables, and the wrong one of [name], [[name]]."""
+    """Refuse unknown keys, values in place of tables, and [name] confused with [[name]]."""
     bare = _strip_type(kind, node.value)
     if _is_table(bare) and not isinstance(node.value, dict):
         name = format_path(path) or "the file"
@@ -234,7 +234,7 @@ def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -
 
 
 def _table_hint(key: str, top: Any) -> str:
-    """Explain where a wrongly nested table of the file belongs; empty: no such table."""
+    """Return a hint where a wrongly nested table belongs, or empty text for other keys."""
     inner, several = _find_struct(types_of(top).get(key)) if top is not None else (None, False)
     if inner is None:
         return ""
@@ -242,7 +242,7 @@ def _table_hint(key: str, top: Any) -> str:
 
 
 def _check_finite(root: SettingNode, node: SettingNode, path: list[str | int], kind: Any) -> None:
-    """Refuse text such as nan or inf for a number. In TOML it is refused on reading."""
+    """Refuse text such as nan or inf for a number. `parse_toml` refuses it in TOML."""
     for step, below, inner in _walk_values(node, kind):
         _check_finite(root, below, [*path, step], inner)
     if _strip_type(kind, node.value) is float and isinstance(node.value, str):
@@ -257,7 +257,7 @@ def _check_finite(root: SettingNode, node: SettingNode, path: list[str | int], k
 def _find_smallest_error(
     node: SettingNode, kind: Any, lax: bool
 ) -> tuple[list[str | int], Any, Exception] | None:
-    """Find (path, type, error) of the smallest branch that cannot be converted; None: none."""
+    """Return (path, type, error) of the smallest branch that cannot be converted, or None."""
     for step, below, inner in _walk_values(node, kind):
         found = _find_smallest_error(below, inner, lax)
         if found is not None:
@@ -270,7 +270,7 @@ def _find_smallest_error(
 
 
 def _explain(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | int]) -> str:
-    """Translate msgspec's error on a branch into a user's words."""
+    """Translate msgspec's error on a branch into a message for the user."""
     message = str(error)
     if not isinstance(error, msgspec.ValidationError):
         return message
@@ -302,7 +302,7 @@ def _explain(error: Exception, node: SettingNode, kind: Any, path: Sequence[str 
 
 
 def _describe_text(kind: Any) -> str:
-    """Describe text that must match a pattern, by the description in its type."""
+    """Return the description of a text type that has a pattern."""
     for note in typing.get_args(kind)[1:] if typing.get_origin(kind) is Annotated else ():
         if isinstance(note, msgspec.Meta) and note.description:
             return note.description
@@ -310,7 +310,7 @@ def _describe_text(kind: Any) -> str:
 
 
 def _describe_list(kind: Any) -> str:
-    """Describe a list of fixed length in words; empty for any other type."""
+    """Return ``a list of 3 numbers`` for a list of fixed length, else empty text."""
     items = typing.get_args(kind)
     if typing.get_origin(kind) is not tuple or items[1:] == (Ellipsis,):
         return ""

@@ -26,12 +26,12 @@ INT64 = 2**63
 
 @dataclass
 class SettingNode:
-    """Value with the place where it was written.
+    """Node of a settings tree: a value, and the file and line it came from.
 
     Attributes:
         value: The value; for a table a dict of nodes, for a list a list of nodes.
-        file: The file as the user named it, ``--set ...``, or the URL whose options these are.
-        line: The line of the file, counted from 1; 0: not from a file with lines.
+        file: The file as the user named it, ``--set ...``, or the URL that has the option.
+        line: The line of the file, counted from 1; 0 if the value is not from a file.
         folder: The folder to which paths in the file are relative.
     """
 
@@ -42,7 +42,7 @@ class SettingNode:
 
     @property
     def where(self) -> str:
-        """File and line for a message."""
+        """File and line for a message, ``FILE:LINE``."""
         return f"{self.file}:{self.line}" if self.line else self.file
 
     def plain(self) -> Any:
@@ -64,7 +64,7 @@ class SettingNode:
         return node
 
     def walk(self, path: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-        """Yield (path, node) of this node and all below."""
+        """Yield (path, node) of this node and of all nodes below it."""
         yield path, self
         if isinstance(self.value, dict):
             for key, node in self.value.items():
@@ -80,12 +80,12 @@ def format_path(path: Sequence[str | int]) -> str:
 
 
 def make_node(value: Any, file: str, line: int, folder: Path) -> SettingNode:
-    """Make a tree of a plain value, whose nodes all have one line."""
+    """Make a settings tree of a plain value. All nodes get the same file and line."""
     return _build(value, (), {(): line}, file, folder, line)
 
 
 def read_text(path: Path, largest: int = LARGEST) -> str:
-    """Read the text of a file that a user names, without a byte order mark.
+    """Read a UTF-8 text file; drop its byte order mark.
 
     Args:
         largest: largest size of the file, bytes.
@@ -114,19 +114,19 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
 
 
 def read_toml(path: Path, largest: int = LARGEST) -> SettingNode:
-    """Read a TOML file."""
+    """Read a TOML file into a settings tree."""
     folder = Path(os.path.abspath(path)).parent
     return parse_toml(read_text(path, largest), str(path), folder)
 
 
 def parse_toml(text: str, where: str, folder: Path = Path()) -> SettingNode:
-    """Parse a TOML document into a tree.
+    """Parse a TOML document into a settings tree.
 
     Args:
         folder: the folder to which paths in the document are relative.
 
     Raises:
-        ConfigError: not TOML, or a number that no key may have; names the line.
+        ConfigError: not TOML, or a number that is not finite or exceeds 64 bits; names the line.
     """
     try:
         parsed = tomllib.loads(text)
@@ -138,7 +138,7 @@ def parse_toml(text: str, where: str, folder: Path = Path()) -> SettingNode:
 
 
 def plain_value(written: str) -> Any:
-    """Parse a TOML value; take anything else as text, so that it needs no quotes."""
+    """Parse a TOML value. Return other text unchanged, so that it needs no quotes."""
     try:
         return tomllib.loads(f"value = {written}")["value"]
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
@@ -181,7 +181,7 @@ def _describe_syntax_error(path: str, message: str, text: str) -> str:
 
 
 def find_lines(text: str) -> dict[tuple[str | int, ...], int]:
-    """Find the line of every key and header of a valid TOML document, by path.
+    """Return the line of each key and header of a valid TOML document, by path.
 
     Values inside brackets get the line of their key.
     """

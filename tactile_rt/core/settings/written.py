@@ -34,10 +34,9 @@ NAMES = ("name", "kind")  # keys whose value identifies an item of a list
 
 
 def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
-    """Set one key of a tree, which is returned.
+    """Set one key of a settings tree in place, and return the tree.
 
     Args:
-        nodes: the tree; it is changed in place.
         text: ``a.b=value``; ``source.NAME.url=...`` or ``source.0.url=...`` selects an item of a
             list. The value is TOML, or text that need not be quoted.
 
@@ -77,12 +76,11 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
 def set_keys(
     nodes: SettingNode, sets: Sequence[str], kind: Any, known: Sequence[str] | None = None
 ) -> SettingNode:
-    """Set several keys of a tree, which is returned; see `set_key`.
+    """Set several keys of a settings tree in place, as `set_key`, and return the tree.
 
     Args:
-        nodes: the tree; it is changed in place.
         sets: ``a.b=value`` each; the last value of a repeated key is used.
-        known: the keys that may be set; None: all.
+        known: the keys that may be set; None for all.
     """
     known = list(types_of(kind)) if known is None else known
     for text in sets:
@@ -99,9 +97,10 @@ def set_keys(
 def take_sets(
     what: str, sets: Sequence[str], *kinds: type[Any], usual: Mapping[str, Any] | None = None
 ) -> tuple[Any, ...]:
-    """Distribute settings of a command to dataclasses, each of which takes its own keys.
+    """Make dataclasses from ``--set`` texts; each key goes to the class that has it.
 
     Args:
+        what: name of the command, for messages.
         usual: default values, which take precedence over those of the dataclasses.
     """
     known = {name: kind for kind in kinds for name in types_of(kind)}
@@ -131,10 +130,10 @@ def _find_item(node: SettingNode, step: str, origin: str, where: str) -> int:
 
 
 def split_url(url: str) -> tuple[str, str, dict[str, str]]:
-    """Split a URL, ``scheme:target?option=value&option=value``.
+    """Split a URL, ``scheme:target?option=value&option=value``, into three parts.
 
     Returns:
-        Scheme (empty: none), target, and the options as written.
+        Scheme (empty if absent), target, and options as text.
 
     Raises:
         ConfigError: the text has unprintable characters, is too long, is no URL, or gives an option
@@ -159,10 +158,11 @@ def split_url(url: str) -> tuple[str, str, dict[str, str]]:
 
 
 def take_options(what: str, fields: Mapping[str, str], *kinds: type[Any]) -> tuple[Any, ...]:
-    """Distribute options of a URL to dataclasses, each of which takes its own keys.
+    """Make dataclasses from a URL's options; each key goes to the classes that have it.
 
     Args:
-        fields: as written; numbers may be hexadecimal, as CAN identifiers are.
+        what: the URL without options, for messages.
+        fields: the options as text; numbers may be hexadecimal, as CAN identifiers are.
 
     Raises:
         ConfigError: an option is unknown, or has the wrong type.
@@ -179,7 +179,7 @@ def take_options(what: str, fields: Mapping[str, str], *kinds: type[Any]) -> tup
 
 
 def _convert_hexadecimal(value: str) -> str:
-    """Convert a hexadecimal number of at most 64 bits to decimal; keep other text."""
+    """Convert a hexadecimal number of at most 64 bits to decimal text; keep other text."""
     return str(int(value, 16)) if re.fullmatch(r"0[xX][0-9a-fA-F]{1,16}", value) else value
 
 
@@ -188,7 +188,7 @@ def _convert_hexadecimal(value: str) -> str:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Contents of a CSV file."""
+    """Columns and rows of a CSV file. `where` is the file and line of the header."""
 
     where: str
     columns: tuple[str, ...]
@@ -196,7 +196,7 @@ class CsvTable:
 
 
 def read_csv(path: Path) -> CsvTable:
-    """Read a CSV file whose first line names the columns. Lines that begin with # are remarks.
+    """Read a CSV file whose first line names the columns. Lines that begin with # are skipped.
 
     Raises:
         ConfigError: the file cannot be read, is empty, or has a column twice or a row of another
@@ -233,7 +233,7 @@ def _split_cells(line: str, where: str) -> list[str]:
 
 
 def check_columns(table: CsvTable, known: Sequence[str], needed: Sequence[str] = ()) -> None:
-    """Refuse unknown columns, and the lack of a needed one."""
+    """Refuse a table that has an unknown column or lacks a needed one."""
     for column in table.columns:
         if column not in known:
             raise ConfigError(

@@ -51,7 +51,7 @@ class ArraySpec:
         elements: The names of the elements, whiskers or taxels, in the order of every sample.
         grid: The place (row, column) of each element on the array's topological grid, from 0.
         positions: The base point (x, y, z) of each element in the mount frame, m.
-        orientations: The unit quaternion (w, x, y, z) that turns each element's own frame into
+        orientations: The unit quaternion (w, x, y, z) that rotates each element's own frame into
             the mount frame.
         channels: The names of the quantities that each element measures, e.g. ``fx``.
         units: The SI unit of each channel, e.g. ``N``.
@@ -106,8 +106,8 @@ class ArraySpec:
         """Describe an array of unknown geometry, with all elements at the frame's origin.
 
         Args:
-            channels: the SI unit of each channel.
-            elements: the place (row, column) of each element on the grid.
+            channels: SI unit by channel name.
+            elements: Place (row, column) on the grid by element name.
         """
         n = len(elements)
         return cls(
@@ -117,17 +117,17 @@ class ArraySpec:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(element, channel): the shape of one sample."""
+        """Shape of one sample: (number of elements, number of channels)."""
         return len(self.elements), len(self.channels)
 
     @property
     def grid_shape(self) -> tuple[int, int]:
-        """(rows, columns) of the smallest grid that holds every element."""
+        """Numbers of rows and columns of the smallest grid that holds every element."""
         rows, columns = zip(*self.grid, strict=True)
         return max(rows) + 1, max(columns) + 1
 
     def differences(self, other: "ArraySpec", ignore: tuple[str, ...] = ()) -> list[str]:
-        """List where `other` differs from this spec, one phrase each; [] when they match.
+        """List the attributes in which `other` differs from this spec, a phrase each.
 
         Args:
             ignore: attribute names not to compare (a model ignores ``name`` and ``rate_hz``).
@@ -154,15 +154,15 @@ class ArraySpec:
         return found
 
     def to_json(self) -> str:
-        """Write one line of JSON with a schema version, for recordings and models."""
+        """Return the spec as one line of JSON, for recordings and models."""
         return msgspec.json.encode({"version": SPEC_VERSION, **msgspec.to_builtins(self)}).decode()
 
     @classmethod
     def from_json(cls, text: str) -> "ArraySpec":
-        """Read what `to_json` wrote.
+        """Return the spec that `to_json` has written as JSON.
 
         Raises:
-            ConfigError: not JSON, a field missing or of the wrong type, or a newer version.
+            ConfigError: not JSON, a field missing or of the wrong type, or another version.
         """
         try:
             fields: dict[str, Any] = msgspec.json.decode(text, type=dict[str, Any])
@@ -178,7 +178,7 @@ class ArraySpec:
 
 @dataclass(frozen=True)
 class Chunk:
-    """n >= 1 consecutive samples, the form in which all samples move through the program.
+    """Block of n >= 1 consecutive samples; all samples move through the program in chunks.
 
     Attributes:
         seq: (n,) int64 sequence number of each sample; a gap means lost samples.
@@ -205,12 +205,12 @@ class Chunk:
         return len(self.seq)
 
     def select(self, at: slice | NDArray[np.bool_]) -> "Chunk":
-        """Return some of the samples, by a slice or by a mask (n,)."""
+        """Return a chunk of the samples that a slice or a mask (n,) selects."""
         return Chunk(self.seq[at], self.t_ns[at], self.values[at], self.valid[at])
 
 
 def concatenate(chunks: list[Chunk]) -> Chunk:
-    """Join consecutive chunks of one stream into one; the samples are copied."""
+    """Join consecutive chunks of one stream into one chunk; copy the samples."""
     return Chunk(
         *(
             np.concatenate([getattr(c, name) for c in chunks])
@@ -221,17 +221,17 @@ def concatenate(chunks: list[Chunk]) -> Chunk:
 
 @dataclass
 class SourceStats:
-    """Samples counted where they are lost or gained, since the source was opened.
+    """Counts of delivered, lost and repeated samples since the source was opened.
 
     ``sent + duplicated = delivered + corrupt + missing + dropped + duplicates`` where `sent` and
-    `duplicated` are the sender's side.
+    `duplicated` are counts of the sender.
 
     Attributes:
         delivered: Samples that reached the reader.
-        corrupt: Samples that came damaged and were thrown away.
-        missing: Samples that never came, as the gaps in the device's counter show.
-        dropped: Samples that came and were thrown away because nobody read them in time.
-        duplicates: Samples that came a second time and were thrown away.
+        corrupt: Samples that arrived damaged and were discarded.
+        missing: Samples that never arrived, as the gaps in the device's counter show.
+        dropped: Samples that arrived and were discarded because they were not read in time.
+        duplicates: Samples that arrived a second time and were discarded.
     """
 
     delivered: int = 0
@@ -243,13 +243,13 @@ class SourceStats:
 
 @dataclass(eq=False)  # compared by identity: two streams of one array are distinct in a set
 class Source(abc.ABC):
-    """Source of samples. Implementations provide `spec`, `read` and `close`.
+    """Base class of sources of samples. Implementations provide `spec`, `read` and `close`.
 
     A source is its own context manager and iterates over its chunks until it ends.
 
     Attributes:
-        live: True if samples come whether or not anyone reads them, as of a device or a
-            simulation in real time; a source that is not live waits for its reader.
+        live: True if samples come even if nothing reads them, as from a device or a simulation
+            in real time; a source that is not live waits for its reader.
     """
 
     live = True  # a class attribute, not a field: most implementations never change it
@@ -277,9 +277,9 @@ class Source(abc.ABC):
         """Release the device; safe to call twice. Reading afterwards raises `EndOfStream`."""
 
     def fileno(self) -> int:
-        """Return a file descriptor for `select` and the like; -1: none at present, or never. Once
-        it is readable, `read` with a timeout of 0 takes the samples that have come. It changes when
-        a line is lost and opened again."""
+        """Return a file descriptor for `select`, or -1 if the source has none at present. Once it
+        is readable, `read` with a timeout of 0 returns the samples that have arrived. It changes
+        when a lost line is opened again."""
         return -1
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -303,14 +303,14 @@ STEPS, STEP_MS = 22, 45.0  # steps of a window, and length of a step (Chung et a
 
 @dataclass(frozen=True)
 class Timing:
-    """Timing of a window: its steps, each of `substeps` samples and followed by a decision."""
+    """Number of steps in a window, and of samples in a step (`substeps`)."""
 
     steps: int = STEPS
     substeps: int = 5
 
     @classmethod
     def of(cls, period_ns: int) -> "Timing":
-        """Return a timing with steps as near to 45 ms as whole samples allow."""
+        """Return the timing for a sample period, with steps as near 45 ms as possible."""
         return cls(substeps=max(1, round(STEP_MS * 1e6 / period_ns)))
 
     @property

@@ -35,15 +35,15 @@ CLIP = {"N": 5e-3, "N m": 5e-6}
 SCALE = {"N": 3e-5, "N m": 1.5e-7}
 CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
 SILENT = 0.2  # smallest noise assumed by the detector, in parts of a described sensor's noise
-# Likewise in parts of the drift: an offset that has wandered for 10 s since the baseline (by 0.6 of
-# its spread, if it forgets in a minute) is then no endless contact, also for the worst of dozens.
+# Likewise in parts of the drift: an offset that wanders for 10 s after the baseline (by 0.6 of its
+# spread, at a correlation time of a minute) causes no endless contact, even in the worst of dozens.
 WANDERED = 1.5
 ROUNDING = 1 / math.sqrt(12)  # standard deviation of a rounding error, in steps
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSpec:
-    """Channel of every whisker of an array.
+    """Data sheet of one sensor channel, the same for every whisker of an array.
 
     It reads the sum of loads, each times its sensitivity, or one component of a magnet's field. A
     channel with the name and unit of a load reads that load by default.
@@ -53,13 +53,13 @@ class ChannelSpec:
         unit: The SI unit of its readings, e.g. ``N m``, ``T`` or ``V``.
         of: The sensitivity to each of `LOADS`: reading per N, N m or rad.
         field: The component of the magnet's field that it reads, in the element's frame: ``x``,
-            ``y`` or ``z``; empty: none.
+            ``y`` or ``z``; empty for none.
         range: The largest reading of either sign, where it saturates.
-        noise_density: The white noise: the square root of its one-sided spectral density, in the
-            unit per root of a hertz.
-        resolution: The step to which readings are rounded; 0: none.
-        offset: The offset that remains after the device's own tare: one standard deviation.
-        drift: The wandering offset: its standard deviation at any one time.
+        noise_density: The amplitude spectral density of the white noise (one-sided), in the unit
+            per square root of a hertz.
+        resolution: The step to which readings are rounded; 0 for none.
+        offset: The standard deviation of the offset that remains after the device's own tare.
+        drift: The standard deviation, at any one time, of an offset that wanders.
 
     Raises:
         ConfigError: the measured quantity is not given, or given twice; an unknown load or
@@ -117,7 +117,7 @@ class MagnetSpec:
     """Magnet on a compliantly mounted whisker, and the magnetometer below it.
 
     Both are points in the element's frame at rest, mm from the base point, about which the magnet
-    turns with the whisker. The field is that of a dipole.
+    rotates with the whisker. The field is that of a dipole.
 
     Attributes:
         moment_a_m2: The magnetic moment, A m^2: remanence times volume over the vacuum's
@@ -147,16 +147,16 @@ class MagnetSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSpec:
-    """Sensor of every whisker of an array.
+    """Data sheet of the sensor that reads every whisker of an array.
 
     Attributes:
         rate_hz: The sample rate of the device, Hz.
-        bandwidth_hz: The corner frequency of its first-order low-pass, Hz; 0: no low-pass.
+        bandwidth_hz: The corner frequency of its first-order low-pass, Hz; 0 for no low-pass.
         latency_ms: The time from a sample to its receipt by the host, ms.
-        magnet: The magnet of every whisker; None: no magnet.
+        magnet: The magnet of every whisker; None for no magnet.
         matrix: The calibrated sensitivities of single whiskers, by name: a row for each channel, a
-            column for each of `LOADS` (the two turns may be left out); they replace those of the
-            channels.
+            column for each of `LOADS` (the two rotations may be left out); they replace those of
+            the channels.
 
     Raises:
         ConfigError: no channels, two with one name, a rate that is not positive, a negative number,
@@ -210,26 +210,26 @@ class SensorSpec:
 
     @property
     def noise_bandwidth_hz(self) -> float:
-        """Noise bandwidth of a sample, Hz: the spectral width of white noise in it."""
+        """Equivalent bandwidth of the white noise in a sample, Hz."""
         passed = self.rate_hz / 2
         # equivalent noise bandwidth of a first-order low-pass
         return min(passed, self.bandwidth_hz * math.pi / 2) if self.bandwidth_hz else passed
 
     def sensitivity(self, whisker: str) -> NDArray[np.float64]:
-        """Return (channel, load) a whisker's reading per N, N m and rad, ordered as `LOADS`."""
+        """Return a whisker's readings per N, N m and rad, (channel, load), ordered as `LOADS`."""
         if whisker in self.matrix:
             rows = np.array(self.matrix[whisker])
             return np.pad(rows, ((0, 0), (0, len(LOADS) - rows.shape[1])))
         return np.array([channel.sensitivity for channel in self.channels])
 
     def noise(self) -> NDArray[np.float64]:
-        """Return (channel,) the standard deviation of the white noise of a device's sample."""
+        """Return the standard deviation of each channel's white noise in a sample, (channel,)."""
         density = np.array([c.noise_density for c in self.channels])
         return density * math.sqrt(self.noise_bandwidth_hz)
 
 
 class ChannelLimits(NamedTuple):
-    """Limits within which a network trusts an array's channels: (channel,) each, SI.
+    """Limits within which a network trusts an array's channels; arrays (channel,), SI units.
 
     Attributes:
         noise: The rated noise per sample of the network, one standard deviation.
@@ -247,10 +247,10 @@ class ChannelLimits(NamedTuple):
 def channel_limits(
     spec: ArraySpec, sensor: SensorSpec | None = None, period_ns: int = 0
 ) -> ChannelLimits:
-    """Return the limits within which a network trusts each channel.
+    """Return the limits within which a network trusts each channel of an array.
 
     Args:
-        sensor: the array's sensor; None: a sensor that is as quiet as a mouse's whiskers need.
+        sensor: the array's sensor; None for a sensor with the rated noise.
         period_ns: period of the network's samples; the noise of a sensor that samples faster is
             averaged by the resampler.
 
@@ -271,10 +271,10 @@ def channel_limits(
             "array's file, which says how noisy they are"
         )
 
-    def of(table: Mapping[str, float]) -> NDArray[np.float32]:
+    def fill(table: Mapping[str, float]) -> NDArray[np.float32]:
         return np.array([table[unit] for unit in spec.units], dtype=np.float32)
 
-    return ChannelLimits(of(RATED_NOISE), of(CHANNEL_FLOOR), of(CLIP), of(SCALE))
+    return ChannelLimits(fill(RATED_NOISE), fill(CHANNEL_FLOOR), fill(CLIP), fill(SCALE))
 
 
 def _noise_factor(rate_hz: float, period_ns: int) -> float:
