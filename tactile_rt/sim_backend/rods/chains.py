@@ -19,11 +19,11 @@ A = Any  # a contiguous array of float64: numba infers the types of arguments
 
 
 class Chain(NamedTuple):
-    """The mechanical parameters of a whisker, or of many with concatenated rows.
+    """The mechanical parameters of one whisker, or of many, their rows concatenated.
 
     Attributes:
         clamped: The number of links without a joint: 1, or 0 on a compliant base.
-        turn: (link, 2) cosine and sine of the resting angle from the link before, about z.
+        turn: (link, 2) cosine and sine of the resting angle from the previous link, about z.
         length: (link,) lengths of the links, mm.
         inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
             inertia (mg mm^2).
@@ -59,10 +59,10 @@ class Pose(NamedTuple):
 
 @compile_cached
 def place(chain: Chain, q: A, pose: Pose) -> None:
-    """Compute a chain's pose from the first node and first resting frame in `pose`.
+    """Fill a chain's pose from joint angles and from its first node and first frame.
 
     Args:
-        q: (degree of freedom,) rad.
+        q: (degree of freedom,) joint angles, rad.
     """
     clamped, turn, length = chain.clamped, chain.turn, chain.length
     nodes, frames, axes = pose
@@ -91,7 +91,7 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
 
 @compile_cached
 def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
-    """Compute the pose of a chain on a base (4, 3): point, then frame."""
+    """Fill the pose of a chain on a base, `root` (4, 3): point, then frame."""
     for i in range(3):
         pose.nodes[0, i] = root[0, i]
         for k in range(3):
@@ -101,7 +101,7 @@ def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
 
 @compile_cached
 def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
-    """Compute the lower triangle of the mass matrix.
+    """Compute the lower triangle of a chain's joint-space mass matrix, mg mm^2.
 
     Args:
         work: (3, 3) scratch.
@@ -155,11 +155,11 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
 def inertial_forces(
     chain: Chain, pose: Pose, v: A, a: A, base: A, pushed: A, work: A, torques: A, wrench: A
 ) -> None:
-    """Compute the torques of a motion (inverse dynamics), less those of external forces.
+    """Compute a motion's joint torques (inverse dynamics), less those of external forces.
 
     Args:
         v, a: (degree of freedom,) rad/ms and rad/ms^2.
-        base: (4, 3) of the base: velocity (not used), angular velocity, acceleration, angular
+        base: (4, 3) the base's velocity (not used), angular velocity, acceleration, angular
             acceleration.
         pushed: (link, 6) force (mN) and moment about the world's origin (uN m) on each link.
         work: (link, 6) scratch.
