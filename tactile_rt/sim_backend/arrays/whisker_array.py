@@ -56,8 +56,8 @@ class WhiskerArray:
     Attributes:
         whiskers: The whiskers in the frame of the head, mm and rad.
         sensor: The sensor that reads the whiskers; None if the base loads are read as they are.
-        gravity: The gravity in the world frame, m/s^2; zeros by default. Loads are relative to a
-            tare under this gravity.
+        gravity: The gravity in the world frame, m/s^2; zero (weightless) by default. Loads are
+            relative to a tare under this gravity.
 
     Raises:
         ConfigError: no whiskers, or two with the same name or grid cell.
