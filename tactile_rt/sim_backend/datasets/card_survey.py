@@ -100,7 +100,7 @@ class Card:
 
 @dataclass
 class _Findings:
-    """Measurements collected object by object, which `_summarise` turns into the card."""
+    """Measurements collected object by object, which `_summarise` converts into the card."""
 
     # (element,) of every sweep: the largest load; 0 for an untouched whisker.
     peaks: list[NDArray[np.float32]] = field(default_factory=list)

@@ -97,7 +97,7 @@ def make_sweeps(
     engine: str = "processes",
     address: str | None = None,
 ) -> Generator[str, None, None]:
-    """Make the missing sweeps of a set; yield each object's name once it is finished.
+    """Simulate the missing sweeps of a set; yield each object's name once it is done.
 
     Args:
         folder: the set's folder; with "ray", on a file system that all machines share.
@@ -130,7 +130,7 @@ def make_sweeps(
         outcomes = run_processes(work, todo, processes or os.cpu_count() or 1)
     for name, failure in outcomes:
         if failure is not None:
-            if recipe.objects.generated:  # none of these is broken
+            if recipe.objects.generated:  # no parametric object is broken
                 raise TactileError(f"{name} cannot be made: {failure}")
             skipped[name] = failure
             write_skipped(folder, skipped)
@@ -257,7 +257,7 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     elements = sum(len(animal.whiskers) for animal in ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    # A sweep that misses the array is kept where a set needs every combination.
+    # A sweep that misses the array stays in a set that needs every combination.
     most = DRAWS if recipe.sweeps.combinations() == [{}] else 1
     for tries in range(most):
         shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)

@@ -85,7 +85,7 @@ def _start(work: Work) -> tuple[Connection, SpawnProcess]:
     # Only this process handles Ctrl-C: the others must not receive it, even while they start.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with _one_thread():
+        with _limit_threads():
             process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
@@ -94,7 +94,7 @@ def _start(work: Work) -> tuple[Connection, SpawnProcess]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def _limit_threads() -> Iterator[None]:
     """Limit processes started in this context to one thread: every core has a process."""
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -38,7 +38,7 @@ class Tally:
 
     @property
     def shortcomings(self) -> str:
-        """One-line text that counts the set's problems and hints at remedies; empty without any."""
+        """Text that counts the set's problems, with hints at remedies; empty without problems."""
         problems = {
             f"{self.misses} miss the array (larger `size_mm`, less `distance_mm`, other "
             "`height_mm`)": self.misses,
@@ -51,7 +51,7 @@ class Tally:
 
 
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
-    """Count the sweeps, `sweeps` per object, and their problems, of the objects in a folder."""
+    """Count sweeps and problems of the named objects in a folder; each has `sweeps` sweeps."""
     existing = [name for name in names if has_object(folder, name)]
     counts = dict.fromkeys(COUNTED, 0)
     for name in existing:
@@ -86,7 +86,7 @@ def write_sums(folder: Path) -> None:
 
 
 def written_sum(folder: Path, name: str) -> str | None:
-    """Return the checksum of a file in SHA256SUMS; None if it has none."""
+    """Return a file's checksum in the set's SHA256SUMS; None if none is recorded."""
     return _read_sums(folder).get(name) if (folder / SUMS).exists() else None
 
 

@@ -46,7 +46,7 @@ class ShapeObjects:
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
-        """Names of the categories that training never sees."""
+        """Names of the categories withheld from training, for open-set tests."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
         known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.OUTLIERS)
         _check_categories(unknown, (*known, *shapes.added_categories()))
@@ -156,7 +156,7 @@ class MeshObjects:
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
-        """Names of the categories that training never sees."""
+        """Names of the categories withheld from training, for open-set tests."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
         _check_categories(unknown, tuple(sorted(self._by_category)))
         return self.choice.withheld
@@ -229,7 +229,7 @@ def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
 
 
 def _resolve_count(number: float, total: int) -> int:
-    """Return `number`, or if below 1 that fraction of `total`, at least 1 unless 0."""
+    """Return a whole count: `number`, or for a fraction that share of `total` (least 1)."""
     return max(1, round(number * total)) if 0 < number < 1 else int(number)
 
 

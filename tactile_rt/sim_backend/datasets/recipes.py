@@ -91,7 +91,7 @@ class Range(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def combined(self) -> tuple[float, ...]:
-        """Listed values or offsets, which are combined with those of other parameters."""
+        """Values (`each`) or offsets (`plus`) to combine with those of other parameters."""
         return self.each or self.plus
 
     @property
@@ -268,7 +268,7 @@ class SweepChoice:
         return index % (self.draws + self.held_out_draws)
 
     def draw(self, rng: np.random.Generator, index: int, shared: np.random.Generator) -> Sweep:
-        """Draw the parameters of sweep `index`.
+        """Draw the parameters of sweep `index` of an object.
 
         Args:
             shared: a generator in the same state for all sweeps of a draw, see `Range.once`.
