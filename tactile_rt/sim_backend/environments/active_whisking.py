@@ -38,7 +38,7 @@ MOTION: Final = ("amplitude", "offset", "velocity x", "velocity y", "velocity z"
 LOGITS: Final = 5.0  # guesses of +1 for a kind and -1 for another differ by 2 x 5 in their logits
 FRAMES: Final = 5  # means of samples in a step
 FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: larger readings saturate
-DRAWS: Final = 100  # tries to place an object where the array meets it
+DRAWS: Final = 100  # tries to place an object where whiskers meet it
 Observation = dict[str, NDArray[np.float32]]
 
 

@@ -54,8 +54,7 @@ class Stretch:
     """The loads, angles and contacts of consecutive samples.
 
     Attributes:
-        loads: The (sample, element, 6) base loads, N and N m, in the elements' frames, which
-            rotate.
+        loads: The (sample, element, 6) base loads, N and N m, in the rotating element frames.
         angle: The (sample,) protraction from rest, mean over the sample, rad, rostral positive.
         touching: The (sample, element) flags of contact with the object.
     """
@@ -225,7 +224,7 @@ def _compute_response(samples: int) -> tuple[Floats, Floats]:
     fading[0] = np.eye(3)
     for k in range(samples):
         fading[k + 1] = decay @ fading[k]
-    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) share of an aim so long ago
+    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) weight of an input so long ago
     following = np.zeros((samples + 1, 3, samples))
     for k in range(1, samples + 1):
         following[k, :, :k] = gained[:k][::-1].T
