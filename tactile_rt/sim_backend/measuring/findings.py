@@ -136,7 +136,7 @@ def spread_of(values: Sequence[float], known: float) -> Figure:
 def change(
     path: tuple[str | int, ...], described: float | None, found: Figure, why: str = ""
 ) -> tuple[Edit, ...]:
-    """Return the edit that corrects a described value; empty if inside the interval.
+    """Return the edit that corrects a described value; empty if it is in the interval.
 
     If only an upper limit was measured, a value above it is set to the limit.
     """

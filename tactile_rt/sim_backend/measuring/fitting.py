@@ -64,7 +64,7 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
 
 
 def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
-    """Measure a recorded array; return findings and its file's corrected text, unwritten.
+    """Measure a recorded array; return findings and the corrected text of its file.
 
     Raises:
         ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or see
@@ -100,7 +100,7 @@ def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
 
 
 def _find_out_of_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
-    """Report channels whose readings exceed twice the described range, more than any tare."""
+    """Report channels whose readings exceed twice their range, the most that a tare explains."""
     largest = np.nanmax(np.abs(recorded.values[recorded.valid]), axis=0, initial=0.0)
     return [
         ArrayFinding(

@@ -60,7 +60,7 @@ class Rest(NamedTuple):
 
     @property
     def coarse(self) -> NDArray[np.bool_]:
-        """The (channel,) flags of noise below half a step, which rounding hides."""
+        """The (channel,) flags: rounding hides the noise, which is below half a step."""
         return self.noise**2 < (1 / 4 + 1 / 12) * self.step**2
 
 
@@ -84,7 +84,7 @@ def rounding_step(values: NDArray[np.float32]) -> float:
 
 
 def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) -> Rest | None:
-    """Find when a whisker rests, and its readings then; None if below 3 s.
+    """Measure a whisker's readings at rest; return None for less than 3 s of rest.
 
     Args:
         values: (n, channel) readings, none missing.

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 Floats = NDArray[np.float64]
 
-HEARD = 0.45  # of the sample rate: a faster swing may be the alias of another one
+HEARD = 0.45  # of the sample rate: a faster swing may be the alias of another swing
 AWAY, LARGE = 6.0, 20.0  # least deflection of a sample, and of a pluck's peak: in noise sigmas
 APART_S = 0.25  # calm between two plucks
 LOUDER = 5.0  # a simultaneous swing this much smaller than another is its echo in the mount
