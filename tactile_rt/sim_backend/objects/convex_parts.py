@@ -222,7 +222,7 @@ class SolidPieces:
         return outer + self._fill_middle(outer, spare)
 
     def _make_pieces(self) -> list[Floats]:
-        """Return a convex piece behind each face, as deep as the tolerance allows."""
+        """Return a convex piece behind each face, deep where thickness and tolerance allow."""
         mesh = self._mesh
         ways = -mesh.vertex_normals
         starts, ends = mesh.vertices + ASIDE * ways, mesh.vertices + OUT * ways
@@ -249,7 +249,7 @@ class SolidPieces:
         return both[hull.vertices] if self._near_enough(hull) else None
 
     def _near_enough(self, hull: ConvexHull | None) -> bool:
-        """Return whether a hull covers no surface point deeper than the tolerance."""
+        """Return whether a hull covers the surface nowhere deeper than the tolerance."""
         if hull is None:
             return False
         low, high = hull.min_bound, hull.max_bound

@@ -61,7 +61,7 @@ def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     for name, text in models.items():
         if b"beamlattice>" in text:
             raise ValueError("it holds a beam lattice; export it as a mesh of triangles")
-        # the library takes all parts of an inner file for each of them
+        # the library reads all parts of an inner file for each part
         if "3d/3dmodel.model" not in name.lower() and text.count(b"<mesh>") > 1:
             raise ValueError("several parts share a file within it; export it as one mesh")
         for _, thing in etree.iterparse(BytesIO(text), tag="{*}object"):

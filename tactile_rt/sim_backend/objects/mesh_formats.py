@@ -26,7 +26,7 @@ PLY_TYPES: Final = {  # other names are the same as in NumPy
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8",
 }  # fmt: skip
-MOST_NODES: Final = 10_000  # of a scene, counted every time that one is used
+MOST_NODES: Final = 10_000  # of a scene; a node counts every time that it is used
 SAME: Final = 1e-9  # relative difference in area within which two readings are the same
 MAX_FACES = 2_000_000  # which take a minute
 

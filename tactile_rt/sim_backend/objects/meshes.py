@@ -215,7 +215,7 @@ def _cut_into_pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject
 
 
 def _repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the mesh with coincident vertices merged and small holes filled."""
+    """Return the mesh with coincident vertices merged and small or flush holes filled."""
     mesh = mesh.copy()
     if not mesh.is_watertight:  # merged only if necessary: touching bodies would grow together
         mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=MERGE_DIGITS)

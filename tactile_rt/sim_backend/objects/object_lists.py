@@ -10,7 +10,7 @@ A list is a CSV file with a row for every mesh file:
     up                    the axis of the file that points up, y or z
     scale                 metres per unit of the file; empty: unknown
     shape                 the same for variants, mirror images and copies of one thing, which stay
-                          on one side of a split; empty: the object is unlike any other
+                          on one side of a split; empty if the object is unlike any other
     kind, maker           its kind within the category, and who or what made it; optional, as is
     attribution           the credit that the licence demands
 

@@ -62,7 +62,7 @@ class ObjectRow(Origin, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class ObjectSet:
-    """The objects of a folder.
+    """The objects of a folder of mesh files.
 
     Attributes:
         paths: The file of every object, by its name ``category/object``, in alphabetical order.
@@ -117,7 +117,7 @@ class ObjectSet:
 
 
 def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
-    """Find the objects in a folder.
+    """Find the mesh objects in a folder of either layout.
 
     Args:
         detail: how meshes become pieces; in a ShapeNet folder y is up, unless `detail.up` is set.
@@ -135,7 +135,7 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
     plain = [p for p in files if p.suffix.lower() in MESH_SUFFIXES]
     read = {p.with_suffix("") for p in plain}
     unread = [p for p in files if p.suffix.lower() in UNREAD_SUFFIXES]
-    plain += [p for p in unread if p.with_suffix("") not in read]  # to be refused with a reason
+    plain += [p for p in unread if p.with_suffix("") not in read]  # `load` refuses these
     if not plain:
         raise ConfigError(
             f"{folder}: holds no objects: expected category/object.obj (or "
