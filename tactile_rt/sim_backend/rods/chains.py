@@ -132,7 +132,7 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
         d0, d1, d2 = h0 - mass * p0, h1 - mass * p1, h2 - mass * p2
         for k in range(2 * (b - clamped), 2 * (b - clamped) + 2):
             a0, a1, a2 = axes[k, 0], axes[k, 1], axes[k, 2]
-            # Momentum of all that turns with this joint at unit speed, and its moment.
+            # Momentum of all links that rotate with this joint at unit speed, and its moment.
             l0, l1, l2 = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
             v0, v1, v2 = a2 * p1 - a1 * p2, a0 * p2 - a2 * p0, a1 * p0 - a0 * p1
             m0 = work[0, 0] * a0 + work[0, 1] * a1 + work[0, 2] * a2 + h1 * v2 - h2 * v1
@@ -258,7 +258,7 @@ def factor(matrix: A, n: int) -> bool:
 
 @compile_cached
 def solve_forth(lower: A, n: int, x: A) -> None:
-    """Solve L y = x, in place."""
+    """Solve L y = x for y, which replaces x."""
     for i in range(n):
         s = x[i]
         for k in range(i):
@@ -268,7 +268,7 @@ def solve_forth(lower: A, n: int, x: A) -> None:
 
 @compile_cached
 def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
-    """Solve L y = x for `count` columns of x, in place."""
+    """Solve L y = x for y, which replaces x: `count` columns at once."""
     for i in range(n):
         for k in range(i):
             for c in range(count):
@@ -279,7 +279,7 @@ def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
 
 @compile_cached
 def solve_back(lower: A, n: int, x: A) -> None:
-    """Solve L' y = x, in place."""
+    """Solve L' y = x for y, which replaces x."""
     for i in range(n - 1, -1, -1):
         x[i] /= lower[i, i]
         s = x[i]
@@ -288,7 +288,7 @@ def solve_back(lower: A, n: int, x: A) -> None:
 
 
 def chain_mass(chain: Chain) -> A:
-    """Compute the full mass matrix of a chain at rest: (degree of freedom, same)."""
+    """Compute the full joint-space mass matrix of a chain at rest, mg mm^2."""
     links, n = len(chain.length), 2 * (len(chain.length) - chain.clamped)
     pose = Pose(np.zeros((links + 1, 3)), np.zeros((links, 3, 3)), np.zeros((n, 3)))
     pose.frames[0], matrix = np.eye(3), np.zeros((n, n))

@@ -273,7 +273,7 @@ def _push_out(
         turned[k] = 0.0
         for j in range(k, n):
             turned[k] += lower[j, k] * v[j]
-    # free: the gap of each contact after the step, mm; negative: still overlapping
+    # free: the gap of each contact after the step, mm; negative if still overlapping
     for c in range(count):
         i = 3 * c
         r0 = points[c, 0] - nodes[0, 0]

@@ -11,7 +11,7 @@ from tactile_rt.sim_backend.rods.nearest import WORK, nearest
 
 A = Any
 NEAR_MM = 0.1  # places that are nearer are constraints of a step
-STALE_MM, CLOSE_MM = 0.05, 1.0  # within the second, a plane is updated after so much travel
+STALE_MM, CLOSE_MM = 0.05, 1.0  # a plane closer than CLOSE_MM is updated after STALE_MM of travel
 MOST_CONTACTS = 8  # of one whisker at one time: the nearest ones
 
 

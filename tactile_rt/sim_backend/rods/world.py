@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 
 WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
-FEW_CORNERS = 64  # up to so many, trying them all is faster
+FEW_CORNERS = 64  # for so many corners or fewer, trying all is faster
 
 _make_rod = lru_cache(maxsize=512)(make_rod)  # 10 ms each; the same whiskers meet many objects
 
