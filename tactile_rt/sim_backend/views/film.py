@@ -237,7 +237,7 @@ def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:
 
 
 class Film:
-    """Complete pictures of footage; call `close` when done.
+    """A renderer of complete pictures of footage; call `close` when done.
 
     Args:
         pixels: width of the pictures; their height is 9/16 of the width.

@@ -134,7 +134,7 @@ class Footage:
 
     @property
     def strongest(self) -> int:
-        """Index of the moment with the largest sum of sizes; the middle without touch."""
+        """Index of the moment of the largest total force; the middle if all are 0."""
         total = self.sizes.sum(axis=1)
         return int(total.argmax()) if total.any() else len(self) // 2
 

@@ -88,7 +88,7 @@ class ForceScale:
 
 
 class Sheet:
-    """Pictures of footage, one for each moment; static parts are drawn once.
+    """A renderer of footage with map and traces; static parts are drawn once.
 
     Attributes:
         size: The (width, height) of the pictures in pixels, both even.
@@ -167,13 +167,13 @@ def _round_size(pixels: int) -> tuple[int, int]:
 
 
 def scene_size(pixels: int) -> tuple[int, int]:
-    """Compute the scene's (width, height) in a sheet of a width, pixels."""
+    """Compute the scene's (width, height), pixels, in a sheet that is `pixels` wide."""
     width, height = _round_size(pixels)
     return round(SCENE[2] * width), round(SCENE[3] * height)
 
 
 def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artist]:
-    """Draw a labelled reference arrow, as long as that force's arrow in the scene."""
+    """Draw a labelled reference arrow, as long as the top force's arrow in the scene."""
     right, y = SCENE[0] + SCENE[2] - 0.022, SCENE[1] + 0.03  # bases are often on the left
     long = scale.arrow_mm / camera.extent_mm * SCENE[3] * TALL / WIDE
     head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
@@ -276,7 +276,7 @@ class ForceMap:
 
 
 def rostral_sign(spec: ArraySpec) -> NDArray[np.float64]:
-    """Return (element,) signs: 1 if columns go rostral, -1 if caudal (left of a face)."""
+    """Return (element,) signs: 1 if columns count rostrally, -1 if caudally (left of a face)."""
     place = np.array(spec.positions)
     columns = np.array([column for _, column in spec.grid], dtype=np.float64)
     signs = np.ones(len(columns))
