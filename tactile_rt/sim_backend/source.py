@@ -297,7 +297,7 @@ class SimSource(PacedSource):
         return read
 
     def _simulate_loads(self, start_ns: int) -> Chunk:
-        """Simulate the next true loads, before any sensor."""
+        """Simulate the next chunk of true loads, before any sensor."""
         if self._sweep_left == 0 and self._rest_left == 0:
             self._begin_sweep(start_ns)
         if self._rest_left:

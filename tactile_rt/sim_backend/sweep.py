@@ -19,17 +19,17 @@ from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, rotation
 
 SPACING_MM = 0.25
-TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off the centreline
-PASSED_BY_MM = 0.5  # a miss by less is simulated
-SIDES = 500  # directions in which a piece of more corners keeps its furthest corner
+TOUCH_MM = 0.15  # a contact below it: both soft layers, and a link's chord off the centreline
+PASSED_BY_MM = 0.5  # a whisker that is missed by less is simulated
+SIDES = 500  # a piece of more corners keeps the furthest in each of so many directions
 
 EARTH = 9.80665  # m/s^2
 NOTHING: Mapping[str, float] = MappingProxyType({})
 LIMITS = {
     "size_mm": (1e-3, 1e4),
-    "speed_mm_s": (1e-3, 3e3),  # faster, it moves too far in a step of the simulation
+    "speed_mm_s": (1e-3, 3e3),  # a faster object moves too far in a time step
     "gap_mm": (0.0, 1e4),
-    "heading_deg": (-60.0, 60.0),  # beyond, it would hit the head itself
+    "heading_deg": (-60.0, 60.0),  # beyond, the object would hit the head itself
     "climb_deg": (-60.0, 60.0),
     "ramp_ms": (0.0, 1e4),
     "head_moves": (0.0, 1.0),
@@ -188,8 +188,8 @@ class Sweep:
             and the whiskers' side.
         climb_deg: The rise of the object's path above the horizontal, degrees.
         ramp_ms: The time from the start to full speed, ms; the acceleration begins and ends at 0.
-        head_moves: 1: the head moves past an object that stands still, and its whiskers feel its
-            acceleration; 0: the object moves.
+        head_moves: 1 if the head moves past an object that stands still, and its whiskers feel its
+            acceleration; 0 if the object moves.
         surface_friction: The friction of the object's surface, as a multiple of that in the
             whiskers' description.
         shake_g: The amplitude of the acceleration that shakes the head along (1, 1, 1), as on a
@@ -201,7 +201,7 @@ class Sweep:
             after the tare, degrees. Loads are relative to the tare, so that the weight of the
             whiskers shows.
         tilt_axis_deg: The direction of the axis of that tilt in the x-y plane, from x, degrees.
-        tilt_ms: The duration of the tilt from the start of the sweep; 0: it is tilted before.
+        tilt_ms: The duration of the tilt from the start of the sweep; 0 if it is tilted before.
     """
 
     size_mm: float = 40.0
@@ -254,7 +254,7 @@ class Sweep:
         """
         added = np.array([self.gravity_x_g, self.gravity_y_g, self.gravity_z_g]) * EARTH
         axis = rotation("z", np.radians(self.tilt_axis_deg))
-        # The world frame turns with the head, so gravity turns the other way.
+        # The world frame rotates with the head, so gravity rotates the other way.
         back = axis @ rotation("x", -np.radians(self.tilt_deg) * tilt) @ axis.T
         return np.asarray(back @ (described + added))
 

@@ -187,7 +187,7 @@ class SweepSimulation:
 
     @cached_property
     def _world(self) -> World:
-        """The engine, made with the first sample, so not for a rejected draw."""
+        """The engine, created at the first sample, since a rejected draw needs none."""
         profile = self._profile
         if engine_of(profile) != "rods":
             return MujocoWorld(self.model, self._whiskers, profile, self._start)
@@ -314,7 +314,7 @@ def draw_simulation(
     profile: Profile,
     draw: Callable[[np.random.Generator], Sweep] = draw_sweep,
 ) -> tuple[Sweep, SweepSimulation]:
-    """Draw sweeps until the object meets the array; after 20, return a miss."""
+    """Draw sweeps until the object meets the array, at most 20; return the last."""
     for _ in range(DRAWS):
         sweep = draw(rng)
         simulation = SweepSimulation(array, target, sweep, profile)

@@ -22,7 +22,7 @@ ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
 TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)
 ANGLES = ("theta", "phi", "zeta")
 COLUMN = re.compile(r"(theta|phi|zeta)_deg(?:_(.+))?")
-LARGEST_DEG = 120.0  # more must be an absolute angle or another unit, not a turn from rest
+LARGEST_DEG = 120.0  # more must be an absolute angle or another unit, not an angle from rest
 
 
 class Trajectory(Protocol):

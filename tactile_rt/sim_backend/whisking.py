@@ -121,7 +121,7 @@ class WhiskSimulation:
         return read_base_loads(sensors / self._steps_per_sample), touch
 
     def _compute_turns(self, steps: int) -> NDArray[np.float64]:
-        """Compute base angles from rest (steps + 2, base angle), rad, from one step back."""
+        """Compute base angles from rest, (steps + 2, base angle), rad, starting one step back."""
         at = np.arange(self._step - 1, self._step + steps + 1)
         times = at.astype(np.float64) * (self.model.opt.timestep * 1e-3)
         turns = self._trajectory.offsets(times, self._whiskers) * self._mirror

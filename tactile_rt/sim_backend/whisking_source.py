@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec, stamp_samples
 
-LARGEST_MM = 1e3  # of an object and its position
+LARGEST_MM = 1e3  # of an object's size and position
 
 
 @dataclass(frozen=True)

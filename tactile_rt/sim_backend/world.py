@@ -230,7 +230,7 @@ def _add_whisker(
             quat=quaternion(rotation("z", turn)),
         )
         heading, origin = headings[i], nodes[i]
-        # The first half cell is clamped, or turns on a compliant mount.
+        # The first half cell is clamped, or rotates on a compliant mount.
         if i > 0 or whisker.mount_stiffness:
             for axis in ((0, 1, 0), (0, 0, 1)):
                 body.add_joint(
@@ -257,7 +257,7 @@ def _add_whisker(
 
 
 def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict[str, float]:
-    """Set every whisker's joint damping so that its first mode has its damping ratio.
+    """Set every whisker's joint damping to give its first mode the described damping ratio.
 
     It is Rayleigh damping: c = beta k with beta = 2 zeta / omega_1. The integrator itself adds h k,
     which is subtracted; where that alone exceeds the target (short whiskers, coarse steps) the
