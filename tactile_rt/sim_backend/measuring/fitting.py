@@ -92,7 +92,7 @@ def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
 
 
 def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
-    """Return the (channel,) readings of an unloaded whisker that the description predicts."""
+    """Return the (channel,) readings that the description predicts for an unloaded whisker."""
     now, there = np.zeros(1, np.int64), np.ones((1, 1), np.bool_)
     read = Transducer(sensor, (name,)).push(Chunk(now, now, np.zeros((1, 1, 8), np.float32), there))
     assert read is not None

@@ -117,7 +117,7 @@ class SheetPieces:
 
     Args:
         sheet: any surface, in the unit box.
-        half: half the thickness of a plate, in largest extents.
+        half: half the thickness of a plate, in units of the largest extent.
     """
 
     def __init__(self, sheet: trimesh.Trimesh, half: float) -> None:

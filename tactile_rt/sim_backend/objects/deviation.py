@@ -88,7 +88,7 @@ class TriangleSurface:
         self._tree = cKDTree(self.middles)
 
     def about(self, points: Floats) -> Floats:
-        """Estimate distances (n,) of points (n, 3); few are too large, by `reach` at most."""
+        """Estimate distances (n,) of points (n, 3), some too large by at most `reach`."""
         _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
         best: Floats = np.min([_find_gaps(self.tiles[tile], points) for tile in near.T], axis=0)
         return best
@@ -151,7 +151,7 @@ def _find_inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_
 
 
 def spread_planes(planes: Floats) -> Floats:
-    """Reorder planes by the golden ratio, so that consecutive ones cover all directions."""
+    """Reorder planes by the golden ratio, so that consecutive planes cover all directions."""
     ordered: Floats = planes[np.argsort(np.arange(len(planes)) * 0.6180339887 % 1)]
     return ordered
 

@@ -126,7 +126,7 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
     tolerance, it is exceeded.
 
     Args:
-        tolerance: largest allowed movement of the surface, in largest extents.
+        tolerance: largest allowed movement of the surface, in units of the largest extent.
     """
     if len(mesh.faces) <= SHARES[0] * most:
         return mesh
