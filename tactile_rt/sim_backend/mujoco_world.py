@@ -41,7 +41,7 @@ UNSTABLE = tuple(
 
 
 class ContactProbe:
-    """A reader of contacts from simulation states, on its own copy of the data."""
+    """A reader that computes contacts from simulation states, on its own MuJoCo data."""
 
     def __init__(
         self, model: mujoco.MjModel, whiskers: Sequence[Whisker], profile: Profile
@@ -61,7 +61,7 @@ class ContactProbe:
             self._stretch[geoms] = np.diff(nodes) / (2 * model.geom_size[geoms, 1])
 
     def read(self, state: Floats, place: Floats) -> Floats:
-        """Compute the contacts of one state.
+        """Compute each whisker's contact with the object in one state.
 
         Args:
             place: (3,) position of the object during the step, mm.
@@ -99,7 +99,7 @@ class ContactProbe:
 
 
 def contact_distances(felt: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return force-weighted arc lengths (m) from base to contact; NaN: no contact.
+    """Return force-weighted arc lengths (m) from base to contact; NaN without contact.
 
     A whisker touches if it is in contact for at least half of the sample's time.
 
@@ -116,7 +116,7 @@ def contact_distances(felt: NDArray[np.float32]) -> NDArray[np.float32]:
 def add_piece(
     world: mujoco.MjSpec, body: mujoco.MjsBody, name: str, corners: Floats, **faces: Any
 ) -> None:
-    """Add a convex piece of an object, of (corner, 3) mm, to a body."""
+    """Add a convex piece with (corner, 3) corners, mm, to an object's body."""
     world.add_mesh(name=name, uservert=corners.astype(np.float32).ravel(), **faces)
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_MESH,
@@ -149,7 +149,7 @@ def sweep_model(
 
 
 class MujocoWorld:
-    """A `sweep_simulation.World` that MuJoCo steps.
+    """The `sweep_simulation.World` whose engine is MuJoCo.
 
     Args:
         start: (3,) initial position of the object, mm.

@@ -20,12 +20,11 @@ SHAPE = ("length", "radius", "curvature")
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
-    """The range in which an array may differ from its description; 0: not at all.
+    """The ranges in which an array may differ from its description; 0 for no difference.
 
     Each value is the half-range of a uniform distribution: relative (0.1 is +-10 %) for material
-    and shape, in degrees or mm for poses. The material is drawn once, because all whiskers are
-    made of the same, and so is the mount; the geometry is drawn for each whisker. Names and cells
-    of the grid never change.
+    and shape, in degrees or mm for poses. Material and mount are drawn once, because all whiskers
+    share them; the geometry is drawn for each whisker. Names and cells of the grid never change.
 
     Attributes:
         young_modulus, density, damping_ratio, friction: The ranges of the material's properties,
@@ -62,12 +61,12 @@ class Randomisation:
                 raise ConfigError(f"{name} is relative and must be less than 1, not {value}")
 
     def draw(self, rng: np.random.Generator, array: WhiskerArray) -> WhiskerArray:
-        """Draw an array around this one; return the same object if everything is off.
+        """Draw a randomised copy of an array; the array itself if all ranges are 0.
 
         The stream must still be described by the original array (`array_spec`): a robot does not
-        know by how much its own differs. The draws come from a child of `rng`, so that later
-        draws from it are the same with and without randomisation. No quantity's draw depends on
-        the ranges of the others.
+        know by how much its own differs. The draws come from a child of `rng`, so that later draws
+        from it are the same with and without randomisation. Each quantity's draw is independent of
+        the other ranges.
 
         Raises:
             ConfigError: a whisker comes out too thick for its length, which takes both a stubby
@@ -108,7 +107,7 @@ class Randomisation:
 
 
 def _draw_factors(rng: np.random.Generator, half_ranges: list[float]) -> list[float]:
-    """Draw factors, each from 1 +- its half-range."""
+    """Draw a uniformly distributed factor from 1 +- each half-range."""
     factors: list[float] = (
         1 + np.array(half_ranges) * rng.uniform(-1, 1, len(half_ranges))
     ).tolist()

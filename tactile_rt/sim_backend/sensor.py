@@ -43,8 +43,7 @@ class Sensor:
     load.
 
     Args:
-        described: the sensor in the array's description, whose errors add to the model's; None:
-            it has none.
+        described: the array's described sensor, whose errors add to the model's; None without one.
         drawn: whether to add the noise, offset and drift of the description; else only its
             deterministic properties count: resolution and saturation.
 
@@ -121,7 +120,7 @@ class Sensor:
         self._latest_ns = np.int64(np.iinfo(np.int64).min)  # time stamps less their sample's count
 
     def push(self, chunk: Chunk) -> Chunk | None:
-        """Return the samples that the host receives of these, or None if all are dropped."""
+        """Convert true samples to those that the host receives; None if all are dropped."""
         since = self._compute_intervals(chunk.t_ns)
         values = self._compute_readings(chunk, since) if self._alters else chunk.values
         t_ns = chunk.t_ns
@@ -144,7 +143,7 @@ class Sensor:
         return Chunk(seq, t_ns, values, valid)
 
     def _compute_intervals(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Compute (n,) times since the sample before, s; infinite for the first."""
+        """Compute the (n,) times since the previous sample, s; infinite for the first."""
         before = t_ns[0] if self._taken_ns is None else self._taken_ns
         since = np.maximum(np.diff(t_ns, prepend=before), 0) / NS_PER_S
         if self._taken_ns is None:
@@ -222,7 +221,7 @@ class Sensor:
         return steps
 
     def _draw_flicker(self, since: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Draw the (n, element, channel) sum of unit processes of different time constants."""
+        """Draw (n, element, channel) 1/f noise: a sum of processes of several time constants."""
         total = np.empty((len(since), *self.bias.shape))
         shape = (len(self._flicker_times_s), *self.bias.shape)
         for i, passed in enumerate(since.tolist()):
@@ -248,7 +247,7 @@ class Sensor:
         return -np.log(0.5 * np.array([math.erfc(x / math.sqrt(2)) for x in draws]))
 
     def _order_stamps(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Raise time stamps to at least a nanosecond after their predecessor's."""
+        """Raise each time stamp to at least a nanosecond after its predecessor."""
         count = self._received + np.arange(len(t_ns))
         ahead = np.maximum.accumulate(np.maximum(t_ns - count, self._latest_ns))
         self._received += len(t_ns)
@@ -268,7 +267,7 @@ def _draw_crosstalk(rng: np.random.Generator, spec: ArraySpec) -> NDArray[np.flo
 
 
 def _find_neighbours(spec: ArraySpec) -> list[NDArray[np.int64]]:
-    """Find the (element,) neighbours' indices in each of four directions; -1: none."""
+    """Find the (element,) indices of neighbours in each of four directions; -1 without one."""
     at = {cell: i for i, cell in enumerate(spec.grid)}
     return [
         np.array([at.get((row + down, column + right), -1) for row, column in spec.grid])

@@ -136,7 +136,7 @@ class PacedSource(Source):
         self._next = None
 
     def _catch_up(self, chunk: Chunk) -> Chunk:
-        """Shift a late chunk to the present; its numbers count the skipped samples."""
+        """Shift a late chunk to the present; skipped samples leave a gap in `seq`."""
         assert self._start_ns is not None
         behind_ns = time.monotonic_ns() - int(chunk.t_ns[-1])
         shift_ns = 0
@@ -161,19 +161,19 @@ class SimOptions(PacedOptions, Randomisation):
 
     Attributes:
         objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
-            mesh files (see `mesh_files`), drawn in random order; empty: all categories. A comma in
-            a file's name is written ``%2C``, in a URL ``%252C``.
-        sweeps: The number of different objects that pass before the stream ends; 0: endless.
+            mesh files (see `mesh_files`), drawn in random order; if empty, all categories. A comma
+            in a file's name is written ``%2C``, in a URL ``%252C``.
+        sweeps: The number of different objects that pass before the stream ends; 0 for no end.
         repeat: The number of sweeps of the same object in succession.
         recipe: The name of a recipe (see `datasets.recipes`), or its .toml file, whose paths are
             relative to its folder: sweeps are drawn as in the recipe, except for parameters given
-            here. Empty: parameters not given are drawn as below.
+            here. If empty, other parameters are drawn as below.
         size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
             see `sweep.Sweep`; by default, the size is 40 mm and the others are drawn every time.
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
             shake_hz, gravity_x_g, gravity_y_g, gravity_z_g, tilt_deg, tilt_axis_deg, tilt_ms: The
-            parameters of every sweep, see `sweep.Sweep`; by default it is level, at full speed from
-            the start and not shaken.
+            parameters of every sweep, see `sweep.Sweep`; by default the path is level, the speed
+            full from the start, and nothing shaken.
     """
 
     objects: str = ""
@@ -223,7 +223,7 @@ class SimOptions(PacedOptions, Randomisation):
 
 @dataclass(frozen=True)
 class Pass:
-    """An object that passed the array: the ground truth that decisions are scored against."""
+    """A record of an object that passed the array: the ground truth for scoring decisions."""
 
     start_ns: int
     name: str
@@ -237,8 +237,8 @@ class SimSource(PacedSource):
     Samples that the sensors drop count as missing.
 
     Args:
-        array: which array, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
-            .csv or .toml file.
+        array: its name or file, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``,
+            a .csv or .toml file.
 
     Attributes:
         notes: Metadata for recordings: the version of the engine.
@@ -297,7 +297,7 @@ class SimSource(PacedSource):
         return read
 
     def _simulate_loads(self, start_ns: int) -> Chunk:
-        """Simulate the next true loads, before any sensor."""
+        """Simulate the next chunk of true loads, before any sensor."""
         if self._sweep_left == 0 and self._rest_left == 0:
             self._begin_sweep(start_ns)
         if self._rest_left:
@@ -377,6 +377,6 @@ def _read_recipe(options: SimOptions) -> SweepRecipe | None:
 
 
 def _make_factories(options: SimOptions) -> list[Callable[[], TactileObject]]:
-    """Return factories of the objects that the options name; empty: all categories."""
+    """Return a factory for each object that the options name; empty if they name none."""
     names = [name.replace("%2C", ",") for name in options.objects.split(",") if name]
     return [promised_object(name, options) for name in names]

@@ -1,4 +1,4 @@
-"""The six stimuli of the barrel-cortex recordings, and the model input that they give.
+"""Simulation of the six stimuli of the barrel-cortex recordings, and of a model's input.
 
 Mice discriminated a convex from a concave surface, each presented close, at a medium distance or
 far (Rodgers 2022). Chung et al. (2025) whisk against both sides of the mesh of a bent sheet. Here
@@ -82,7 +82,7 @@ class Surface:
         step_mm: tuple[float, float, float] = (1.0, 1.0, 0.0),
         radius_mm: float = 63.6,
     ) -> "Surface":
-        """Return one of `STIMULI`, whose distances are `step_mm` apart."""
+        """Make one of `STIMULI` by name; close, medium and far are `step_mm` apart."""
         if name not in STIMULI:
             raise ConfigError(f"no stimulus {name!r}: there are {', '.join(STIMULI)}")
         shape, _, distance = name.partition("-")
@@ -133,7 +133,7 @@ class Touch:
 
     Attributes:
         loads: The (sample, element, channel) base loads at 1 kHz, N and N m.
-        touch: The (sample, element) bool: the whisker touched the object.
+        touch: The (sample, element) flags of contact with the object.
     """
 
     loads: NDArray[np.float32]
@@ -141,7 +141,7 @@ class Touch:
 
     @property
     def first_ms(self) -> int | None:
-        """The sample of the first contact; None without contact."""
+        """Time of the first contact from the start, ms; None without contact."""
         touched = self.touch.any(axis=1)
         return int(touched.argmax()) if touched.any() else None
 
@@ -149,7 +149,7 @@ class Touch:
 def whisk_against(
     simulation: WhiskSimulation, progress: Callable[[int], None] = lambda samples: None
 ) -> Touch:
-    """Run a simulation to its end, and report the number of new samples to `progress`."""
+    """Run a simulation to its end; call `progress` with each number of new samples."""
     loads: list[NDArray[np.float64]] = []
     touch: list[NDArray[np.bool_]] = []
     for _ in range(0, simulation.samples, AT_ONCE):
@@ -161,7 +161,7 @@ def whisk_against(
 
 
 def model_input(felt: Touch) -> NDArray[np.float32]:
-    """Resample a touch for the network: from the first contact on, every 9 ms.
+    """Resample a touch to the network's input: from the first contact on, every 9 ms.
 
     The first sample is centred on the first contact, through the same resampler as live data.
 
@@ -195,7 +195,7 @@ def write_input(
     angles: NDArray[np.float64],
     parameters: Mapping[str, Any],
 ) -> None:
-    """Write the model input of stimuli as .npz, and its provenance as .json.
+    """Write the network's input for all stimuli as .npz, and its provenance as .json.
 
     The .npz holds ``stimuli`` (names, in the order of the first axes), ``values`` (stimulus,
     sample, element, channel) from `model_input`, N and N m, ``values_1khz`` (the same, of the whole

@@ -19,17 +19,17 @@ from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Floats, Whisker, rotation
 
 SPACING_MM = 0.25
-TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off the centreline
-PASSED_BY_MM = 0.5  # a miss by less is simulated
-SIDES = 500  # directions in which a piece of more corners keeps its furthest corner
+TOUCH_MM = 0.15  # a contact below it: both soft layers, and a link's chord off the centreline
+PASSED_BY_MM = 0.5  # a whisker that is missed by less is simulated
+SIDES = 500  # a piece of more corners keeps the furthest in each of so many directions
 
 EARTH = 9.80665  # m/s^2
 NOTHING: Mapping[str, float] = MappingProxyType({})
 LIMITS = {
     "size_mm": (1e-3, 1e4),
-    "speed_mm_s": (1e-3, 3e3),  # faster, it moves too far in a step of the simulation
+    "speed_mm_s": (1e-3, 3e3),  # a faster object moves too far in a time step
     "gap_mm": (0.0, 1e4),
-    "heading_deg": (-60.0, 60.0),  # beyond, it would hit the head itself
+    "heading_deg": (-60.0, 60.0),  # beyond, the object would hit the head itself
     "climb_deg": (-60.0, 60.0),
     "ramp_ms": (0.0, 1e4),
     "head_moves": (0.0, 1.0),
@@ -44,7 +44,7 @@ LIMITS = {
 
 
 def centrelines(whiskers: Sequence[Whisker], mount: Mount) -> list[Floats]:
-    """Sample every whisker at rest, base to tip: (point, 3) in the world, mm."""
+    """Return points (point, 3) along every whisker at rest, base to tip, world, mm."""
     turn, origin = mount.rotation, np.array(mount.position)
     lines = []
     for whisker in whiskers:
@@ -55,9 +55,9 @@ def centrelines(whiskers: Sequence[Whisker], mount: Mount) -> list[Floats]:
 
 
 def faces_right(animals: Sequence[WhiskerArray], lines: Sequence[Floats]) -> NDArray[np.bool_]:
-    """Return (whisker,) flags: the whisker's side of the head faces world +x.
+    """Return (whisker,) flags: true if the whisker's side of the head faces world +x.
 
-    Sides are judged as a whole: on a turned head some whiskers of the far side point across.
+    Sides are judged as a whole: on a rotated head some whiskers of the far side point across.
     """
     out = np.array([line[-1, 0] - line[0, 0] for line in lines])
     sides = np.array([2 * k + _points_left(w) for k, a in enumerate(animals) for w in a.whiskers])
@@ -88,13 +88,13 @@ def lateral_reach(animals: Sequence[WhiskerArray]) -> float:
 def way_to_contact(
     whiskers: Sequence[Whisker], lines: Sequence[Floats], pieces: Sequence[trimesh.Trimesh]
 ) -> tuple[float, NDArray[np.bool_]]:
-    """Find how far pieces can move along -y before they meet a whisker.
+    """Find how far pieces move along -y until first contact, and which whiskers they reach.
 
     Args:
         pieces: convex, in the world, mm.
 
     Returns:
-        The distance, mm, infinite if none is met; and (whisker,) flags of the whiskers so near to
+        The distance, mm, infinite without contact; and (whisker,) flags of the whiskers so near to
         the swept volume that they may be touched.
     """
     points = np.concatenate(lines)
@@ -183,13 +183,13 @@ class Sweep:
         roll_deg: The rotation of the object about its own x, degrees; first of the three.
         pitch_deg: The rotation of the object about its own y, degrees; after the roll, before the
             yaw.
-        heading_deg: The direction in which the object moves, turned about z from -y, degrees. At 0
+        heading_deg: The direction in which the object moves, rotated about z from -y, degrees. At 0
             it comes from the front; negative, for whiskers on the right, it comes from the front
             and the whiskers' side.
         climb_deg: The rise of the object's path above the horizontal, degrees.
         ramp_ms: The time from the start to full speed, ms; the acceleration begins and ends at 0.
-        head_moves: 1: the head moves past an object that stands still, and its whiskers feel its
-            acceleration; 0: the object moves.
+        head_moves: 1 if the head moves past an object that stands still, and its whiskers feel its
+            acceleration; 0 if the object moves.
         surface_friction: The friction of the object's surface, as a multiple of that in the
             whiskers' description.
         shake_g: The amplitude of the acceleration that shakes the head along (1, 1, 1), as on a
@@ -201,7 +201,7 @@ class Sweep:
             after the tare, degrees. Loads are relative to the tare, so that the weight of the
             whiskers shows.
         tilt_axis_deg: The direction of the axis of that tilt in the x-y plane, from x, degrees.
-        tilt_ms: The duration of the tilt from the start of the sweep; 0: it is tilted before.
+        tilt_ms: The duration of the tilt from the start of the sweep; 0 if it is tilted before.
     """
 
     size_mm: float = 40.0
@@ -236,7 +236,7 @@ class Sweep:
 
     @property
     def turn(self) -> Floats:
-        """The (3, 3) rotation of the object."""
+        """The (3, 3) rotation of the object: roll, then pitch, then yaw."""
         roll, pitch, yaw = np.radians((self.roll_deg, self.pitch_deg, self.yaw_deg))
         return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
 
@@ -247,29 +247,29 @@ class Sweep:
         return rotation("x", climb) @ rotation("z", -heading)
 
     def gravity(self, described: Sequence[float], tilt: float = 0.0) -> Floats:
-        """Compute gravity in the world, m/s^2, with a share of the tilt.
+        """Compute (3,) gravity in the world, m/s^2, after a share (0 to 1) of tilt.
 
         Args:
             described: (3,) gravity in the array's description, m/s^2.
         """
         added = np.array([self.gravity_x_g, self.gravity_y_g, self.gravity_z_g]) * EARTH
         axis = rotation("z", np.radians(self.tilt_axis_deg))
-        # The world frame turns with the head, so gravity turns the other way.
+        # The world frame rotates with the head, so gravity rotates the other way.
         back = axis @ rotation("x", -np.radians(self.tilt_deg) * tilt) @ axis.T
         return np.asarray(back @ (described + added))
 
 
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
-    """Scale a mouse's sweep distance, 6.5 mm, by the reach of an array's whiskers.
+    """Return the usual sweep distance, mm: a mouse's 6.5, scaled by whisker reach.
 
-    So an object meets the same share of the whiskers: 20 of a mouse's 30 reach beyond its 6.5 mm,
-    19 of a rat's 30 beyond its 8.75.
+    So an object meets the same share of whiskers: 20 of a mouse's 30 reach beyond 6.5 mm, 19 of a
+    rat's 30 beyond its 8.75 mm.
     """
     return round(Sweep.distance_mm * lateral_reach(animals) / _measure_mouse_reach(), 2)
 
 
 def usual_size(animals: Sequence[WhiskerArray]) -> float:
-    """Return an object size: 40 mm, or the extent of the whisker tips if larger.
+    """Return the usual object size, mm: 40, or the extent of whisker tips if larger.
 
     So an object is at least as large as the region that the whiskers reach.
     """
@@ -287,7 +287,7 @@ def draw_sweep(
     distance_mm: float = Sweep.distance_mm,
     chosen: Mapping[str, float] = NOTHING,
 ) -> Sweep:
-    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds."""
+    """Draw speed, yaw, height, distance and gap of a sweep, unless given in `chosen`."""
     drawn = {
         "speed_mm_s": float(rng.uniform(28, 40)),
         "yaw_deg": float(rng.uniform(0, 360)),

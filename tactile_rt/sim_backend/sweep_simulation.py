@@ -36,7 +36,7 @@ CLEAR_MM = 5.0  # how far a sweep continues past the last whisker
 
 
 def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
-    """Return a warning about whiskers whose ringing decays too fast at a profile; empty: none."""
+    """Return a warning that counts whiskers over-damped at a profile; empty if none is."""
     if engine_of(profile) != "rods":
         return ""
     whiskers = [w for animal in animals for w in animal.whiskers]
@@ -55,7 +55,7 @@ def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
 
 
 def _find_damped(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, float, str]]:
-    """Find whiskers whose ringing decays too fast: (target, simulated damping ratio, name)."""
+    """Find over-damped whiskers: (target damping ratio, simulated damping ratio, name) of each."""
     from tactile_rt.sim_backend.rods.rod import HEARD_HZ, make_rod
 
     steps = round(SAMPLE_MS / profile.timestep_ms)
@@ -75,7 +75,7 @@ def check_sweep(sweep: Sweep, profile: Profile) -> None:
 
 
 class World(Protocol):
-    """An engine that steps whiskers while an object passes."""
+    """Protocol of an engine that steps whiskers while an object passes."""
 
     @property
     def angles(self) -> Floats:
@@ -83,7 +83,7 @@ class World(Protocol):
 
     @property
     def turns(self) -> Floats:
-        """The (sample, whisker, 2) turns of the bases in the last `advance`, rad."""
+        """The (sample, whisker, 2) rotations of the bases in the last `advance`, rad."""
 
     def advance(
         self, way: Floats, look_every: int = 0, shaken: Floats | None = None
@@ -93,10 +93,10 @@ class World(Protocol):
         Args:
             way: (sample + 1, 3) positions of the object at the beginning of each sample and at the
                 end of the last, mm.
-            look_every: interval in samples at which contacts are computed; 0: never. An engine
+            look_every: interval in samples at which contacts are computed; 0 for never. An engine
                 that has them anyway returns those of every sample.
             shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; `way` is then
-                relative to the head. None: it is not accelerated.
+                relative to the head. If None, the head is not accelerated.
 
         Returns:
             (sample, whisker, 6) loads, N and N m, and (sample, whisker, 3) contacts, see
@@ -114,14 +114,14 @@ class SweepSimulation:
         array: the whiskers; a tuple of arrays for several animals in one world
             (`whisker_array.place`). The object passes on the side to which most of the whiskers
             reach.
-        whole: simulate everything: the loads stay the same, and a picture is complete.
+        whole: whether to simulate everything, for complete pictures; the loads stay the same.
 
     Attributes:
         touches: False if the object passes without meeting any resting whisker.
         duration_ms: The simulated time until the object has passed all resting whiskers, ms; it
             may still drag a whisker along.
-        wedged: The names of whiskers that had no room between parts of the object: their loads
-            depend on the profile.
+        wedged: The names of whiskers without room between parts of the object: their loads depend
+            on the profile.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class SweepSimulation:
 
     @cached_property
     def _world(self) -> World:
-        """The engine, made with the first sample, so not for a rejected draw."""
+        """The engine, created at the first sample, since a rejected draw needs none."""
         profile = self._profile
         if engine_of(profile) != "rods":
             return MujocoWorld(self.model, self._whiskers, profile, self._start)
@@ -212,7 +212,7 @@ class SweepSimulation:
         return [trimesh.Trimesh(p.vertices + place, p.faces, process=False) for p in self._pieces]
 
     def show(self, data: mujoco.MjData) -> None:
-        """Set the whiskers and the object in data of `model` to their present positions."""
+        """Set whiskers and object in `data`, of `model`, to their present positions."""
         data.qpos[:] = self._world.angles
         data.mocap_pos[0] = self._compute_positions(np.array([self._samples]))[0]
         data.time = self._samples * SAMPLE_MS
@@ -262,7 +262,7 @@ class SweepSimulation:
             }
 
     def _compute_positions(self, samples: NDArray[np.int64]) -> Floats:
-        """Compute (n, 3) positions of the object relative to the head, mm, after some samples."""
+        """Compute the object's (n, 3) positions relative to the head, mm, at given samples."""
         t, ramp = samples * SAMPLE_MS, self._sweep.ramp_ms
         way = np.asarray(t, dtype=np.float64)
         if ramp:
@@ -272,7 +272,7 @@ class SweepSimulation:
         return place
 
     def _compute_acceleration(self, first: int, samples: int) -> Floats | None:
-        """Compute the (n, 3) acceleration of the head from a sample on, mm/ms^2; None: zero."""
+        """Compute the head's (n, 3) acceleration from sample `first` on, mm/ms^2; None if zero."""
         sweep, ramp = self._sweep, self._sweep.ramp_ms
         moves = bool(sweep.head_moves) and first * SAMPLE_MS < ramp
         if not (moves or sweep.shake_g or self._tilts):
@@ -295,9 +295,9 @@ class SweepSimulation:
         return shaken
 
     def turns(self) -> Floats:
-        """Return (sample, element, 2) turns of compliant bases about the elements' y and z, rad.
+        """Return (sample, element, 2) rotations of compliant bases about elements' y and z, rad.
 
-        Means over the samples of the last `advance`; zero for rigid mounts.
+        They are means over each sample of the last `advance`; zero for rigid mounts.
         """
         return self._base_turns
 
@@ -314,7 +314,7 @@ def draw_simulation(
     profile: Profile,
     draw: Callable[[np.random.Generator], Sweep] = draw_sweep,
 ) -> tuple[Sweep, SweepSimulation]:
-    """Draw sweeps until the object meets the array; after many tries, return a miss."""
+    """Draw sweeps until the object meets the array, at most 20; return the last."""
     for _ in range(DRAWS):
         sweep = draw(rng)
         simulation = SweepSimulation(array, target, sweep, profile)
@@ -356,7 +356,7 @@ def _bend_lines(
 
 
 def _scale_friction(animal: WhiskerArray, friction: float) -> WhiskerArray:
-    """Multiply the friction of all whiskers of an array."""
+    """Multiply the friction of all whiskers of an array by a factor."""
     if friction == 1:
         return animal
     whiskers = tuple(replace(w, friction=w.friction * friction) for w in animal.whiskers)

@@ -1,7 +1,7 @@
 """Trajectories of the whiskers' bases: regular whisking, or a recorded trajectory.
 
-The base of a whisker turns in azimuth (theta, protraction), elevation (phi) and torsion (zeta);
-the last two follow the first with a slope that differs from row to row.
+A whisker's base rotates in azimuth (theta, protraction), elevation (phi) and torsion (zeta); the
+last two follow the first with a slope that differs from row to row.
 """
 
 import re
@@ -22,18 +22,18 @@ ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
 TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)
 ANGLES = ("theta", "phi", "zeta")
 COLUMN = re.compile(r"(theta|phi|zeta)_deg(?:_(.+))?")
-LARGEST_DEG = 120.0  # more must be an absolute angle or another unit, not a turn from rest
+LARGEST_DEG = 120.0  # more must be an absolute angle or another unit, not an angle from rest
 
 
 class Trajectory(Protocol):
-    """A motion of the bases in time."""
+    """Protocol of a motion of the whiskers' bases in time."""
 
     @property
     def duration_s(self) -> float:
         """Duration in s; infinite if it has no end."""
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """Compute turns from the resting angles, (len(t_s), whisker, 3) rad, at times from 0 on.
+        """Compute rotations from the resting angles, (len(t_s), whisker, 3) rad, at times, s.
 
         Protraction, elevation and torsion; positive protraction is rostral on both sides. The
         bases stand still at time 0 and before.
@@ -46,7 +46,7 @@ class Whisk:
 
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
-        protraction_deg, retraction_deg: The furthest turn forward and backward of rest, degrees.
+        protraction_deg, retraction_deg: The largest rotation forward and back from rest, degrees.
         ramp_s: The time from rest to full amplitude, s.
         duration_s: The length of the whole trajectory, s.
     """
@@ -72,7 +72,7 @@ class Whisk:
                 )
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """Compute turns, see `Trajectory`."""
+        """Compute rotations from rest, see `Trajectory.offsets`."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)[:, None]
         phase = 2 * np.pi * self.frequency_hz * t  # 0 is fully retracted
         middle = (self.protraction_deg - self.retraction_deg) / 2
@@ -86,7 +86,7 @@ class Recorded:
     """A recorded trajectory, interpolated by a cubic spline: see `read_trajectory`.
 
     Attributes:
-        turns: The (sample, whisker, 3) turns from the resting angles, rad.
+        turns: The (sample, whisker, 3) rotations from the resting angles, rad.
     """
 
     times_s: Floats
@@ -103,7 +103,7 @@ class Recorded:
         return CubicSpline(self.times_s, self.turns - self.turns[0])
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """Compute turns, see `Trajectory`; the last posture is held after the end."""
+        """Compute rotations, see `Trajectory.offsets`; after the end they stay constant."""
         at = [self.names.index(w.name) for w in whiskers]
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
         moved = self._spline(t)
@@ -112,7 +112,7 @@ class Recorded:
 
 
 def _ramp(x: Floats) -> Floats:
-    """Rise smoothly from 0 at x = 0 to 1 at x = 1.
+    """Return a smooth step from 0 (x <= 0) to 1 (x >= 1).
 
     The first two derivatives are continuous.
     """
@@ -121,7 +121,7 @@ def _ramp(x: Floats) -> Floats:
 
 
 def couple_whiskers(theta: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-    """Add each row's elevation and torsion to protractions (n, whisker): (n, whisker, 3) rad."""
+    """Extend protractions (n, whisker) by elevation and torsion to (n, whisker, 3), rad."""
     slopes = np.array([[1.0, *_slopes(w.row)] for w in whiskers])
     turns: Floats = theta[:, :, None] * slopes
     return turns
@@ -136,10 +136,10 @@ def _slopes(row: int) -> tuple[float, float]:
 def read_trajectory(path: Path, whiskers: tuple[Whisker, ...]) -> Recorded:
     """Read a recorded trajectory of base angles.
 
-    The file has a header and one line for each time: ``time_s``, then turns from rest in degrees,
-    rostral positive: ``theta_deg`` of all whiskers, ``theta_deg_C`` of a row, ``theta_deg_C2`` of
-    one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg`` likewise; without
-    them elevation and torsion follow theta (Knutsen et al. 2008).
+    The file has a header and one line for each time: ``time_s``, then rotations from rest in
+    degrees, rostral positive: ``theta_deg`` of all whiskers, ``theta_deg_C`` of a row,
+    ``theta_deg_C2`` of one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg``
+    likewise; without them elevation and torsion follow theta (Knutsen et al. 2008).
     """
     table = read_csv(path)
     columns, lines = table.columns, [row.line for row in table.rows]
@@ -187,7 +187,7 @@ def _letter(row: int) -> str:
 
 
 def base_angles(trajectory: Trajectory, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-    """Compute base angles theta, phi, zeta in the morphology's convention, (time, whisker, 3) rad.
+    """Compute base angles (time, whisker, 3), rad: theta, phi, zeta in the morphology's convention.
 
     On the left side, where azimuth and torsion are mirrored, protraction lowers theta.
     """
@@ -197,6 +197,6 @@ def base_angles(trajectory: Trajectory, t_s: Floats, whiskers: tuple[Whisker, ..
 
 
 def mirror(whiskers: tuple[Whisker, ...]) -> Floats:
-    """Return (whisker, 3) signs of theta, phi and zeta for a rostral turn, by side."""
+    """Return (whisker, 3) signs by which a rostral rotation changes theta, phi and zeta."""
     sides = [-1.0 if w.base[0] < 0 else 1.0 for w in whiskers]
     return np.array([(side, 1.0, side) for side in sides])

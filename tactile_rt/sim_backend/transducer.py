@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 
 def sensor_of(animals: Sequence[WhiskerArray]) -> SensorSpec | None:
-    """Return the sensor of all whiskers in one world; None: base loads are delivered.
+    """Return the sensor of all whiskers in one world; None if base loads are delivered.
 
     Raises:
         ConfigError: the arrays have different sensors, or the sensor samples faster than the
@@ -76,7 +76,7 @@ def device_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
 
 
 def sensor_drift(animals: Sequence[WhiskerArray], period_ms: float) -> float:
-    """Return the largest drift of a channel over its rated noise.
+    """Return the largest ratio of a channel's drift to its rated noise.
 
     Args:
         period_ms: the period of the samples that carry the noise, ms.
@@ -106,7 +106,7 @@ class Transducer:
         self._last: tuple[int, Floats] | None = None  # time and readings of the newest sample
 
     def push(self, chunk: Chunk) -> Chunk | None:
-        """Return the sensor's samples that are due after these loads; None: none yet.
+        """Feed loads to the sensor; return the samples that are due, or None.
 
         Args:
             chunk: (n, element, load) loads at 1 kHz, the first six of `sensor_spec.LOADS` or all.
@@ -141,7 +141,7 @@ class Transducer:
         return Chunk(seq, due, values.astype(np.float32), valid)
 
     def _take_due(self, until_ns: int) -> NDArray[np.int64]:
-        """Take the samples that are due by a time, and return their times, ns."""
+        """Return the times of the samples due by `until_ns`, ns, and count them as delivered."""
         assert self._start_ns is not None
         period = 1e9 / self._sensor.rate_hz
         count = int((until_ns - self._start_ns) / period) + 2 - self._taken
@@ -165,7 +165,7 @@ class Transducer:
 
 
 def dipole_field(magnet: MagnetSpec, turns: Floats) -> Floats:
-    """Compute a magnet's field (..., 3) on a turned base, T, element's frame.
+    """Compute a magnet's field (..., 3) on a rotated base, T, in the element's frame.
 
     Args:
         turns: (..., 2) rotation vector of the base about the element's y and z, rad.

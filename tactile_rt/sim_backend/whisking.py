@@ -1,4 +1,4 @@
-"""Simulation of active whisking: the turning bases, and the loads that result.
+"""Simulation of active whisking: the rotating bases, and the loads that result.
 
 The base angles are prescribed, not driven: each base has three hinges of so large an inertia that
 loads on the whisker do not move it, and in every physics step a force accelerates it along the
@@ -41,7 +41,7 @@ TOLERANCE = 1e-16
 
 
 class WhiskSimulation:
-    """An array that whisks, alone or against an object that stands still.
+    """The simulation of an array that whisks, alone or against a stationary object.
 
     Args:
         pieces: (points, 3) corners of the convex pieces of an object, mm, in the world frame.
@@ -98,8 +98,8 @@ class WhiskSimulation:
         """Simulate the next samples of 1 ms, fewer where the trajectory ends.
 
         Returns:
-            (samples, element, 6) base loads, N and N m, each the mean over its millisecond, in
-            the element's own frame, which turns with its base; and (samples, element) flags of
+            (samples, element, 6) base loads, N and N m, each the mean over its millisecond, in the
+            element's own frame, which rotates with its base; and (samples, element) flags of
             contact with the object.
         """
         samples = min(samples, self.samples - self._step // self._steps_per_sample)
@@ -121,14 +121,14 @@ class WhiskSimulation:
         return read_base_loads(sensors / self._steps_per_sample), touch
 
     def _compute_turns(self, steps: int) -> NDArray[np.float64]:
-        """Compute the bases' turns (steps + 2, base angle), rad, from the previous step on."""
+        """Compute base angles from rest, (steps + 2, base angle), rad, starting one step back."""
         at = np.arange(self._step - 1, self._step + steps + 1)
         times = at.astype(np.float64) * (self.model.opt.timestep * 1e-3)
         turns = self._trajectory.offsets(times, self._whiskers) * self._mirror
         return turns.reshape(len(times), -1)
 
     def _prescribe(self, turns: NDArray[np.float64]) -> None:
-        """Set the bases' angles and velocities, and the force for the next step."""
+        """Set the bases' angles and velocities, and the forces for the next step."""
         h = self.model.opt.timestep
         before, now, after = turns[:3]
         self.data.qpos[self._positions] = now
@@ -146,8 +146,8 @@ class WhiskSimulation:
 def _add_base_joints(world: mujoco.MjSpec, whisker: Whisker) -> None:
     """Add hinges for theta, phi and zeta to a whisker's base.
 
-    With A = Rz(theta - pi/2), B = Ry(-phi) and C = Rx(zeta + pi/2), turning the angles in ABC is
-    the same as turning ABC itself about these axes, one after the other, in the whisker's frame.
+    With A = Rz(theta - pi/2), B = Ry(-phi) and C = Rx(zeta + pi/2), changing the angles in ABC is
+    the same as rotating ABC itself about these axes, one after the other, in the whisker's frame.
     """
     *_, zeta = whisker.angles
     c = rotation("x", zeta + np.pi / 2)
@@ -161,7 +161,7 @@ def _add_base_joints(world: mujoco.MjSpec, whisker: Whisker) -> None:
 
 
 def _find_owners(model: mujoco.MjModel, whiskers: tuple[Whisker, ...]) -> NDArray[np.int64]:
-    """Find the index of the whisker that each geom belongs to; -1: the object."""
+    """Find the index of the whisker that each geom belongs to; -1 for the object."""
     names = {w.name: i for i, w in enumerate(whiskers)}
     owner = np.full(model.nbody, -1, dtype=np.int64)
     for body in range(1, model.nbody):  # parents come before their children

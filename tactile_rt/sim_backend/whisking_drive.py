@@ -2,12 +2,12 @@
 
 protraction = offset(t) + amplitude(t) sin(phase(t)), d phase / dt = 2 pi frequency(t)
 
-Frequency, amplitude and offset follow the last command, each through three first-order lags of
-40 ms in series: 99 % of a change is complete after a third of a second. Such a filter never
-overshoots, so no sequence of commands turns a base further than the commands themselves do; and
+Frequency, amplitude and offset follow the last command, each through three first-order lags of 40
+ms in series: 99 % of a change is complete after a third of a second. Such a filter never
+overshoots, so no sequence of commands rotates a base further than the commands themselves do; and
 its output has a continuous second derivative, so angle, velocity and acceleration never jump.
-Between two commands the motion has a closed form: the angle at a time does not depend on when or
-in which pieces it is computed.
+Between two commands the motion has a closed form: the angle at a time does not depend on when or in
+which pieces it is computed.
 """
 
 import math
@@ -36,7 +36,7 @@ class Whisking:
 
     Attributes:
         frequency_hz: The cycles per second, 0 to 30; at 0 the whiskers are held at the offset.
-        amplitude_rad: The turn to either side of the offset, rad.
+        amplitude_rad: The rotation to either side of the offset, rad.
         offset_rad: The middle of the whisking from rest, rad, rostral positive. Offset and
             amplitude together stay within 1.05 rad (60 degrees).
 
@@ -82,7 +82,7 @@ class Whisking:
 
 @dataclass(frozen=True)
 class _Segment:
-    """The motion from one command to the next.
+    """The motion between two commands, as the state of its lags at the start.
 
     Attributes:
         aim: The (3,) frequency, amplitude and offset commanded.
@@ -111,7 +111,7 @@ class _Segment:
 
 
 class Drive:
-    """An endless `Trajectory` that commands change."""
+    """An endless whisking `Trajectory` that commands change while it runs."""
 
     duration_s = math.inf
 
@@ -122,7 +122,7 @@ class Drive:
         self._segments = [_Segment(0.0, aim, still, 0.0)]
 
     def command(self, whisking: Whisking, t_s: float) -> None:
-        """Glide to another motion from a time on, at or after the last command's.
+        """Change smoothly to another motion from `t_s` on, the last command's time or later.
 
         Angles at earlier times stay the same, as far back as the command before.
         """
@@ -135,7 +135,7 @@ class Drive:
         self._segments = [last, _Segment(t_s, aim, away[0] + last.aim - aim, turned)]
 
     def protraction(self, t_s: Floats) -> Floats:
-        """Compute the bases' (n,) turns from rest at times, rad, rostral positive."""
+        """Compute the (n,) protraction from rest at times, rad, rostral positive."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)
         now = self._segments[-1]
         angle = _compute_angle(now, np.maximum(t, now.start_s))
@@ -145,7 +145,7 @@ class Drive:
         return angle
 
     def offsets(self, t_s: Floats, whiskers: tuple[Whisker, ...]) -> Floats:
-        """Compute turns, see `Trajectory`; rows are coupled as in the rat."""
+        """Compute rotations from rest, see `Trajectory.offsets`; rows are coupled as in the rat."""
         theta = self.protraction(t_s)
         return couple_whiskers(np.repeat(theta[:, None], len(whiskers), axis=1), whiskers)
 

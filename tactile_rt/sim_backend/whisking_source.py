@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec, stamp_samples
 
-LARGEST_MM = 1e3  # of an object and its position
+LARGEST_MM = 1e3  # of an object's size and position
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Placing:
 
 
 def parse_point(text: str, key: str) -> tuple[float, float, float]:
-    """Read a point ``x,y,z``, mm."""
+    """Parse the text ``x,y,z`` of an option `key` into a point, mm."""
     try:
         x, y, z = (float(part) for part in text.split(","))
         if not all(abs(v) <= LARGEST_MM for v in (x, y, z)):
@@ -69,18 +69,18 @@ def parse_point(text: str, key: str) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class WhiskingOptions(PacedOptions, Placing):
-    """Options of the whisking array: its first motion, its object and its sensors.
+    """Options of the whisking array: its initial motion, its object and its sensors.
 
-    The fields of `PacedOptions` are options too; they concern the loads, while angles are true.
-    So are those of `Placing`.
+    The fields of `PacedOptions` and `Placing` are options too; sensor errors affect the loads, not
+    the angles.
 
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
         amplitude_deg, offset_deg: The protraction is offset + amplitude sin(2 pi f t) from rest,
             rostral positive, degrees. See `Whisking` for the ranges.
-        object: The name (``mug-50``), category or mesh file of the object beside the array; empty:
-            the array whisks in air.
-        seconds: The length of the stream, s; 0: without end.
+        object: The name (``mug-50``), category or mesh file of the object beside the array; if
+            empty, the array whisks in air.
+        seconds: The length of the stream, s; 0 for no end.
     """
 
     frequency_hz: float = 8.0
@@ -98,24 +98,24 @@ class WhiskingOptions(PacedOptions, Placing):
 
     @property
     def whisking(self) -> Whisking:
-        """The first command."""
+        """The initial whisking command."""
         turns = math.radians(self.amplitude_deg), math.radians(self.offset_deg)
         return Whisking(self.frequency_hz, *turns)
 
 
 class WhiskingSource(PacedSource):
-    """An array in MuJoCo that whisks, alone or against an object that stands beside it.
+    """A source: an array in MuJoCo that whisks, alone or against an object beside it.
 
-    Its channels are the six base loads, in the turning frame of each base, and ``angle``: the
+    Its channels are the six base loads, in the rotating frame of each base, and ``angle``: the
     protraction of each base from rest, rad, rostral positive; each the mean over its millisecond.
     Two sources with the same commands at the same samples deliver the same.
 
     Args:
-        array: which array, see `files.load_array`: ``mouse`` (also if empty), ``rat-left``, a
+        array: its name or file, see `files.load_array`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
 
     Attributes:
-        commands: The pairs (first sample affected, command), in order.
+        commands: The (first affected sample, command) pairs in time order.
 
     Raises:
         ConfigError: no such array or object, or whiskers begin inside the object.
@@ -150,7 +150,7 @@ class WhiskingSource(PacedSource):
 
     @staticmethod
     def check(array: str, options: WhiskingOptions) -> ArraySpec:
-        """Open and close the array; return its spec, or raise the `ConfigError` of opening."""
+        """Open and close the array; return its spec, or raise a `ConfigError` on failure."""
         with WhiskingSource(array, options) as source:
             return source.spec
 

@@ -98,12 +98,12 @@ PROFILES = {
 
 
 def engine_of(profile: Profile) -> str:
-    """Return the engine that steps sweeps: MuJoCo if numba, which compiles `rods`, is missing."""
+    """Return the profile's engine, or ``mujoco`` if numba, which compiles `rods`, is missing."""
     return profile.engine if find_spec("numba") is not None else "mujoco"
 
 
 def engine_version(profile: Profile) -> str:
-    """Return the version of the `rods` engine, for sets and recordings; else ``mujoco``."""
+    """Return the `rods` engine's version, or ``mujoco``, to store with sets and recordings."""
     return ENGINE if engine_of(profile) == "rods" else "mujoco"
 
 
@@ -146,7 +146,7 @@ def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
 
 
 def stamp_samples(values: NDArray[np.float32], first: int = 0, start_ns: int = 0) -> Chunk:
-    """Make a chunk of valid values at the simulator's rate, from sample `first` on."""
+    """Make a chunk of values, all valid, at the simulator's rate from sample `first` on."""
     seq = first + np.arange(len(values), dtype=np.int64)
     valid = np.ones(values.shape[:2], dtype=np.bool_)
     return Chunk(seq, start_ns + seq * round(SAMPLE_MS * 1e6), values, valid)
@@ -230,7 +230,7 @@ def _add_whisker(
             quat=quaternion(rotation("z", turn)),
         )
         heading, origin = headings[i], nodes[i]
-        # The first half cell is clamped, or turns on a compliant mount.
+        # The first half cell is clamped, or rotates on a compliant mount.
         if i > 0 or whisker.mount_stiffness:
             for axis in ((0, 1, 0), (0, 0, 1)):
                 body.add_joint(
@@ -257,14 +257,14 @@ def _add_whisker(
 
 
 def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict[str, float]:
-    """Give every whisker Rayleigh damping at the damping ratio of its first mode.
+    """Set every whisker's joint damping to give its first mode the described damping ratio.
 
-    Stiffness-proportional: c = beta k with beta = 2 zeta / omega_1. The integrator itself adds
-    h k, which is subtracted; where that alone exceeds the target (short whiskers, coarse steps)
-    the whisker stays over-damped.
+    It is Rayleigh damping: c = beta k with beta = 2 zeta / omega_1. The integrator itself adds h k,
+    which is subtracted; where that alone exceeds the target (short whiskers, coarse steps) the
+    whisker stays over-damped.
 
     Args:
-        whiskers: whose damping ratios are used; other whiskers of the model get the published one.
+        whiskers: their damping ratios are used; other whiskers of the model get the published one.
 
     Returns:
         First resonance of every whisker, Hz.

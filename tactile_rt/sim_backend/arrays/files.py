@@ -1,4 +1,4 @@
-"""Arrays by name, of a species, a robot or another package, or from a CSV or TOML file.
+"""Whisker arrays, loaded by name (species, robot, package) or from a CSV or TOML file.
 
 Both kinds of file have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`;
 see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both formats. In TOML::
@@ -68,7 +68,7 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 def robot_text(name: str) -> str:
-    """Return the text of the .toml file of one of `ROBOTS`."""
+    """Return the text of a robot's array file (.toml); `name` is one of `ROBOTS`."""
     file = resources.files(__package__).joinpath("data", f"{name}.toml")
     return file.read_text(encoding="utf-8")
 
@@ -100,13 +100,12 @@ ANIMALS = (*SPECIES, *(f"{animal}-{side}" for animal in SPECIES for side in SIDE
 
 @cache
 def species_array(name: str) -> WhiskerArray:
-    """Return the array of an animal: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ...
+    """Return the whisker array of an animal: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ...
 
     ``mouse`` is ``mouse-right``. A left side alone is mounted as the mirror image of the right
-    side, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads; both
-    sides stand on one head, mounted as for the right side alone. The rat's pose in the published
-    sweeps is unknown: its head is turned like the mouse's and placed so that the means of their
-    base points coincide.
+    side, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads. Both
+    sides share one head, mounted as for the right side alone. The rat's pose in the published
+    sweeps is unknown: its head has the mouse's rotation, and the two mean base points coincide.
     """
     animal, _, side = name.partition("-")
     if name not in ANIMALS:
@@ -168,8 +167,8 @@ def load_array(name: str) -> WhiskerArray:
     """Load a single array by name or from a file.
 
     Args:
-        name: of an animal and side, see `species_array`, of a robot, see `ROBOTS`, or of another
-            package's array; or a path to a .csv or .toml file.
+        name: an animal and side (see `species_array`), a robot (see `ROBOTS`), another package's
+            array, or a path to a .csv or .toml file.
     """
     arrays = load_animals(name)
     if len(arrays) > 1:
@@ -178,7 +177,7 @@ def load_array(name: str) -> WhiskerArray:
 
 
 def load_animals(name: str) -> tuple[WhiskerArray, ...]:
-    """Load the arrays that share one world: a named one, or all of a file."""
+    """Load the arrays that share one world: a named array, or all of a file."""
     path = Path(name)
     if path.suffix.lower() in ARRAY_FILES:
         return read_animals(path)
@@ -191,10 +190,10 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
 
 
 def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...]:
-    """Read the array, or the several animals, of a .csv or .toml file.
+    """Read one array, or those of several animals, from a .csv or .toml file.
 
     Args:
-        text: content to use in place of that of a .toml file; None: read the file.
+        text: content to parse instead of the .toml file's; if None, the file is read.
     """
     if path.suffix.lower() == ".csv":
         whiskers = _read_csv(path)
@@ -301,7 +300,7 @@ def _check_distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Wh
 
 
 def _check_columns(nodes: settings.SettingNode, path: list[str | int]) -> None:
-    """Refuse a table with a key that is not a column."""
+    """Raise a `ConfigError` if a table has a key that is not a column."""
     for key, node in nodes.at(path).value.items():
         if key not in COLUMNS:
             where, hint = f"{node.where}: {settings.format_path(path)}", settings.hint(key, COLUMNS)

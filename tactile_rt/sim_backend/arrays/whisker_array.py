@@ -37,7 +37,7 @@ class Mount:
         return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
 
     def mirror(self) -> "Mount":
-        """Return the pose mirrored in world x."""
+        """Return the pose mirrored in the world's y-z plane."""
         x, y, z = self.position
         roll, pitch, yaw = self.roll_pitch_yaw
         return Mount((-x, y, z), (roll, -pitch, -yaw))
@@ -51,16 +51,16 @@ MOUNT = Mount(
 
 @dataclass(frozen=True)
 class WhiskerArray:
-    """Whiskers on one head.
+    """A whisker array: the whiskers of one head, its pose, and their sensor.
 
     Attributes:
-        whiskers: The array's whiskers in the frame of the head, in mm and rad.
-        sensor: The sensor that reads the whiskers; None: the base loads are read as they are.
-        gravity: The gravity in the world frame, m/s^2; zeros: the whiskers have no weight. Loads
-            are relative to a tare under this gravity.
+        whiskers: The whiskers in the frame of the head, mm and rad.
+        sensor: The sensor that reads the whiskers; None if the base loads are read as they are.
+        gravity: The gravity in the world frame, m/s^2; zero (weightless) by default. Loads are
+            relative to a tare under this gravity.
 
     Raises:
-        ConfigError: no whiskers, or two of one name or in one cell of the grid.
+        ConfigError: no whiskers, or two with the same name or grid cell.
     """
 
     name: str
@@ -88,12 +88,12 @@ class WhiskerArray:
 
 
 def mirror_whisker(whisker: Whisker) -> Whisker:
-    """Return the whisker on the other side of the head, its points reflected in x.
+    """Return a whisker's mirror image, on the other side of the head.
 
-    Its curvature is the same, and its frame is right-handed, too: x along the whisker and y towards
-    its concave side are the reflected axes, and z = x cross y is opposite to the reflected z (which
-    makes the base angles -theta, phi, -zeta). So a mirrored contact gives the same fx, fy and mz,
-    and fz, mx and my of the opposite sign.
+    All points are reflected in x; the curvature stays. The frame stays right-handed: x along the
+    whisker and y towards its concave side are reflected, and z = x cross y is opposite to the
+    reflected z (so the base angles are -theta, phi, -zeta). A mirrored contact gives the same fx,
+    fy and mz, and fz, mx and my of the opposite sign.
     """
     x, y, z = whisker.base
     theta, phi, zeta = whisker.angles
@@ -101,7 +101,7 @@ def mirror_whisker(whisker: Whisker) -> Whisker:
 
 
 def both_sides(right: WhiskerArray, name: str) -> WhiskerArray:
-    """Put an array and its mirror image on one head: ``R.C2`` and ``L.C2``.
+    """Return an array joined with its mirror image on one head (``R.C2``, ``L.C2``).
 
     The grid is the face seen from the front: the right side keeps its cells, on the viewer's left,
     and the left side mirrors them, on the viewer's right, so that the most rostral columns meet in
@@ -117,13 +117,13 @@ def both_sides(right: WhiskerArray, name: str) -> WhiskerArray:
 
 
 def place(arrays: Sequence[WhiskerArray]) -> tuple[WhiskerArray, ...]:
-    """Put several animals in one world: make element names and grid cells distinct.
+    """Return several animals' arrays for one world, with distinct element names and grid cells.
 
     The k-th animal's whiskers are called ``k.C2`` or ``k.R.C2`` (k from 1), and its rows of the
     grid follow below those of the animals before it. A single animal keeps its names.
 
     Raises:
-        ConfigError: two in the same pose, or under different gravity.
+        ConfigError: two arrays have the same pose, or different gravity.
     """
     if len(arrays) == 1:
         return (arrays[0],)
@@ -151,7 +151,7 @@ def centred_mount(
     centre: Point = (0.0, 0.0, 0.0),
     roll_pitch_yaw: Point = (0.0, 0.0, 0.0),
 ) -> Mount:
-    """Return the mount that brings the mean base point to `centre` (world, mm)."""
+    """Return the mount that places the whiskers' mean base point at `centre` (world, mm)."""
     turned = Mount((0.0, 0.0, 0.0), roll_pitch_yaw).rotation
     x, y, z = (centre - turned @ np.mean([w.base for w in whiskers], axis=0)).tolist()
     return Mount((x, y, z), roll_pitch_yaw)

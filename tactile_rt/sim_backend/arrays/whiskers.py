@@ -1,4 +1,4 @@
-"""The geometry and material of a whisker, and its description by a row of a table.
+"""Geometry and material of a whisker, which a table row can describe.
 
 Lengths in mm and angles in rad here, as the field publishes them; `world` converts.
 """
@@ -62,14 +62,14 @@ TAKEN = ("world", "head", "object")  # bodies that share a model with the whiske
 
 @dataclass(frozen=True)
 class Whisker:
-    """One whisker: a tapered, planar, parabolic beam on its base point.
+    """A whisker: a tapered, planar, parabolic beam, mounted at its base point.
 
     Attributes:
         name: The whisker's name, without spaces, e.g. ``C2``: row letter and column.
         row, column: The whisker's cell on the array's grid, counted from 0 (row A, column 0).
         length: The arc length S from base to tip, mm.
         curvature: The coefficient a of y = a x^2 in the whisker's plane, 1/mm; 0 is straight, and a
-            negative one curves towards -y.
+            negative value curves towards -y.
         base: The base point (x, y, z) in the array frame, mm.
         angles: The base angles (theta, phi, zeta): azimuth, elevation, torsion, rad.
         base_radius, tip_radius: The radii of the cone at its two ends, mm; equal for a cylinder,
@@ -78,8 +78,8 @@ class Whisker:
         density_base, density_tip: The mass density at either end, kg/m^3.
         damping_ratio: The damping ratio of the first mode (1 is critical).
         mount_stiffness: The rotational stiffness of the whisker's mount, about each axis across the
-            whisker, N m / rad; 0: the mount is rigid.
-        mount_damping: The damping of that rotation, N m s / rad.
+            whisker, N m / rad; 0 for a rigid mount.
+        mount_damping: The rotational damping of the mount, N m s / rad.
     """
 
     name: str
@@ -146,10 +146,10 @@ class Whisker:
 
     @classmethod
     def from_columns(cls, values: Mapping[str, object]) -> "Whisker":
-        """Make a whisker from a row: texts or numbers by `REQUIRED` and `OPTIONAL` column.
+        """Make a whisker from a table row: text or numbers by column name.
 
-        Rows of the grid are counted from 1, as in the field's tables. An absent or empty optional
-        value is keratin's; a radius or density given for the base alone also holds for the tip.
+        Columns: `REQUIRED`, `OPTIONAL`; grid rows count from 1, as in the field's tables. The
+        default material is keratin; a radius or density of the base alone holds for the tip, too.
         """
         given = {k: v for k, v in values.items() if v is not None and v != ""}
         missing = [column for column in REQUIRED if column not in given]
@@ -196,11 +196,11 @@ class Whisker:
         return base + (tip - base) * np.asarray(s) / self.length
 
     def bending_stiffness(self, s: Floats) -> Floats:
-        """Return E I (N mm^2) at arc length s (mm), I = pi r^4/4."""
+        """Return the bending stiffness E I (N mm^2) at arc length s (mm)."""
         return self.young_modulus * 1e-6 * np.pi * self.radius(s) ** 4 / 4
 
     def centreline(self, s: Floats) -> Floats:
-        """Return points (len(s), 3), mm, at arc lengths s (mm) in the whisker frame.
+        """Return centreline points (len(s), 3) at arc lengths s, mm, in the whisker frame.
 
         The whisker leaves its base along +x and curves towards +y (-y if negatively curved).
         """
@@ -223,16 +223,16 @@ class Whisker:
 
 
 def link_nodes(whisker: Whisker, links: int) -> Floats:
-    """Return arc lengths (links + 2,), mm, of base, joints in mid-cell, and tip."""
+    """Return arc lengths (links + 2,), mm, of base, joints (at cell midpoints) and tip."""
     joints = (np.arange(links) + 0.5) * (whisker.length / links)
     return np.concatenate([[0.0], joints, [whisker.length]])
 
 
 def joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
-    """Return the stiffness (uN m / rad) of the joint in mid-cell.
+    """Return the stiffness (uN m / rad) of the joint at a cell's midpoint.
 
-    The joint bends a tip under a force as much as the beam's own piece does, by the integral of
-    (L - s)^2 / E I: towards a thin tip, that is more than E I in mid-cell would give.
+    Under a force at the tip, the joint deflects it as much as this cell of the beam does, by the
+    integral of (L - s)^2 / E I: near a thin tip, more than E I at the midpoint would give.
     """
     s, weights = start + (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
     lever = whisker.length - s
@@ -243,8 +243,8 @@ def joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
 def link_inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, float, float, float]:
     """Return a link's mass (mg), centroid (mm from start), axial and transverse inertia (mg mm^2).
 
-    They are those of the tapered piece: with uniform links the mass would lie too far out, and the
-    whisker's first resonance would be up to 3 % too low.
+    The taper is included: with uniform links the mass would lie too far out, and the whisker's
+    first resonance would be up to 3 % too low.
     """
     x, weights = (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
     radius = whisker.radius(start + x)
@@ -256,7 +256,7 @@ def link_inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, fl
 
 
 def rotation(axis: str, angle: float | Floats) -> Floats:
-    """Return right-handed rotations (..., 3, 3) by angles (rad) about x, y or z."""
+    """Return right-handed rotation matrices (..., 3, 3) by angles (rad) about x, y or z."""
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., 3 - i - j, 3 - i - j] = 1.0

@@ -30,7 +30,7 @@ PAPER = (
 
 
 def write_card(folder: Path, fit: Fit) -> Card:
-    """Write the card of a set, finished or not, into its folder."""
+    """Write README.md and card.png into a (perhaps unfinished) set's folder; return the card."""
     manifest = SweepManifest.read(folder)
     card, examples = survey(folder, fit)
     write_whole(folder / "card.png", lambda file: _draw_card(card, examples, manifest, file))
@@ -117,7 +117,7 @@ def _describe_loads(card: Card) -> str:
 
 
 def _format_load(value: float, card: Card) -> str:
-    """Return a load with its unit, e.g. 39 uN."""
+    """Return a load as text with its unit, e.g. 39 uN."""
     power = min(max(math.floor(math.log10(value) / 3), -4), 0) if value > 0 else 0
     return f"{value / 1000**power:.3g} {PREFIXES[power]}{card.unit}"
 
@@ -148,7 +148,7 @@ def _list_accuracies(found: list[Separability]) -> str:
 def _draw_card(
     card: Card, examples: dict[str, NDArray[np.float32]], manifest: SweepManifest, file: BinaryIO
 ) -> None:
-    """Draw forces, and the load of a sweep of some categories, as a PNG."""
+    """Draw a histogram of loads, and an example sweep of some categories, as a PNG."""
     spread = np.linspace(0, len(examples) - 1, min(len(examples), EXAMPLES)).round().astype(int)
     chosen = [sorted(examples)[i] for i in spread]
     rows = -(-len(chosen) // COLUMNS)

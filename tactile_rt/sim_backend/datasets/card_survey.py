@@ -1,9 +1,9 @@
 """Counts and measurements of a sweep set: the numbers of its card.
 
-One object is read at a time, so that the set may be larger than the memory. A set's separability
-is checked as published: Chung et al. (2025) decode 2, 3 and 4 classes (cups, microwaves, chairs,
-trains) from the raw loads by support vector machines. Here the machines are tested on objects that
-they never saw, or they would only have to recognise sweeps of known objects.
+One object is read at a time, so that the set may be larger than the memory. A set's separability is
+checked as published: Chung et al. (2025) decode 2, 3 and 4 classes (cups, microwaves, chairs,
+trains) from the raw loads by support vector machines. Here the machines are tested on new objects,
+or they would only have to recognise sweeps of known objects.
 """
 
 import math
@@ -44,7 +44,7 @@ Fit = Callable[
 
 @dataclass(frozen=True)
 class Features:
-    """Input features of some sweeps, and their categories."""
+    """Input features (sweep, feature) of some sweeps, and their categories (sweep,)."""
 
     values: NDArray[np.float32]
     categories: NDArray[np.str_]
@@ -52,10 +52,10 @@ class Features:
 
 @dataclass(frozen=True)
 class Separability:
-    """The accuracy on some classes, for objects that were not trained on.
+    """A classifier's accuracy on some classes, for objects that it was not trained on.
 
     Attributes:
-        accuracy: The mean over classes of the share of correctly decided sweeps, 0 to 1.
+        accuracy: The mean over classes of the share of correctly classified sweeps, 0 to 1.
     """
 
     classes: tuple[str, ...]
@@ -64,7 +64,7 @@ class Separability:
 
 @dataclass
 class Card:
-    """The counts and measurements of a set.
+    """The counts and measurements that a sweep set's card shows.
 
     Attributes:
         sweeps, objects: The counts of sweeps and of objects, by split and category.
@@ -72,9 +72,9 @@ class Card:
             the first channel.
         load_edges: The (bin + 1,) edges of the histogram of the largest load of every touched
             whisker in every sweep.
-        load_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
+        load_counts: The (bin,) numbers of touched whiskers over all sweeps, in each bin of it.
         coverage: The share of the sweeps in which each whisker is touched, 0 to 1, by its name.
-        whiskers_touched: The mean number of whiskers touched by a sweep that touches.
+        whiskers_touched: The mean number of touched whiskers, over sweeps that touch any.
     """
 
     sweeps: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -100,7 +100,7 @@ class Card:
 
 @dataclass
 class _Findings:
-    """Data gathered from one object after the other."""
+    """Measurements collected object by object, which `_summarise` converts into the card."""
 
     # (element,) of every sweep: the largest load; 0 for an untouched whisker.
     peaks: list[NDArray[np.float32]] = field(default_factory=list)
@@ -114,10 +114,10 @@ class _Findings:
 
 
 def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]]:
-    """Measure the existing objects of a set.
+    """Measure the objects that exist in a sweep set's folder, and return its card.
 
     Returns:
-        The card, and the load (sample, element) of a sweep with a touch, by category.
+        The card, and for each category the load (sample, element) of a sweep with a touch.
     """
     manifest = SweepManifest.read(folder)
     units = manifest.spec.units
@@ -214,11 +214,11 @@ def _summarise(card: Card, found: _Findings, manifest: SweepManifest) -> None:
 def window_features(
     values: NDArray[np.float32], start: int, period_ms: float, limits: ChannelLimits
 ) -> NDArray[np.float32]:
-    """Return the input features (22 * element * channel,) of one sweep.
+    """Compute a sweep's input features (22 * element * channel,): log-scaled means of 22 steps.
 
     Args:
         values: (sample, element, channel) SI.
-        start: sample of first contact.
+        start: index of the first sample in contact.
     """
     edges = start + np.arange(STEPS + 1) * STEP_MS / period_ms
     edges = np.minimum(edges.round().astype(int), len(values) - 1)
@@ -230,10 +230,10 @@ def window_features(
 
 
 def check_separability(train: Features, test: Features, fit: Fit) -> list[Separability]:
-    """Measure the accuracy on the 2, 3 and 4 classes nearest to the published ones.
+    """Measure accuracy on the 2, 3 and 4 categories nearest to the published classes.
 
     Args:
-        train, test: sweeps of different objects.
+        train, test: features of sweeps; no object is in both.
     """
     known = sorted(set(train.categories) & set(test.categories))
     nearest = [next((c for c in names if c in known), None) for names in PUBLISHED]
@@ -243,7 +243,7 @@ def check_separability(train: Features, test: Features, fit: Fit) -> list[Separa
 
 
 def _accuracy(train: Features, test: Features, classes: tuple[str, ...], fit: Fit) -> float:
-    """Return the mean over classes of the share of correctly decided test sweeps."""
+    """Return the mean over classes of the share of correctly classified test sweeps."""
     chosen = np.concatenate([np.flatnonzero(train.categories == c)[:PER_CLASS] for c in classes])
     predict = fit(train.values[chosen], train.categories[chosen], PENALTY)
     right = [(predict(test.values[test.categories == c]) == c).mean() for c in classes]

@@ -97,16 +97,16 @@ def make_sweeps(
     engine: str = "processes",
     address: str | None = None,
 ) -> Generator[str, None, None]:
-    """Make the missing sweeps of a set; yield each object's name when finished.
+    """Simulate the missing sweeps of a set; yield each object's name once it is done.
 
     Args:
-        folder: the set's; on a cluster, on a file system that all of its machines share.
-        processes: number of processes or tasks at a time; None: one per core.
-        engine: "processes" of this machine, or "ray".
+        folder: the set's folder; with "ray", on a file system that all machines share.
+        processes: number of processes or tasks at a time; if None, one per core.
+        engine: "processes" on this machine, or "ray" on a cluster.
 
     Raises:
-        ConfigError: no such split or engine, or the folder holds another set, or sweeps of an
-            unknown one.
+        ConfigError: no such split or engine, or the folder holds another set, or sweeps without a
+            manifest.
         TactileError: an object kills every process that tries to make it.
     """
     if engine not in ENGINES:
@@ -130,7 +130,7 @@ def make_sweeps(
         outcomes = run_processes(work, todo, processes or os.cpu_count() or 1)
     for name, failure in outcomes:
         if failure is not None:
-            if recipe.objects.generated:  # none of these is broken
+            if recipe.objects.generated:  # no parametric object is broken
                 raise TactileError(f"{name} cannot be made: {failure}")
             skipped[name] = failure
             write_skipped(folder, skipped)
@@ -139,7 +139,7 @@ def make_sweeps(
 
 
 def _interleave_splits(manifest: SweepManifest, missing: set[str]) -> list[str]:
-    """Order objects so that all splits grow evenly, the test split twice as fast."""
+    """Sort missing objects so that all splits grow evenly, the test split twice as fast."""
     alike: dict[tuple[str, str], list[str]] = {}
     for side, names in manifest.split.items():
         for name in names:
@@ -153,13 +153,13 @@ def _interleave_splits(manifest: SweepManifest, missing: set[str]) -> list[str]:
 
 
 def finished_objects(folder: Path, names: Sequence[str]) -> list[str]:
-    """Return the objects that need no more work: they exist, or cannot be made."""
+    """Return the named objects that are done: their file exists, or they are skipped."""
     skipped = read_skipped(folder) if folder.is_dir() else {}
     return [n for n in names if n in skipped or has_object(folder, n)]
 
 
 def _refuse_strays(folder: Path, manifest: SweepManifest) -> None:
-    """Refuse sweeps without their manifest, which may belong to another set."""
+    """Raise a `ConfigError` for sweeps without a manifest, as they may be another set's."""
     if (folder / MANIFEST).exists() or not any(has_object(folder, n) for n in manifest.names()):
         return
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
@@ -172,10 +172,10 @@ def _refuse_strays(folder: Path, manifest: SweepManifest) -> None:
 
 @dataclass(frozen=True)
 class SweepRecord:
-    """One finished sweep.
+    """A simulated sweep: its sensor readings, its parameters, and its contacts if requested.
 
     Attributes:
-        values: The (sample, element, channel) loads of the sweep, SI.
+        values: The (sample, element, channel) readings, SI; loads if the array has no sensor.
     """
 
     values: Floats
@@ -185,7 +185,7 @@ class SweepRecord:
 
 @dataclass(frozen=True)
 class _Work:
-    """A callable that makes all sweeps of an object, or returns why it cannot."""
+    """A callable that stores all sweeps of an object, or returns why it cannot."""
 
     recipe: SweepRecipe
     folder: Path
@@ -214,7 +214,7 @@ class _Work:
 
 @lru_cache(maxsize=1)
 def _choose_objects_once(choice: bytes) -> ShapeObjects | MeshObjects:
-    """Choose objects once per process, since Ray hands each task its own work."""
+    """Return the chosen objects, cached per process, since Ray copies the work to each task."""
     return choose_objects(msgspec.json.decode(choice, type=ObjectChoice))
 
 
@@ -230,7 +230,7 @@ def _write(folder: Path, name: str, records: Sequence[SweepRecord], target: Tact
 
 
 def fingerprint(target: TactileObject) -> str:
-    """Return a hash of an object's convex pieces, whatever they were made from."""
+    """Return a hash of the vertices and faces of an object's convex pieces."""
     digest = hashlib.sha256()
     for piece in target.pieces:
         digest.update(np.asarray(piece.vertices, dtype="<f8").tobytes())
@@ -239,25 +239,25 @@ def fingerprint(target: TactileObject) -> str:
 
 
 def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> SweepRecord:
-    """Simulate one sweep of a set.
+    """Simulate sweep `index` of an object, with the parameters that the recipe draws for it.
 
-    A drawn sweep that misses the array, that too few whiskers reach or that turns unstable is drawn
-    again, up to 20 times; a sweep of a combination of given values is not.
+    If the sweep misses the array, too few whiskers reach the object or the simulation is unstable,
+    it is drawn again, up to 20 draws in all; with listed values (`each`, `plus`) it is not.
 
     Returns:
         Values (sample, element, channel), SI, and the parameters of `sweep.Sweep` with `draw`, the
         sweep's number among those of its combination, `touches`, 0 if it misses the array,
         `unstable`, 1 if it could not be simulated at this profile (its values are 0 then),
         `saturated`, the share of the readings that the sensor clips, and `wedged`, the number of
-        whiskers that had no room, see `SweepSimulation`. Contacts, if the recipe asks for them, are
-        the true ones, whatever the sensors read.
+        whiskers without room, see `SweepSimulation`. Contacts, if the recipe requests them, come
+        from the simulation, without any sensor error.
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
     ideal = load_animals(recipe.array)
     elements = sum(len(animal.whiskers) for animal in ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    # A sweep that misses the array is kept where a set needs every combination.
+    # A sweep that misses the array stays in a set that needs every combination.
     most = DRAWS if recipe.sweeps.combinations() == [{}] else 1
     for tries in range(most):
         shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)
@@ -293,8 +293,8 @@ def _simulate(
     """Simulate a sweep at the simulator's own rate; return None if it is unstable.
 
     Returns:
-        (sample, element, load) `sensor_spec.LOADS`, and contacts, which are empty unless the
-        recipe asks for them.
+        (sample, element, load) loads, in the order of `sensor_spec.LOADS`, and contacts, which are
+        empty unless the recipe requests them.
     """
     lead, total = _count_samples(recipe)
     try:
@@ -312,10 +312,10 @@ def _simulate(
 def _apply_sensor(
     recipe: SweepRecipe, target: TactileObject, index: int, loads: NDArray[np.float64]
 ) -> tuple[Floats, float]:
-    """Return readings (sample, element, channel), and the share of them that the sensor clips.
+    """Convert loads to sensor readings (sample, element, channel); return the clipped share too.
 
-    Noise, offset and drift of the array's description are left to training, which draws them anew
-    each time that it uses a sweep.
+    The described noise, offset and drift are not added here: training draws them anew each time
+    that it uses a sweep.
     """
     # The description stays that of the ideal arrays: a robot does not know how its own differs.
     ideal = load_animals(recipe.array)
@@ -335,16 +335,16 @@ def _apply_sensor(
 
 
 def _count_samples(recipe: SweepRecipe) -> tuple[int, int]:
-    """Return the samples of the lead, and of lead and sweep, at the simulator's rate."""
+    """Return the number of simulator samples in the lead, and in lead and sweep together."""
     per_output = recipe.period_ms / SAMPLE_MS
     # One more, for the first output's kernel: it is centred one period after the first input.
     return round((recipe.lead + 1) * per_output), round((recipe.samples + SPARE) * per_output)
 
 
 def _make_chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
-    """Make a chunk of a lead at rest, then loads (sample, element, channel), then rest.
+    """Make a chunk: zeros for the lead, loads (sample, element, channel), zeros to the end.
 
-    At rest the whiskers carry no load at all, so rest needs no simulation.
+    At rest the whiskers carry no load, so the rest needs no simulation.
     """
     lead, total = _count_samples(recipe)
     values = np.zeros((total, *loads.shape[1:]), dtype=np.float32)
@@ -353,9 +353,9 @@ def _make_chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
 
 
 def _resample(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> Floats:
-    """Resample a chunk to (sample, element, channel), as the live stream is.
+    """Resample a chunk like the live stream, to (sample, element, channel).
 
-    With `every_nth` in the recipe, take the last sample by the time of each output instead.
+    With `every_nth` in the recipe, select the last sample up to each output's time instead.
     """
     if recipe.every_nth:
         due_ns = chunk.t_ns[0] + recipe.period_ns * np.arange(1, recipe.samples + 1)

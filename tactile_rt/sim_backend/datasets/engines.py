@@ -30,10 +30,10 @@ Outcome = tuple[str, str | None]  # the name, and the work's answer
 
 
 def run_processes(work: Work, names: Sequence[str], processes: int) -> Iterator[Outcome]:
-    """Work through the names in parallel processes; yield each when it is finished.
+    """Call `work` on every name in parallel processes; yield each outcome when ready.
 
-    An exception in the work ends the run and is raised here. A process that dies is replaced,
-    and its name tried again; closing the iterator kills the processes.
+    An exception in the work ends the run and is raised here. A process that dies is replaced, and
+    its name is tried again, up to 3 times in all. Closing the iterator kills the processes.
 
     Args:
         work: must be picklable.
@@ -85,7 +85,7 @@ def _start(work: Work) -> tuple[Connection, SpawnProcess]:
     # Only this process handles Ctrl-C: the others must not receive it, even while they start.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with _one_thread():
+        with _limit_threads():
             process.start()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
@@ -94,8 +94,8 @@ def _start(work: Work) -> tuple[Connection, SpawnProcess]:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limit processes started here to one thread each: every core has a process."""
+def _limit_threads() -> Iterator[None]:
+    """Limit processes started in this context to one thread: every core has a process."""
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
@@ -131,16 +131,16 @@ def _die_with_parent() -> None:
 def run_ray(
     work: Work, names: Sequence[str], processes: int | None = None, address: str | None = None
 ) -> Iterator[Outcome]:
-    """Work through the names on a Ray cluster; yield each when it is finished.
+    """Call `work` on every name on a Ray cluster; yield each outcome when ready.
 
     A task whose worker or node is lost is tried again elsewhere.
 
     Args:
         work: must be picklable; runs on any node, so the files that it writes must be on a file
             system that all nodes share.
-        processes: tasks at a time; None for one per CPU of the cluster.
-        address: of the cluster; None for the one that RAY_ADDRESS names or that runs on this
-            machine, or else a new one of this machine alone.
+        processes: number of tasks at a time; if None, one per CPU of the cluster.
+        address: HOST:PORT of the cluster; if None, the cluster that RAY_ADDRESS names or that runs
+            on this machine, or else a new one of this machine alone.
 
     Raises:
         ConfigError: Ray is not installed, or no cluster answers at the address.

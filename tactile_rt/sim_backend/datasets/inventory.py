@@ -21,7 +21,7 @@ STALE_S = 60  # no file of a set takes this long to write
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts of a set's sweeps and of its skipped objects."""
+    """Counts of a set's sweeps, of problems among them, and of skipped objects."""
 
     sweeps: int = 0
     misses: int = 0
@@ -32,13 +32,13 @@ class Tally:
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Share of sweeps that touch a whisker, and share that exceed the sensor's range."""
+        """Shares of sweeps that touch a whisker and that saturate the sensor, 0 to 1."""
         sweeps = max(1, self.sweeps)
         return (self.sweeps - self.misses) / sweeps, self.saturated / sweeps
 
     @property
     def shortcomings(self) -> str:
-        """Problems to report beside the number of sweeps; empty if all is well."""
+        """Text that counts the set's problems, with hints at remedies; empty without problems."""
         problems = {
             f"{self.misses} miss the array (larger `size_mm`, less `distance_mm`, other "
             "`height_mm`)": self.misses,
@@ -51,7 +51,7 @@ class Tally:
 
 
 def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
-    """Count the sweeps of those objects that a folder has, `sweeps` each."""
+    """Count sweeps and problems of the named objects in a folder; each has `sweeps` sweeps."""
     existing = [name for name in names if has_object(folder, name)]
     counts = dict.fromkeys(COUNTED, 0)
     for name in existing:
@@ -63,7 +63,7 @@ def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete stale hidden files, which killed processes left half-written."""
+    """Delete half-written hidden files that killed processes left over a minute ago."""
     names = (MANIFEST, SKIPPED, SUMS, "*.npz")
     for path in (path for name in names for path in folder.glob(f".{name}.*")):
         if time.time() - path.stat().st_mtime > STALE_S:
@@ -71,10 +71,10 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def write_sums(folder: Path) -> None:
-    """Write SHA256SUMS of the set's files; sums that exist already stay.
+    """Write the checksums of a set's files to SHA256SUMS; existing checksums stay.
 
-    So a file that was damaged since never counts as intact; one that was made anew has the same
-    content, because sweeps depend only on their recipe.
+    So a file damaged since then never counts as intact; a file made anew has the same content,
+    because sweeps depend only on their recipe.
     """
     known = _read_sums(folder) if (folder / SUMS).exists() else {}
     names = [MANIFEST, *([SKIPPED] if (folder / SKIPPED).exists() else [])]
@@ -86,12 +86,12 @@ def write_sums(folder: Path) -> None:
 
 
 def written_sum(folder: Path, name: str) -> str | None:
-    """Return the recorded checksum of a finished set's file; None without one."""
+    """Return a file's checksum in the set's SHA256SUMS; None if none is recorded."""
     return _read_sums(folder).get(name) if (folder / SUMS).exists() else None
 
 
 def check_sums(folder: Path) -> int:
-    """Compare every file with SHA256SUMS.
+    """Compare the checksum of every listed file with SHA256SUMS.
 
     Returns:
         The number of files, all of which are intact.

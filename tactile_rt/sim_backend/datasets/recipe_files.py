@@ -32,9 +32,9 @@ def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ())
     """Read a shipped recipe by its name, or the recipe in a TOML file.
 
     Args:
-        folder: the base of relative paths in a TOML file; None: the working directory, as on a
+        folder: the base of relative paths in a TOML file; if None, the working directory, as on a
             command line.
-        sets: settings ``key=value``; ``objects.test=3`` sets a key of a table.
+        sets: settings ``key=value`` to override; ``objects.test=3`` sets a key of a table.
     """
     if Path(name).suffix == ".toml":
         return _parse(settings.set_keys(settings.read_toml(Path(name)), sets, SweepRecipe), folder)
@@ -47,7 +47,7 @@ def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ())
 
 
 def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepRecipe:
-    """Return the recipe that is stored in a set's manifest or a model's card.
+    """Make a recipe from the dictionary stored in a set's manifest or a model's card.
 
     Raises:
         ConfigError: this release does not understand the recipe.
@@ -73,7 +73,7 @@ def _parse(nodes: settings.SettingNode, folder: Path | None = None) -> SweepReci
 
 
 def _add_usual_values(nodes: settings.SettingNode, folder: Path | None) -> None:
-    """Add the distance, period and lengths that follow from a recipe's array."""
+    """Fill in a recipe's missing distance, period and lengths from its array."""
     written = nodes.plain()
     array, period_ms = written.get("array", SweepRecipe.array), SweepRecipe.period_ms
     sweeps = nodes.value.setdefault("sweeps", _make_node(nodes, {})).value
@@ -95,7 +95,7 @@ def _make_node(nodes: settings.SettingNode, value: Any) -> settings.SettingNode:
 
 
 def _find_usual_lengths(period_ms: float) -> tuple[float, float]:
-    """Return lead and length (ms) of a sweep, enough for baseline and window."""
+    """Return the usual lead and length (ms) of a sweep, enough for baseline and window."""
     # A baseline takes a fixed number of samples; a window a fixed number of steps, and spare.
     lead_ms = max(SweepRecipe.lead_ms, SweepRecipe.lead_ms / SweepRecipe.period_ms * period_ms)
     after_ms = SweepRecipe.length_ms - SweepRecipe.lead_ms
@@ -104,7 +104,7 @@ def _find_usual_lengths(period_ms: float) -> tuple[float, float]:
 
 
 def _make_absolute(path: str, folder: Path | None) -> str:
-    """Make a path absolute: parts of a set may be made from other folders."""
+    """Return the absolute path, since parts of a set may be made from other folders."""
     try:
         return str(((folder or Path()) / Path(path).expanduser()).absolute())
     except RuntimeError:  # no such user, or one without a home

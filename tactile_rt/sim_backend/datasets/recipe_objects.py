@@ -24,10 +24,10 @@ PER_WITHHELD = 12
 
 @dataclass(frozen=True)
 class ShapeObjects:
-    """Parametric objects.
+    """The parametric objects that a recipe chooses, and their split.
 
     Raises:
-        ConfigError: a category does not exist, or has too few objects for the split.
+        ConfigError: a category does not exist or is too small for the split.
     """
 
     choice: ObjectChoice
@@ -38,7 +38,7 @@ class ShapeObjects:
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
-        """Names of the classes, in the order of their labels."""
+        """Names of the classes; a label is an index into them."""
         known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.added_categories())
         _check_categories(self.choice.categories, known)
         unknown = (*self.choice.withheld, *self.choice.outliers)
@@ -46,7 +46,7 @@ class ShapeObjects:
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
-        """Names of the categories that training never sees."""
+        """Names of the categories withheld from training, for open-set tests."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
         known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.OUTLIERS)
         _check_categories(unknown, (*known, *shapes.added_categories()))
@@ -54,7 +54,7 @@ class ShapeObjects:
 
     @cached_property
     def split(self) -> dict[str, tuple[str, ...]]:
-        """Object names per split."""
+        """Names of the objects in each split."""
         choice = self.choice
         validation, test = int(choice.validation), int(choice.test)
         if choice.per_category - validation - test < 1:
@@ -80,7 +80,7 @@ class ShapeObjects:
 
     @property
     def category_of(self) -> dict[str, str]:
-        """Category of every object whose name does not give it."""
+        """Category by object name, for names that do not give it."""
         if not self._prefix:
             return {}
         names = chain.from_iterable(self.split.values())
@@ -91,19 +91,19 @@ class ShapeObjects:
         return load_object(name)
 
     def target(self, name: str) -> str:
-        """Return the object's name, as a ``sim:`` URL names it."""
+        """Return the name by which a ``sim:`` URL finds the object: its own."""
         return name
 
 
 @dataclass(frozen=True)
 class MeshObjects:
-    """Objects from a folder of meshes, see `object_sets`.
+    """The objects that a recipe chooses from a folder of meshes, and their split.
 
-    The split depends on their names alone, so that a folder that grows moves few of them from one
-    side to the other. Objects of one shape in the folder's table stay together, and count as one.
+    `object_sets` reads the folder. The split depends on object names alone, so that few change
+    sides when the folder grows. Objects of one shape in its table stay together, and count as one.
 
     Raises:
-        ConfigError: no such folder, a category is not in it, or has too few objects for the split.
+        ConfigError: no such folder, or a category is missing or too small for the split.
     """
 
     choice: ObjectChoice
@@ -117,7 +117,7 @@ class MeshObjects:
 
     @cached_property
     def _names(self) -> dict[str, str]:
-        """Name of every object in its folder, by a valid file name."""
+        """Name in the folder (``category/object``), by name in the set (``category-object``)."""
         names = {name.replace("/", "-"): name for name in self._set.names}
         if len(names) < len(self._set.names):
             raise ConfigError(f"{self.choice.source}: two objects differ by / and - alone")
@@ -125,7 +125,7 @@ class MeshObjects:
 
     @cached_property
     def _by_category(self) -> dict[str, list[list[str]]]:
-        """Objects of each category, those of one shape together."""
+        """Groups of objects of one shape, by category, in a fixed shuffled order."""
         origins, omit, only = self._set.origins, self.choice.without_source, self.choice.only_source
         sources = {name: origin.source for name, origin in origins.items()}
         for source in filter(None, (omit, only)):
@@ -148,7 +148,7 @@ class MeshObjects:
 
     @cached_property
     def categories(self) -> tuple[str, ...]:
-        """Names of the classes, in the order of their labels."""
+        """Names of the classes; a label is an index into them."""
         known = tuple(sorted(self._by_category))
         _check_categories(self.choice.categories, known)
         unknown = (*self.withheld, *self.choice.outliers)
@@ -156,14 +156,14 @@ class MeshObjects:
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
-        """Names of the categories that training never sees."""
+        """Names of the categories withheld from training, for open-set tests."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
         _check_categories(unknown, tuple(sorted(self._by_category)))
         return self.choice.withheld
 
     @cached_property
     def split(self) -> dict[str, tuple[str, ...]]:
-        """Object names per split."""
+        """Names of the objects in each split."""
         sides: dict[str, list[str]] = {split: [] for split in SPLITS}
         for category in self.categories:
             groups = self._by_category[category][: self.choice.per_category or None]
@@ -193,13 +193,13 @@ class MeshObjects:
 
     @property
     def category_of(self) -> dict[str, str]:
-        """Category of every object."""
+        """Category by object name."""
         names = chain.from_iterable(self.split.values())
         return {name: self._set.categories[self._names[name]] for name in names}
 
     @property
     def kind_of(self) -> dict[str, str]:
-        """Kind of every object for which the folder's table has one."""
+        """Kind by object name, for objects whose kind the folder's table gives."""
         names, origins = chain.from_iterable(self.split.values()), self._set.origins
         known = {name: origins[own].kind for name in names if (own := self._names[name]) in origins}
         return {name: kind for name, kind in known.items() if kind}
@@ -219,7 +219,7 @@ class MeshObjects:
 
     @property
     def mesh_options(self) -> dict[str, Any]:
-        """Options of a ``sim:`` URL that turn mesh files into the same objects."""
+        """Options of a ``sim:`` URL that cut mesh files into the same pieces."""
         return self._set.detail.differing()
 
 
@@ -229,7 +229,7 @@ def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
 
 
 def _resolve_count(number: float, total: int) -> int:
-    """Return `number`, or below 1 that fraction of `total`, at least one."""
+    """Return a whole count: `number`, or for a fraction that share of `total` (least 1)."""
     return max(1, round(number * total)) if 0 < number < 1 else int(number)
 
 

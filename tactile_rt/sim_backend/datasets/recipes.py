@@ -55,15 +55,15 @@ Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class Range(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Several values of a sweep's parameter: an interval to draw from, or a list.
+    """The values of a sweep parameter: an interval to draw from, or a list.
 
     Attributes:
         between: The ends of the interval, the lower first.
-        each: The values to take, each combined with every value of the other parameters.
+        each: The list of values, each combined with every value of the other parameters.
         once: Whether all combinations of a draw share one value; else every sweep has its own.
-        plus: The values to add, each combined with every value of the other parameters.
-        peak: The power to which the distance from the middle, drawn uniformly in half intervals, is
-            raised: 1 draws uniformly, and at 3 half of the draws are in the middle eighth.
+        plus: The offsets to add to a draw, each combined with every value of the other parameters.
+        peak: The exponent of the drawn distance from the middle (in half intervals): 1 draws
+            uniformly; at 3, half of the draws are in the middle eighth of the interval.
 
     Raises:
         ConfigError: neither an interval nor values, ends in the wrong order, or a peak out of
@@ -91,19 +91,19 @@ class Range(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def combined(self) -> tuple[float, ...]:
-        """Values that are combined with those of the other parameters."""
+        """Values (`each`) or offsets (`plus`) to combine with those of other parameters."""
         return self.each or self.plus
 
     @property
     def ends(self) -> tuple[float, ...]:
-        """Possible values, or the least and greatest of them."""
+        """All listed values, or the least and the greatest possible draw."""
         if self.each:
             return self.each
         more = self.plus or (0.0,)
         return self.between[0] + min(more), self.between[1] + max(more)
 
     def draw(self, rng: np.random.Generator) -> float:
-        """Draw a value of the interval."""
+        """Draw a random value from the interval."""
         low, high = self.between
         if self.peak == 1:
             return float(rng.uniform(low, high))
@@ -116,28 +116,27 @@ Choice = float | Range
 
 
 class ObjectChoice(msgspec.Struct, frozen=True):
-    """The objects of a set, which are held out, and how meshes become pieces.
+    """The choice of a set's objects, their split, and how meshes are cut.
 
     Attributes:
-        source: The origin of the objects: "shapes" (the parametric ones, each kind of one plan),
-            "varied-shapes" (of any plan) or a folder of meshes.
-        categories: The names of the classes; empty: all that exist.
-        classes: The categories that count as one class, by its name; an object's own category is
-            then its kind. Any other category is a class by itself.
+        source: The origin of the objects: "shapes" (parametric, one plan for each kind),
+            "varied-shapes" (parametric, of any plan) or a folder of meshes.
+        categories: The names of the classes; if empty, all that exist.
+        classes: The categories that are merged into a class, by the class's name; an object's own
+            category is then its kind. Any other category is a class by itself.
         withheld: The categories of the extra split "withheld", which is for open-set tests: their
-            objects are in no other split. Empty: none, or `catalogue.WITHHELD` if `per_withheld`
-            asks for some.
-        outliers: The categories of the extra split "outliers": unknown objects, too, which a model
-            may learn to refuse; those of `withheld` test whether it does.
-        per_category: The number of objects in each category; 0: all that the folder has.
-        validation, test: The numbers of objects of every category that are held out; below 1 a
+            objects are in no other split. If empty, `catalogue.WITHHELD` if `per_withheld` is above
+            0, else none.
+        outliers: The categories of the extra split "outliers": unknown objects, too, but for
+            training a model to refuse; those of `withheld` test whether it does.
+        per_category: The number of objects in each category; 0 for all that the folder has.
+        validation, test: The number of held-out objects of every category; if below 1, the
             fraction.
-        per_withheld: The number of objects in each category of `withheld` and `outliers`; 0: 12, or
-            all that the folder has.
-        without_source: The source, in a folder's `objects.csv`, whose objects are left out; empty:
-            none.
-        only_source: The only source whose objects are taken, all held out for a test, without those
-            that are like one from elsewhere; empty: all sources.
+        per_withheld: The number of objects in each category of `withheld` and `outliers`; 0 for 12,
+            or for all that the folder has.
+        without_source: The source, in a folder's `objects.csv`, whose objects are left out, if any.
+        only_source: The only source to use objects of, if any. All are for the test split, without
+            those of the same shape as an object from another source.
         surface_error_mm, max_pieces, hull, up: The settings of `MeshDetail`, for a folder.
     """
 
@@ -165,7 +164,7 @@ class ObjectChoice(msgspec.Struct, frozen=True):
 
     @property
     def class_of(self) -> dict[str, str]:
-        """Class of each category that counts as another one."""
+        """Class by category, for categories that `classes` merges."""
         return {own: name for name, categories in self.classes.items() for own in categories}
 
     @property
@@ -200,14 +199,14 @@ class ObjectChoice(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class SweepChoice:
-    """The choice of sweeps of every object: see `sweep.Sweep` for the parameters.
+    """The sweeps to make of every object; see `sweep.Sweep` for the parameters.
 
     Attributes:
         draws: The number of sweeps of every combination of the `each` values.
         held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
             `draws` and above.
-        held_out: The number of sweeps of every training object, drawn for each, that are excluded
-            from training: the split ``new-sweeps``.
+        held_out: The number of sweeps of every training object, drawn at random, that form the
+            split ``new-sweeps`` instead of training.
         least_whiskers: The least number of whiskers that can reach the object as it passes; sweeps
             that fewer reach are drawn again.
     """
@@ -256,7 +255,7 @@ class SweepChoice:
                 Sweep(**{name: value})  # checks the value
 
     def combinations(self) -> list[dict[str, float]]:
-        """Return every combination of the combined values; the last varies fastest."""
+        """Return all combinations of listed values, by parameter; the last varies fastest."""
         ranges = {n: c for n in PARAMETERS if isinstance(c := getattr(self, n), Range)}
         each = {name: chosen.combined for name, chosen in ranges.items() if chosen.combined}
         return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
@@ -265,11 +264,11 @@ class SweepChoice:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
     def draw_index(self, index: int) -> int:
-        """Return the number, from 0, of sweep `index` among those of its combination."""
+        """Return the position, from 0, of sweep `index` within its combination."""
         return index % (self.draws + self.held_out_draws)
 
     def draw(self, rng: np.random.Generator, index: int, shared: np.random.Generator) -> Sweep:
-        """Draw the parameters of sweep `index`.
+        """Draw the parameters of sweep `index` of an object.
 
         Args:
             shared: a generator in the same state for all sweeps of a draw, see `Range.once`.
@@ -291,7 +290,7 @@ PARAMETERS = tuple(f.name for f in fields(SweepChoice) if f.name not in COUNTS)
 
 @dataclass(frozen=True)
 class SweepRecipe:
-    """The recipe of a sweep set.
+    """The recipe of a sweep set: array, objects, sweeps, sensors and seed.
 
     Attributes:
         array: The name or file of the array, see `files.load_animals`.
@@ -300,7 +299,7 @@ class SweepRecipe:
         period_ms: The period of the stored samples, ms.
         lead_ms: The time at rest before the simulation starts, ms: enough for a baseline.
         length_ms: The length of one sweep with its lead, ms.
-        contacts: Whether to store, beside the loads, where along each whisker it touches.
+        contacts: Whether to store, with the loads, where along its length each whisker touches.
         every_nth: Whether to store every n-th of the simulator's samples as it is, with aliasing,
             as the paper does; else they go through the live stream's resampler.
         sensor: The model of the sensors; perfect ones by default.
@@ -358,21 +357,21 @@ class SweepRecipe:
         return round(self.length_ms / self.period_ms)
 
     def rng(self, name: str, index: int, stream: int = 0) -> np.random.Generator:
-        """Return the random generator of sweep `index` of an object, see `key`."""
+        """Return a random generator for sweep `index` of an object, seeded by `key`."""
         return np.random.default_rng(self.key(name, index, stream))
 
     def key(self, name: str, index: int, stream: int = 0) -> list[int]:
-        """Return the seed of a sweep's random numbers.
+        """Return the seed of the random numbers for sweep `index` of an object.
 
         Args:
-            stream: 0 for the sweep's parameters; others are for optional models, so that a sensor
-                model changes no sweep.
+            stream: 0 for the sweep's parameters; others for optional models, so that a sensor model
+                changes no sweep.
         """
         # crc32 because hash() of a string differs from one process to the next
         return [self.seed, zlib.crc32(name.encode()), index, *([stream] if stream else [])]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the whole recipe as in a file, for `recipe_files.recipe_of_set`."""
+        """Return the recipe with all values as a dictionary, for `recipe_files.recipe_of_set`."""
         # asdict, as msgspec leaves out fields that it filled with a default
         plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(self)))
         if not self.sweeps.held_out:

@@ -1,4 +1,4 @@
-"""`ActiveWhisking`: an agent moves a head, whisks, and guesses identity or place of an object."""
+"""`ActiveWhisking`: an agent moves a head, whisks, and guesses an object's kind or place."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,12 +38,12 @@ MOTION: Final = ("amplitude", "offset", "velocity x", "velocity y", "velocity z"
 LOGITS: Final = 5.0  # guesses of +1 for a kind and -1 for another differ by 2 x 5 in their logits
 FRAMES: Final = 5  # means of samples in a step
 FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: larger readings saturate
-DRAWS: Final = 100  # tries to place an object where the array meets it
+DRAWS: Final = 100  # tries to place an object where whiskers meet it
 Observation = dict[str, NDArray[np.float32]]
 
 
 def whisker_nodes(head: WhiskingHead) -> list[Floats]:
-    """Return the (node, 3) points of every whisker, base to tip, mm, from the start."""
+    """Return the (node, 3) points of every whisker, base to tip, in the world, mm."""
     frames = head.frames(np.array([head.samples]))[0]
     nodes, at = [], 0
     for whisker, rod, frame in zip(head.array.whiskers, head.world.rods, frames, strict=True):
@@ -60,7 +60,7 @@ def whisker_nodes(head: WhiskingHead) -> list[Floats]:
 
 
 def picture(head: WhiskingHead) -> NDArray[np.uint8]:
-    """Draw the array, red where whiskers touch, and the object: (320, 640, 3) RGB."""
+    """Draw two views of object and whiskers, red if touching: (320, 640, 3) RGB."""
     from PIL import Image, ImageDraw
 
     placed = head.placed
@@ -84,7 +84,7 @@ def picture(head: WhiskingHead) -> NDArray[np.uint8]:
 
 
 class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """Active touch with whiskers: move, whisk, and guess an object's kind or place.
+    """A Gymnasium environment of active touch: move, whisk, and guess an object's kind or place.
 
     `reset` places an object of one of the kinds, at a random yaw, ahead of the array on the side
     to which its whiskers reach, just out of their reach at rest. In each step the action sets the
@@ -120,12 +120,12 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     the same seed and actions it is the same on every machine.
 
     Args:
-        whiskers: the names of the array's whiskers to include; empty: all.
+        whiskers: the names of the array's whiskers to include; all if empty.
         kinds: categories of objects, see `objects.catalogue`; a label is an index into them.
-        instances: the first number of an object of a kind, and the last plus one.
-        touches: the number of touches that ends an episode; 0: no limit.
+        instances: the range of instance numbers of each kind: the first, and the last plus one.
+        touches: the number of touches that ends an episode; 0 for no limit.
         step_ms: the length of a step, a multiple of 5 ms.
-        noise: of the sensor, in multiples of the rated noise of 10 uN and 0.05 uN m a sample.
+        noise: sensor noise, in multiples of the rated 10 uN and 0.05 uN m per sample.
         render_mode: ``rgb_array`` for pictures (extra ``view``).
 
     Attributes:
@@ -204,7 +204,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
             options: ``{"object": "mug-50"}`` names the object, which must be of one of the kinds.
 
         Raises:
-            ConfigError: no such object, or one that no whisker meets.
+            ConfigError: no such object, or no whisker meets the object.
         """
         super().reset(seed=seed)
         rng = self.np_random
@@ -239,7 +239,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Move and whisk for a step, and score the guess against the object.
+        """Move and whisk for one step, and reward the guess in the action.
 
         Raises:
             ConfigError: before the first `reset`, or the action has another shape or is not finite.
@@ -268,7 +268,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._make_observation(felt), self._compute_reward(guess), done, jammed, info
 
     def render(self) -> Any:
-        """Draw top and side views (height, width, 3); None without a render mode."""
+        """Draw top and side views, (320, 640, 3) RGB; None without a render mode."""
         if self.render_mode is None or self._head is None:
             return None
         return picture(self._head)
@@ -297,7 +297,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         }
 
     def _get_centre(self) -> Floats:
-        """Return the (3,) object's centre from the head's origin, mm, in world axes."""
+        """Return the object's centre (3,) relative to the head's origin, mm, in world axes."""
         assert self._head is not None
         return self._head.placed.centre - self._head.position
 
@@ -309,7 +309,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 def _select_whiskers(array: WhiskerArray, names: Sequence[str]) -> WhiskerArray:
-    """Return the array with the named whiskers only; without names, with all."""
+    """Return the array with only the named whiskers; without names, the whole array."""
     if not names:
         return array
     known = {w.name: w for w in array.whiskers}

@@ -1,7 +1,7 @@
-"""A head that moves on command beside an object that stands still, and whisks.
+"""A whisking head that moves on command beside a stationary object.
 
 `rods` steps the whiskers in the frame of the head: the object moves the other way, and whiskers
-feel the head's acceleration. `whisking_drive` turns the bases.
+feel the head's acceleration. `whisking_drive` rotates the bases.
 
 The head follows a point that moves at the commanded velocity within the workspace, through three
 first-order lags like those of whisking: position, velocity and acceleration never jump, and the
@@ -35,7 +35,7 @@ BELOW_MM, ASIDE_MM, PAST_MM = 15.0, 12.0, 5.0  # the workspace for an array of a
 
 @dataclass(frozen=True)
 class Placed:
-    """An object beside an array, and the head's workspace.
+    """An object placed beside an array, and the head's workspace.
 
     Attributes:
         centre: The (3,) position of the object's centre in the world, mm.
@@ -54,9 +54,9 @@ class Stretch:
     """The loads, angles and contacts of consecutive samples.
 
     Attributes:
-        loads: The (sample, element, 6) base loads, N and N m, in the elements' frames, which turn.
+        loads: The (sample, element, 6) base loads, N and N m, in the rotating element frames.
         angle: The (sample,) protraction from rest, mean over the sample, rad, rostral positive.
-        touching: The (sample, element) bool: the whisker touched the object.
+        touching: The (sample, element) flags of contact with the object.
     """
 
     loads: Floats
@@ -83,7 +83,7 @@ def place_beside(
     """Place an object ahead of an array, on the side to which its whiskers reach.
 
     Returns:
-        The placed object; None if the head would pass it without a touch.
+        The placed object; None if no whisker would touch it as the head passes.
     """
     lines = centrelines(array.whiskers, array.mount)
     right = faces_right((array,), lines).mean() >= 0.5
@@ -112,11 +112,11 @@ def place_beside(
 
 
 class WhiskingHead:
-    """An array on a head that moves and whisks, beside an object that stands still.
+    """A simulated array on a head that moves and whisks, beside a stationary object.
 
     Args:
         array: the whiskers, on their head, which faces +y of the world.
-        profile: the resolution; the engine is always `rods`, whatever the profile's.
+        profile: the resolution; the profile's engine is ignored, `rods` is used.
 
     Attributes:
         position, velocity: The (3,) displacement of the head from its start, mm, and its velocity,
@@ -157,11 +157,11 @@ class WhiskingHead:
         return found
 
     def command(self, whisking: Whisking) -> None:
-        """Change the whisking from now on; the motion changes smoothly."""
+        """Change the whisking from the next sample on; the motion changes smoothly."""
         self._drive.command(whisking, self.samples * SAMPLE_MS * 1e-3)
 
     def frames(self, samples: NDArray[np.int64]) -> Floats:
-        """Compute elements' (sample, whisker, 3, 3) world frames at the start of samples."""
+        """Compute the elements' frames (sample, whisker, 3, 3) in the world at samples' starts."""
         times = samples.astype(np.float64) * (SAMPLE_MS * 1e-3)
         angles = base_angles(self._drive, times, self.array.whiskers)
         signs, offsets = np.array([1.0, -1.0, 1.0]), np.array([-np.pi / 2, 0.0, np.pi / 2])
@@ -169,7 +169,7 @@ class WhiskingHead:
         return self._turn @ rotation("z", z) @ rotation("y", y) @ rotation("x", x)
 
     def advance(self, samples: int, velocity_mm_s: Sequence[float] | Floats = (0, 0, 0)) -> Stretch:
-        """Move and whisk for some samples of 1 ms.
+        """Move and whisk for `samples` samples of 1 ms, and return loads and contacts.
 
         Args:
             velocity_mm_s: (3,) commanded velocity of the head, mm/s, in the world.
@@ -193,7 +193,7 @@ class WhiskingHead:
         return Stretch(loads, angle, touching, touches)
 
     def _count_touches(self, touching: NDArray[np.bool_]) -> int:
-        """Count new touches in (sample, element): after `APART_MS` or more without contact."""
+        """Count touches in (sample, element) flags: contacts after `APART_MS` or more without."""
         at = np.arange(len(touching))[:, None]
         last = np.maximum.accumulate(np.where(touching, at, -self._free - 1), axis=0)
         before = np.concatenate([-self._free[None] - 1, last[:-1]])
@@ -201,7 +201,7 @@ class WhiskingHead:
         return int((touching & (at - before > APART_MS)).sum())
 
     def _move(self, samples: int, velocity_mm_s: Floats) -> tuple[Floats, Floats]:
-        """Compute the head's (sample + 1, 3) path, mm, and (sample, 3) acceleration, mm/ms^2."""
+        """Move the head; return path (sample + 1, 3), mm, and acceleration (sample, 3), mm/ms^2."""
         steps = np.arange(1, samples + 1)[:, None] * velocity_mm_s * (SAMPLE_MS * 1e-3)
         aims = np.clip(self._target + steps, self.placed.low, self.placed.high)
         fading, following = _compute_response(samples)
@@ -213,18 +213,18 @@ class WhiskingHead:
 
 @lru_cache(maxsize=8)
 def _compute_response(samples: int) -> tuple[Floats, Floats]:
-    """Compute the discrete response of the three lags to their aim.
+    """Compute the discrete response of the three lags in series to their input.
 
     Returns:
-        (sample + 1, lag, lag) shares of the lags' initial outputs, and (sample + 1, lag, sample)
-        shares of the aim during each sample.
+        (sample + 1, lag, lag) weights of the lags' initial outputs, and (sample + 1, lag, sample)
+        weights of the input in each sample.
     """
     decay = expm((np.diag([1.0, 1.0], -1) - np.eye(3)) * SAMPLE_MS / LAG_MS)
     fading = np.empty((samples + 1, 3, 3))
     fading[0] = np.eye(3)
     for k in range(samples):
         fading[k + 1] = decay @ fading[k]
-    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) share of an aim so long ago
+    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) weight of an input so long ago
     following = np.zeros((samples + 1, 3, samples))
     for k in range(1, samples + 1):
         following[k, :, :k] = gained[:k][::-1].T

@@ -1,4 +1,4 @@
-"""Measured figures compared with described values, and those of a sensor's channels at rest.
+"""Comparison of measured with described values, and measurements of a sensor at rest.
 
 Intervals are 95 % confidence intervals.
 """
@@ -32,10 +32,10 @@ HIDDEN = "noise is less than half a step: rounding hides it"
 
 
 class Figure(NamedTuple):
-    """A measured quantity that is not negative.
+    """An estimate of a non-negative quantity, and its 95 % confidence interval.
 
     Attributes:
-        value: The best estimate; 0 if only a limit is known.
+        value: The best estimate; 0 if only an upper limit is known.
         high: The upper end of the interval, or the limit.
     """
 
@@ -61,8 +61,8 @@ class Edit(NamedTuple):
     """A value to write into an array's file.
 
     Attributes:
-        path: The place of the value in the file: names of tables, the number from 0 in an array of
-            tables, and the key, e.g. ``("sensor", "channel", 0, "drift")``.
+        path: The place of the value in the file: names of tables, the index in an array of tables,
+            and the key, e.g. ``("sensor", "channel", 0, "drift")``.
     """
 
     path: tuple[str | int, ...]
@@ -72,11 +72,11 @@ class Edit(NamedTuple):
 
 @dataclass(frozen=True)
 class ArrayFinding:
-    """A quantity of an array as described and as measured.
+    """A quantity of an array as described and as measured, and edits of its file.
 
     Attributes:
         what: The name of the quantity, e.g. ``noise density of mz``.
-        described: The value in the array's file; None: it has none.
+        described: The value in the array's file; None if it has none.
     """
 
     what: str
@@ -96,18 +96,18 @@ class ArrayFinding:
 
 
 def about(value: float, error: float) -> Figure:
-    """Make a figure from a value and the relative half width of its interval."""
+    """Make a `Figure` from a value and the relative half width of its interval."""
     return Figure(value, value / (1 + error), value * (1 + error))
 
 
 def pool_figures(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[int]]:
-    """Pool several figures into their median, and return the indices of outliers.
+    """Pool estimates of one quantity; return their median and the indices of outliers.
 
-    Its interval includes the uncertainty of each figure and their scatter.
+    The median's interval includes each estimate's uncertainty and their scatter.
 
     Args:
-        figures: at least one, none of them a mere limit.
-        apart: the factor from the median above which a figure, if significant, is an outlier.
+        figures: at least one; each with a value, not just an upper limit.
+        apart: the factor from the median above which an estimate, if significant, is an outlier.
     """
     logs = np.log([f.value for f in figures])
     errors = np.array([math.log(f.high / f.value) for f in figures])
@@ -121,7 +121,7 @@ def pool_figures(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[
 
 
 def spread_of(values: Sequence[float], known: float) -> Figure:
-    """Estimate the standard deviation of values drawn about 0.
+    """Estimate the standard deviation of zero-mean values, and its interval.
 
     Args:
         known: the variance from other causes, which is subtracted.
@@ -136,9 +136,9 @@ def spread_of(values: Sequence[float], known: float) -> Figure:
 def change(
     path: tuple[str | int, ...], described: float | None, found: Figure, why: str = ""
 ) -> tuple[Edit, ...]:
-    """Return the edit of a file's value; none if it lies in the interval.
+    """Return the edit that corrects a described value; empty if it is in the interval.
 
-    A described value beyond a limit is set to the limit.
+    If only an upper limit was measured, a value above it is set to the limit.
     """
     if described is not None and found.low <= described <= found.high:
         return ()
@@ -151,10 +151,10 @@ def compare_sensor(
     rests: Mapping[str, Rest],
     untouched: Mapping[str, NDArray[np.float64]],
 ) -> list[ArrayFinding]:
-    """Compare the rate, and the noise, resolution, drift and offset of every channel.
+    """Compare measured rate, noise, resolution, drift and offset with a sensor's description.
 
     Args:
-        untouched: (channel,) readings at rest by whisker, as predicted by the description.
+        untouched: for each whisker, the (channel,) readings at rest that the description predicts.
     """
     edits = change(("sensor", "rate_hz"), sensor.rate_hz, about(rate.value, SAME_RATE))
     note = ""
@@ -172,7 +172,7 @@ def compare_sensor(
 
 
 class _ChannelAtRest:
-    """One channel of all whiskers at rest."""
+    """Measurements of one channel, over all whiskers at rest."""
 
     def __init__(self, number: int, channel: ChannelSpec, rests: Mapping[str, Rest]) -> None:
         self._number, self._channel = number, channel

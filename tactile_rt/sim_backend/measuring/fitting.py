@@ -35,14 +35,14 @@ MEASURED = re.compile(r"(;\s*|#\s*)measured: .*")
 
 
 class Fitted(NamedTuple):
-    """The comparison of an array with its recording, and the text of the fitted file."""
+    """Findings about a recorded array, and the text of its file with corrected values."""
 
     findings: list[ArrayFinding]
     text: str
 
 
 def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
-    """Read an array from a file and check that a recording fits it."""
+    """Read an array from a .toml file; raise an error if a recording's spec differs."""
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"{path}: an array that says what reads it is a .toml file")
     array = load_array(str(path))
@@ -64,7 +64,7 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
 
 
 def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
-    """Measure an array, and fit its description to that; no file is written.
+    """Measure a recorded array; return findings and the corrected text of its file.
 
     Raises:
         ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or see
@@ -92,7 +92,7 @@ def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
 
 
 def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
-    """Return the (channel,) readings of a whisker without any load, as described."""
+    """Return the (channel,) readings that the description predicts for an unloaded whisker."""
     now, there = np.zeros(1, np.int64), np.ones((1, 1), np.bool_)
     read = Transducer(sensor, (name,)).push(Chunk(now, now, np.zeros((1, 1, 8), np.float32), there))
     assert read is not None
@@ -100,7 +100,7 @@ def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
 
 
 def _find_out_of_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
-    """Find channels whose readings exceed the described range, even after a tare."""
+    """Report channels whose readings exceed twice their range, the most that a tare explains."""
     largest = np.nanmax(np.abs(recorded.values[recorded.valid]), axis=0, initial=0.0)
     return [
         ArrayFinding(
@@ -113,7 +113,7 @@ def _find_out_of_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding
 
 
 def _read_tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
-    """Return number and content of each whisker's table, by its name."""
+    """Parse a file's whisker tables: the number and content of each, by whisker name."""
     file = parse_toml(text, "array").plain()
     sides = ("R.", "L.") if file.get("mirror") else ("",)
     return {
@@ -154,7 +154,7 @@ def _measure_whiskers(
 
 
 def _measure_rate(recorded: Chunk) -> Figure:
-    """Measure the sample rate, Hz: the slope of counts over times."""
+    """Measure the sample rate, Hz: the slope of sample numbers over time stamps."""
     if len(recorded) < LEAST:
         raise ConfigError(f"the recording has {len(recorded)} samples: {LEAST} are the least")
     count = int(recorded.seq[-1] - recorded.seq[0]) + 1
@@ -171,7 +171,7 @@ def _measure_rate(recorded: Chunk) -> Figure:
 
 
 def _fill_gaps(recorded: Chunk, element: int) -> NDArray[np.float32] | None:
-    """Interpolate an element's (n, channel) readings over a few gaps; None: too many missing."""
+    """Interpolate an element's (n, channel) readings over gaps; None if too many are missing."""
     valid = recorded.valid[:, element] & np.isfinite(recorded.values[:, element]).all(axis=1)
     seq = recorded.seq[valid] - recorded.seq[0]
     values: NDArray[np.float32] = recorded.values[valid, element]
@@ -186,10 +186,10 @@ def _fill_gaps(recorded: Chunk, element: int) -> NDArray[np.float32] | None:
 
 
 def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
-    """Change values in the text of an array's file; comments and layout stay.
+    """Return the text of an array's file with edited values; comments and layout stay.
 
-    A line is changed by a pattern, which valid TOML may defeat. So the new text is parsed again,
-    and refused unless it differs from the file in just these numbers.
+    A regular expression changes each line, which may fail on valid TOML. So the new text is parsed
+    again, and a `ConfigError` raised unless just these numbers differ.
     """
     ending = "\r\n" if "\r\n" in text else "\n"
     text = text.replace("\r\n", "\n")

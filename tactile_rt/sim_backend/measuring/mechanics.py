@@ -91,7 +91,7 @@ def compare_whiskers(
 
 
 def _explain_missing(rod: Rod, heard: Sequence[Ring], rate_hz: float) -> str:
-    """Return why a whisker that swings cannot be measured; empty: it can."""
+    """Return the reason why a plucked whisker cannot be measured; empty if it can."""
     if rod.resonance_hz > HEARD * rate_hz:
         at = float(np.median([ring.hz for ring in heard]))
         return f"{TOO_FAST.format(rate_hz)}: what swings at {at:.3g} Hz may be an alias"
@@ -108,7 +108,7 @@ def _make_rod(whisker: Whisker) -> Rod:
 
 
 def _combine_plucks(values: Sequence[float], errors: Sequence[float], off: float) -> Figure:
-    """Compute the median of several plucks; `off` is the relative error common to all."""
+    """Compute the median over several plucks; `off` is the relative error common to all."""
     scatter = max(float(np.std(values, ddof=1)), math.sqrt(np.mean(np.square(errors))))
     half = float(stats.t.ppf(0.975, len(values) - 1)) * MEDIAN * scatter / math.sqrt(len(values))
     value = float(np.median(values))
@@ -117,7 +117,7 @@ def _combine_plucks(values: Sequence[float], errors: Sequence[float], off: float
 
 
 def _choose_stiffness(whisker: Whisker) -> tuple[str, str]:
-    """Return the fields of the stiffness that most affects the resonance, and of its damping."""
+    """Return the field names of the stiffness that most affects resonance, and its damping."""
     if whisker.mount_stiffness:
         stiffer = {
             field: _make_rod(_set_field(whisker, field, 1.1 * getattr(whisker, field))).resonance_hz
@@ -129,7 +129,7 @@ def _choose_stiffness(whisker: Whisker) -> tuple[str, str]:
 
 
 def _solve_stiffness(whisker: Whisker, field: str, hz: Figure) -> Figure | None:
-    """Solve for the stiffness that gives a whisker the measured frequency; None: impossible."""
+    """Solve for the stiffness that gives the measured frequency; None if no value does."""
     now = getattr(whisker, field)
     least, most = PLAUSIBLE.get(COLUMNS[field], (SOFTEST_MOUNT, math.inf))
     ends = (math.log(max(least / now, 1 / FURTHEST)), math.log(min(most / now, FURTHEST)))
@@ -157,7 +157,7 @@ def _report_field(
     whiskers: Mapping[str, Whisker],
     tables: Mapping[str, tuple[int, Mapping[str, Any]]],
 ) -> list[ArrayFinding]:
-    """Report a field: for most whiskers in [defaults], for the others in their own tables."""
+    """Report a fitted field: one value for [defaults], and the values of deviating whiskers."""
     column, unit = COLUMNS[field], UNITS[field]
     usual = [n for n in figures if column not in tables[n][1] and figures[n].low > 0]
     own = [n for n in figures if n not in usual]

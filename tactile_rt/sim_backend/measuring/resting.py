@@ -1,9 +1,9 @@
-"""The readings of a whisker at rest: level, noise, rounding and drift.
+"""Measurement of a whisker's readings at rest: level, noise, rounding and drift.
 
-Operations: the step that readings are rounded to; where the whisker is at rest, with its level and
-noise there; the likelihood of every size of the drift.
+`rounding_step` finds the step that readings are rounded to, `find_rest` the times at rest with
+level and noise, and `drift_likelihood` the likelihood of every size of the drift.
 
-Plan. Samples are cut into short blocks, and each is detrended, so that little of a slow change
+Method: samples are cut into short blocks, and each is detrended, so that little of a slow change
 remains. A block is at rest if it is not much noisier than the quietest quarter, if its level is
 close to the usual level, and if its neighbours are at rest, too. The noise is the median over
 blocks, which an undetected tap does not affect. Changes of level between blocks are drift, of the
@@ -29,14 +29,14 @@ WHITER = np.geomspace(0.5, 30, 15)  # candidate ratios of a level's white varian
 
 
 class Rest(NamedTuple):
-    """The readings of a whisker while nothing touches it.
+    """Statistics of a whisker's readings while nothing touches it.
 
     Attributes:
         at_s: The (block,) middle times of the blocks at rest, s.
         levels: The (block, channel) mean readings of these blocks.
         noise: The (channel,) standard deviation of a sample about its level, rounding included.
         block_s: The duration of a block, s.
-        step: The (channel,) step that readings are rounded to; 0: none is found.
+        step: The (channel,) step that readings are rounded to; 0 if none is found.
     """
 
     at_s: Floats
@@ -48,24 +48,24 @@ class Rest(NamedTuple):
 
     @property
     def level(self) -> Floats:
-        """The (channel,) mean readings."""
+        """The (channel,) mean readings at rest."""
         mean: Floats = self.levels.mean(axis=0)
         return mean
 
     @property
     def level_error(self) -> Floats:
-        """The (channel,) standard error of `level`, without that from drift."""
+        """The (channel,) standard error of `level`, without the error that drift causes."""
         white: Floats = self.noise / np.sqrt(len(self.levels) * self.size)
         return np.where(self.coarse, self.step / 12**0.5, white)
 
     @property
     def coarse(self) -> NDArray[np.bool_]:
-        """The (channel,) flags: noise is less than half a step, so rounding hides it."""
+        """The (channel,) flags: rounding hides the noise, which is below half a step."""
         return self.noise**2 < (1 / 4 + 1 / 12) * self.step**2
 
 
 def rounding_step(values: NDArray[np.float32]) -> float:
-    """Find the step that (n,) readings are rounded to; 0: no grid is found."""
+    """Find the step that (n,) readings are rounded to; return 0 if there is none."""
     levels = np.unique(values)
     levels = levels[1:-1] if len(levels) > 8 else levels  # saturated readings are off the grid
     if len(levels) < 2:
@@ -84,11 +84,11 @@ def rounding_step(values: NDArray[np.float32]) -> float:
 
 
 def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) -> Rest | None:
-    """Find a whisker's rest, and its readings there; None: less than 3 s.
+    """Measure a whisker's readings at rest; return None for less than 3 s of rest.
 
     Args:
         values: (n, channel) readings, none missing.
-        bandwidth_hz: of the sensor's low-pass, which correlates the noise of samples; 0: none.
+        bandwidth_hz: corner of the sensor's low-pass, which correlates noise; 0 without one.
     """
     step = np.array([rounding_step(of_channel) for of_channel in values.T])
     size = max(BLOCK, round(REMEMBERED * rate_hz / bandwidth_hz) if bandwidth_hz else 0)
@@ -122,10 +122,10 @@ def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) 
 
 
 def drift_likelihood(rest: Rest, channel: int, sizes: Floats) -> Floats:
-    """Compute (size,) log-likelihoods of sizes of the drift, its standard deviations.
+    """Compute the (size,) log-likelihoods of standard deviations of the drift.
 
-    Levels are the sum of an unknown constant, an Ornstein-Uhlenbeck process, and white errors,
-    whose variance may differ from the one that the noise of samples predicts.
+    Levels are modelled as an unknown constant, an Ornstein-Uhlenbeck process, and white errors,
+    whose variance may differ from what the noise of samples predicts.
     """
     together = max(1, round(np.ptp(rest.at_s) / BINS / rest.block_s))
     bins = np.rint((rest.at_s - rest.at_s[0]) / rest.block_s).astype(int) // together

@@ -1,12 +1,12 @@
 """Frequency and damping of the free swings of plucked whiskers.
 
-Plan. A stretch in which a whisker is away from its rest is a pluck if it ends in a free swing.
-This begins where the whisker first passes its rest after its largest deflection, because nothing
-holds it there. The swing is projected onto the direction of its largest variance among channels.
-Its beginning is left out while it is large: large swings are nonlinear and contain other modes. A
-decaying sinusoid with an offset is fitted to the rest by least squares. Its phase and decay may
-bend with the square of its size, as those of a whisker do; the result is the limit of small
-swings. A fit that leaves more than a tenth of the energy was not a free swing of one whisker.
+Method: a stretch in which a whisker is away from its rest is a pluck if it ends in a free swing.
+It starts where the whisker first passes its rest after its largest deflection and is free. The
+swing is projected onto the direction of its largest variance among channels. Its first, large part
+is left out: large swings are nonlinear and contain other modes. A decaying sinusoid with an offset
+is fitted to the rest by least squares. Its phase and decay may bend with the square of its size, as
+those of a whisker do; the result is the limit of small swings. A fit that leaves more than a tenth
+of the energy was not a free swing of one whisker.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 
 Floats = NDArray[np.float64]
 
-HEARD = 0.45  # of the sample rate: a faster swing may be the alias of another one
+HEARD = 0.45  # of the sample rate: a faster swing may be the alias of another swing
 AWAY, LARGE = 6.0, 20.0  # least deflection of a sample, and of a pluck's peak: in noise sigmas
 APART_S = 0.25  # calm between two plucks
 LOUDER = 5.0  # a simultaneous swing this much smaller than another is its echo in the mount
@@ -32,10 +32,10 @@ LEFT = 0.1  # of the energy, at most
 
 
 class Ring(NamedTuple):
-    """A free swing.
+    """The frequency and damping of a whisker's free swing, with standard errors.
 
     Attributes:
-        hz: The natural frequency, Hz: that of the same whisker without damping.
+        hz: The undamped natural frequency, Hz.
         ratio: The damping ratio; 1 is critical.
         hz_error: The standard error of the frequency, Hz.
     """
@@ -61,10 +61,10 @@ class Swing(NamedTuple):
 
 
 def find_swings(away: Sequence[NDArray[np.float32]], rate_hz: float) -> list[Swing]:
-    """Find the swings of all whiskers, except those that another's larger swing excites.
+    """Find the swings of all whiskers, except those that another whisker's larger swing excites.
 
     Args:
-        away: (n, channel) of every whisker, distance from rest in standard deviations of the noise.
+        away: whiskers' (n, channel) distances from rest, in standard deviations of the noise.
     """
     found, tail = [], round(APART_S / 4 * rate_hz)
     for element, values in enumerate(away):
@@ -89,10 +89,10 @@ def find_swings(away: Sequence[NDArray[np.float32]], rate_hz: float) -> list[Swi
 
 
 def fit_ring(away: NDArray[np.float32], rate_hz: float) -> Ring | None:
-    """Fit the free swing at the end of a stretch; None: it has none.
+    """Fit the free swing at the end of a stretch; None if it has none.
 
     Args:
-        away: (n, channel) distance from rest in standard deviations of the noise.
+        away: (n, channel) distances from rest, in standard deviations of the noise.
     """
     furthest = int(np.argmax((away**2).sum(axis=1)))
     side = away[furthest:] @ away[furthest]

@@ -1,8 +1,8 @@
-"""Objects by name, made of convex pieces: drawn ones by category, and mesh files.
+"""Objects by name, as convex pieces: parametric objects by category, and mesh files.
 
-`make_object` draws the n-th mug, bottle, ...; `load_object` also reads a mesh file. "mug-17" has
-the only plan of its kind; "varied-mug-17" has any plan, see `shapes.varied`. Other packages may add
-categories (`core.packages`), which have one plan each and are used only where they are named.
+`make_object` generates the n-th mug, bottle, ...; `load_object` also reads a mesh file. "mug-17" is
+built by its kind's one plan; "varied-mug-17" by any plan, see `shapes.varied`. Other packages may
+add categories (`core.packages`), which have one plan each and are used only where they are named.
 """
 
 import difflib
@@ -105,7 +105,7 @@ def added_categories() -> tuple[str, ...]:
 
 
 def make_object(category: str, index: int) -> TactileObject:
-    """Draw instance `index` (0 or more) of a category, the same on every machine."""
+    """Generate object `index` (0 or more) of a category, the same on every machine."""
     kind = _find_kind(category, index)
     # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])
@@ -125,9 +125,9 @@ def load_object(target: str, detail: MeshDetail = STANDARD) -> TactileObject:
 
 
 def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], TactileObject]:
-    """Return a factory that makes the object of `load_object` when first called.
+    """Return a factory that makes the object of a name or mesh file when called.
 
-    An unknown name or an unusable mesh raises its error here: a mesh is read at once.
+    A mesh is read at once, so an unknown name or an unusable mesh raises its error here.
     """
     if Path(target).suffix or "/" in target or "\\" in target:
         mesh = load_mesh(Path(target), detail)
@@ -141,7 +141,7 @@ def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], 
 
 
 def _find_kind(category: str, index: int) -> str:
-    """Return the kind of a category; refuse an unknown category or a negative index."""
+    """Return a category's kind; raise a `ConfigError` for an unknown category or negative index."""
     kind = category.removeprefix(VARIED)
     if kind not in _BUILDERS and kind not in (added := added_categories()):
         near = difflib.get_close_matches(kind, (*_BUILDERS, *added), n=1, cutoff=0.3)

@@ -43,9 +43,9 @@ MOST_VOIDS = 2000  # checked
 
 
 class Joining(Generic[P]):
-    """Patches that are joined with their neighbours, the smallest first.
+    """A set of patches that are merged with their neighbours, the smallest pair first.
 
-    A refused pair stays refused however the two grow, until the next call of `join`.
+    A refused pair stays refused until the next `join`, even if a patch has grown since.
     """
 
     def __init__(
@@ -65,14 +65,14 @@ class Joining(Generic[P]):
 
     @property
     def patches(self) -> list[P]:
-        """The present patches."""
+        """The patches that remain after merging."""
         return list(self._alive.values())
 
     def join(self, joined: Callable[[P, P], P | None]) -> None:
-        """Join neighbours until no more can be joined.
+        """Merge neighbouring patches until no more can be merged.
 
         Args:
-            joined: returns the patch that two patches become, or None to refuse the pair.
+            joined: merges two patches and returns the result, or None to refuse the pair.
         """
         refused: dict[int, set[int]] = {k: set() for k in self._alive}
         queue = [
@@ -113,11 +113,11 @@ class _Patch:
 
 
 class SheetPieces:
-    """The plates of a sheet: call `join`, then `corners`.
+    """The convex plates that a sheet is cut into: call `join`, then `corners`.
 
     Args:
         sheet: any surface, in the unit box.
-        half: half the thickness of a plate, in largest extents.
+        half: half the thickness of a plate, in units of the largest extent.
     """
 
     def __init__(self, sheet: trimesh.Trimesh, half: float) -> None:
@@ -135,7 +135,7 @@ class SheetPieces:
         return len(self._joining)
 
     def join(self, tolerance: float) -> None:
-        """Join plates as far as a tolerance, in units of the largest extent, allows."""
+        """Merge plates as far as a tolerance, in units of the largest extent, allows."""
         self._tolerance = tolerance
         self._joining.join(self._join_pair)
 
@@ -188,7 +188,7 @@ class SheetPieces:
 
 
 class SolidPieces:
-    """The pieces of a solid: call `join`, then `corners`."""
+    """The convex pieces that a solid is cut into: call `join`, then `corners`."""
 
     def __init__(self, solid: Manifold) -> None:
         self._solid = solid
@@ -205,7 +205,7 @@ class SolidPieces:
         return len(self._joining) if self._joining else 1
 
     def join(self, tolerance: float) -> None:
-        """Join pieces within a tolerance, in units of the largest extent, larger at each call."""
+        """Merge pieces within a tolerance, in largest extents, that grows from call to call."""
         self._tolerance = tolerance
         if self._joining is None:
             if self._near_enough(_hull(self._mesh.vertices)):
@@ -215,14 +215,14 @@ class SolidPieces:
         self._joining.join(self._join_pair)
 
     def corners(self, spare: int) -> list[Floats]:
-        """Return corners (n, 3) of each piece; the last, at most `spare`, fill the middle."""
+        """Return corners (n, 3) of all pieces; up to `spare` further pieces fill the middle."""
         if self._joining is None:
             return [self._mesh.vertices]
         outer = [p for p in self._joining.patches if _hull(p) is not None]
         return outer + self._fill_middle(outer, spare)
 
     def _make_pieces(self) -> list[Floats]:
-        """Return the piece behind each face, as deep as possible."""
+        """Return a convex piece behind each face, deep where thickness and tolerance allow."""
         mesh = self._mesh
         ways = -mesh.vertex_normals
         starts, ends = mesh.vertices + ASIDE * ways, mesh.vertices + OUT * ways
@@ -249,7 +249,7 @@ class SolidPieces:
         return both[hull.vertices] if self._near_enough(hull) else None
 
     def _near_enough(self, hull: ConvexHull | None) -> bool:
-        """Return whether no surface point lies deeper in a hull than the tolerance."""
+        """Return whether a hull covers the surface nowhere deeper than the tolerance."""
         if hull is None:
             return False
         low, high = hull.min_bound, hull.max_bound

@@ -26,9 +26,9 @@ MOST_POINTS = 20_000  # checked on either surface
 
 
 def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
-    """Return the connected parts of a closed mesh, all wound outward, if its faces match.
+    """Return the connected bodies of a closed mesh, all wound outward.
 
-    Reversing a part that is wound inward fills a void, which nothing can touch, or corrects a body.
+    Reversing a part that is wound inward fills an untouchable void, or corrects a body.
     """
     bodies = _make_solid(mesh.vertices, mesh.faces).decompose()
     turned = ((b, surface_of(b)) for b in bodies)
@@ -36,14 +36,14 @@ def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
 
 
 def outer_solid(bodies: Sequence[Manifold]) -> Manifold:
-    """Return the union of bodies, without the voids between them."""
+    """Return the union of bodies, with the enclosed voids filled."""
     union = Manifold.batch_boolean(list(bodies), manifold3d.OpType.Add)
     shells = [shell for shell in union.decompose() if shell.volume() > 0]
     return Manifold.batch_boolean(shells, manifold3d.OpType.Add)
 
 
 def surface_of(solid: Manifold) -> trimesh.Trimesh:
-    """Return the surface of a solid."""
+    """Return the surface of a solid as a triangle mesh."""
     arrays = solid.to_mesh64()
     return trimesh.Trimesh(
         arrays.vert_properties[:, :3].copy(), arrays.tri_verts.astype(np.int64), process=False
@@ -70,7 +70,7 @@ def tiles(triangles: Floats, size: float = TILE) -> Floats:
 
 
 class TriangleSurface:
-    """A surface to measure distances from.
+    """A triangle surface, cut into tiles, that measures the distances of points to it.
 
     Attributes:
         tiles: The (n, 3, 3) corners of the tiles that the surface is cut into.
@@ -88,7 +88,7 @@ class TriangleSurface:
         self._tree = cKDTree(self.middles)
 
     def about(self, points: Floats) -> Floats:
-        """Estimate distances (n,) of points (n, 3); few are too large, by at most `reach`."""
+        """Estimate distances (n,) of points (n, 3), some too large by at most `reach`."""
         _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
         best: Floats = np.min([_find_gaps(self.tiles[tile], points) for tile in near.T], axis=0)
         return best
@@ -96,7 +96,7 @@ class TriangleSurface:
     def distance(self, points: Floats) -> Floats:
         """Return the distances (n,) of points (n, 3) to the surface.
 
-        They are exact for the farthest points, and those of `about` for others.
+        Distances are exact for the farthest points, and estimated by `about` for others.
         """
         best = self.about(points)
         floor, exact = 0.0, np.zeros(len(points), bool)
@@ -135,12 +135,12 @@ def deviation(
 
 
 def some(points: Floats) -> Floats:
-    """Return evenly chosen points, at most `MOST_POINTS`."""
+    """Return every k-th point, so that at most `MOST_POINTS` remain."""
     return points[:: 1 + len(points) // MOST_POINTS]
 
 
 def _find_inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_]:
-    """Return whether each point (n, 3) is inside a solid, by a ray's crossings."""
+    """Return (n,) flags: the point (n, 3) is inside a solid, by a ray's crossings."""
     inside = np.zeros(len(points), bool)
     for solid in solids:
         low, high = np.split(np.array(solid.bounding_box()), 2)
@@ -151,13 +151,13 @@ def _find_inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_
 
 
 def spread_planes(planes: Floats) -> Floats:
-    """Return planes in golden-ratio order, so that any few cover all directions."""
+    """Reorder planes by the golden ratio, so that consecutive planes cover all directions."""
     ordered: Floats = planes[np.argsort(np.arange(len(planes)) * 0.6180339887 % 1)]
     return ordered
 
 
 def _find_gaps(triangles: Floats, points: Floats) -> Floats:
-    """Return the distance (n,) of each point (n, 3) to its triangle (n, 3, 3)."""
+    """Return distances (n,) of points (n, 3), each to its triangle (n, 3, 3)."""
     nearest = trimesh.triangles.closest_point(triangles, points)
     away: Floats = np.linalg.norm(points - nearest, axis=1)
     return away

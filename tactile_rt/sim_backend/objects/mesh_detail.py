@@ -18,10 +18,10 @@ class MeshDetail:
             becomes.
         max_pieces: The largest number of pieces; if it does not suffice, the distance is larger
             (and measured).
-        hull: Whether to take a single piece, the convex hull; its distance is measured but not
+        hull: Whether to use a single piece, the convex hull; its distance is measured but not
             bounded.
-        up: The axis of the file that points up, "y" or "z"; empty: that of its format (y in glTF),
-            else z.
+        up: The axis of the file that points up, "y" or "z"; if empty, that of its format (y in
+            glTF), else z.
     """
 
     surface_error_mm: float = 0.1

@@ -61,7 +61,7 @@ def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
     for name, text in models.items():
         if b"beamlattice>" in text:
             raise ValueError("it holds a beam lattice; export it as a mesh of triangles")
-        # the library takes all parts of an inner file for each of them
+        # the library reads all parts of an inner file for each part
         if "3d/3dmodel.model" not in name.lower() and text.count(b"<mesh>") > 1:
             raise ValueError("several parts share a file within it; export it as one mesh")
         for _, thing in etree.iterparse(BytesIO(text), tag="{*}object"):
@@ -73,7 +73,7 @@ def _read_3mf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
 
 
 def _check_nodes(used: Mapping[str, Sequence[str]]) -> None:
-    """Refuse scenes that use nodes too often to be built, or in a circle."""
+    """Raise a `ValueError` if nodes expand to too many copies, or contain themselves."""
     times: dict[str, int] = {}  # number of nodes that each node expands to
     try:
         for node in TopologicalSorter(used).static_order():
@@ -114,7 +114,7 @@ def _read_gltf(path: Path, content: bytes) -> list[trimesh.Trimesh]:
 
 
 def _read_buffers(path: Path, scene: Any) -> Iterator[bytes]:
-    """Read the buffers of a glTF that are not in its binary part."""
+    """Yield the buffers of a glTF that are outside its binary part."""
     for buffer in scene.get("buffers", ()):
         uri = buffer.get("uri", "")
         if uri.startswith("data:"):
@@ -130,7 +130,7 @@ def _read_buffers(path: Path, scene: Any) -> Iterator[bytes]:
 
 
 def _check_supported(scene: Any) -> None:
-    """Refuse glTF features that the mesh library would leave out or misread."""
+    """Raise a `ValueError` for glTF features that the mesh library would omit or misread."""
     for required in scene.get("extensionsRequired", ()):
         if not HARMLESS.match(required):
             how = "; `gltfpack -noq -i IN -o OUT` writes it without" * ("meshopt" in required)
@@ -188,7 +188,7 @@ UNREAD_SUFFIXES = (".step", ".stp", ".iges", ".igs", ".fbx", ".3ds", ".wrl", ".u
 
 
 def check_mesh_file(path: Path) -> None:
-    """Refuse a missing or empty file, a Git LFS pointer or an unknown format."""
+    """Raise a `ConfigError` for a missing or empty file, Git LFS pointer or unknown format."""
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise ConfigError(
@@ -216,7 +216,7 @@ def read_triangles(path: Path, up: str = "") -> trimesh.Trimesh:
 
     Args:
         path: the file; a scene counts as one rigid object, its unit does not matter.
-        up: the axis of the file that points up, "y" or "z"; empty: that of its format, else z.
+        up: the axis of the file that points up, "y" or "z"; if empty, that of its format, else z.
     """
     mesh = read_parts([path], up)
     mesh.vertices = (mesh.vertices - mesh.bounds.mean(axis=0)) / mesh.extents.max()

@@ -26,13 +26,13 @@ PLY_TYPES: Final = {  # other names are the same as in NumPy
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8",
 }  # fmt: skip
-MOST_NODES: Final = 10_000  # of a scene, counted every time that one is used
+MOST_NODES: Final = 10_000  # of a scene; a node counts every time that it is used
 SAME: Final = 1e-9  # relative difference in area within which two readings are the same
 MAX_FACES = 2_000_000  # which take a minute
 
 
 def check_number(path: Path, faces: int) -> None:
-    """Refuse more than `MAX_FACES` triangles."""
+    """Raise a `ConfigError` for more than `MAX_FACES` triangles."""
     if faces > MAX_FACES:
         raise ConfigError(
             f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
@@ -50,7 +50,7 @@ def load_meshes(path: Path, content: bytes, expected: int = -1) -> Meshes:
     """Read the bodies of a file with the mesh library.
 
     Args:
-        expected: number of triangles that they must have; -1: unknown.
+        expected: number of triangles that they must have; -1 if unknown.
     """
     kind = path.suffix.lower()[1:]
     # materials are not needed, and the library would complain of missing pictures
@@ -81,7 +81,7 @@ def _check_corners(vertices: Array, corners: Array, base: int = 0) -> None:
 
 
 def _make_mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> trimesh.Trimesh:
-    """Make a mesh of polygons; `base` is the file's first vertex number, for messages."""
+    """Make a mesh from polygons; `base` is the file's first vertex number, for messages."""
     if len(sizes) and sizes.min() < 3:
         raise ValueError(f"face {sizes.argmin() + 1} has {sizes.min()} corners; is it cut short?")
     if len(corners) != sizes.sum():
@@ -92,7 +92,7 @@ def _make_mesh(vertices: Array, corners: Array, sizes: Array, base: int = 0) -> 
 
 
 def _normalise_text(content: bytes) -> bytes:
-    """Return text as UTF-8 without a byte order mark, lines ended by line feeds."""
+    """Convert text to UTF-8 without a byte order mark, with line feeds as line ends."""
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         content = content.decode("utf-16").encode()
     text = content.removeprefix(b"\xef\xbb\xbf")
@@ -189,7 +189,7 @@ def read_ply(path: Path, content: bytes) -> Meshes:
 def _read_rows(
     element: str, data: bytes, at: int, count: int, kinds: dict[str, list[str]]
 ) -> tuple[dict[str, tuple[Array, Array]], int]:
-    """Read an element: list sizes and all values of each property, and its end."""
+    """Read a PLY element: list sizes and values of each property, and the end offset."""
     sizes: dict[str, list[Array]] = {key: [np.zeros(0, int)] for key in kinds}
     values: dict[str, list[Array]] = {key: [np.zeros(0, int)] for key in kinds}
     left, step = count * bool(kinds), count

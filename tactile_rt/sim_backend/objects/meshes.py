@@ -9,7 +9,7 @@ says what a file became:
     hull        its convex hull, if requested
 
 The distance between the outside of the pieces and the mesh is measured every time, in both
-directions, and kept as the object's `surface_error`.
+directions, and stored as the object's `surface_error`.
 
 Cutting a mesh takes seconds, so the pieces are cached in $TACTILE_RT_CACHE, else
 $XDG_CACHE_HOME/tactile_rt/pieces, else ~/.cache/tactile_rt/pieces: one .npz per object, named by a
@@ -126,7 +126,7 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
     tolerance, it is exceeded.
 
     Args:
-        tolerance: largest allowed movement of the surface, in largest extents.
+        tolerance: largest allowed movement of the surface, in units of the largest extent.
     """
     if len(mesh.faces) <= SHARES[0] * most:
         return mesh
@@ -215,7 +215,7 @@ def _cut_into_pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> TactileObject
 
 
 def _repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return the mesh with coincident vertices merged and small damage repaired."""
+    """Return the mesh with coincident vertices merged and small or flush holes filled."""
     mesh = mesh.copy()
     if not mesh.is_watertight:  # merged only if necessary: touching bodies would grow together
         mesh.merge_vertices(merge_tex=True, merge_norm=True, digits_vertex=MERGE_DIGITS)
@@ -227,7 +227,7 @@ def _repair(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _fill_holes(mesh: trimesh.Trimesh) -> list[list[int]]:
-    """Return faces that fill holes which are small, or flush with a neighbour."""
+    """Return triangles that fill small holes and holes flush with a neighbouring face."""
     single = trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)
     beside: dict[int, list[int]] = {}
     faces: dict[int, list[Floats]] = {}

@@ -10,7 +10,7 @@ A list is a CSV file with a row for every mesh file:
     up                    the axis of the file that points up, y or z
     scale                 metres per unit of the file; empty: unknown
     shape                 the same for variants, mirror images and copies of one thing, which stay
-                          on one side of a split; empty: the object is unlike any other
+                          on one side of a split; empty if the object is unlike any other
     kind, maker           its kind within the category, and who or what made it; optional, as is
     attribution           the credit that the licence demands
 
@@ -78,13 +78,13 @@ class ListedFile(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class ListedObject:
-    """An object of a list."""
+    """An object of a list: the mesh files that are its parts."""
 
     files: tuple[ListedFile, ...]
 
     @property
     def name(self) -> str:
-        """Its name, ``category/name``."""
+        """Name of the object, ``category/name``."""
         return f"{self.files[0].category}/{self.files[0].name}"
 
 
@@ -135,14 +135,14 @@ def get_objects(
     clones: Path | None = None,
     progress: Callable[[str], None] = lambda name: None,
 ) -> dict[str, str]:
-    """Download or copy objects into a folder; those already in it stay.
+    """Download or copy objects into a folder, except those already in it.
 
     Args:
         clones: a folder of clones of the repositories and of unpacked packages, each by its name,
-            or a single one of them; None: files are downloaded from GitHub.
+            or a single one of them; if None, files are downloaded from GitHub.
 
     Returns:
-        The reasons why objects are missing, by their names; none of their parts is in the folder.
+        The reasons why objects are missing, by name; none of their parts is in the folder.
 
     Raises:
         ConfigError: the folder of clones does not exist.

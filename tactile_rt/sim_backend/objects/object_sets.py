@@ -39,7 +39,7 @@ class Origin(msgspec.Struct, frozen=True):
 
     Attributes:
         shape: The same for objects of a category that are variants, mirror images or copies of one
-            thing; empty: no other is like it.
+            thing; empty if no other is like it.
         licence: The SPDX name of the object's licence.
         kind: The object's kind within its category, where categories are shapes.
         attribution: The credit that the licence demands.
@@ -62,7 +62,7 @@ class ObjectRow(Origin, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class ObjectSet:
-    """The objects of a folder.
+    """The objects of a folder of mesh files.
 
     Attributes:
         paths: The file of every object, by its name ``category/object``, in alphabetical order.
@@ -85,7 +85,7 @@ class ObjectSet:
         return {name: name.rpartition("/")[0] for name in self.paths}
 
     def path(self, name: str) -> Path:
-        """Return an object's file."""
+        """Return the path of an object's mesh file."""
         if name not in self.paths:
             raise ConfigError(f"{self.folder}: holds no object {name!r}")
         return self.paths[name]
@@ -107,7 +107,7 @@ class ObjectSet:
     def check(
         self, progress: Callable[[str], None] = lambda name: None
     ) -> dict[str, TactileObject]:
-        """Load every object once; return the usable ones without pieces, see `skipped`."""
+        """Load every object; return usable ones without pieces, and note others in `skipped`."""
         found = {}
         for name in self.names:
             progress(name)
@@ -117,10 +117,10 @@ class ObjectSet:
 
 
 def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
-    """Find the objects in a folder.
+    """Find the mesh objects in a folder of either layout.
 
     Args:
-        detail: how meshes become pieces; in a ShapeNet folder y is up, unless it says otherwise.
+        detail: how meshes become pieces; in a ShapeNet folder y is up, unless `detail.up` is set.
     """
     folder = Path(where)
     if not folder.is_dir():
@@ -135,7 +135,7 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
     plain = [p for p in files if p.suffix.lower() in MESH_SUFFIXES]
     read = {p.with_suffix("") for p in plain}
     unread = [p for p in files if p.suffix.lower() in UNREAD_SUFFIXES]
-    plain += [p for p in unread if p.with_suffix("") not in read]  # to be refused with a reason
+    plain += [p for p in unread if p.with_suffix("") not in read]  # `load` refuses these
     if not plain:
         raise ConfigError(
             f"{folder}: holds no objects: expected category/object.obj (or "
@@ -146,7 +146,7 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
 
 
 def _name_files(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
-    """Return files by object names that are valid as file names."""
+    """Return the files by object name, in which special characters are replaced."""
     paths: dict[str, Path] = {}
     for category, stem, path in found:
         name = f"{_clean_name(category)}/{_clean_name(stem)}"
@@ -160,7 +160,7 @@ def _name_files(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, P
 
 
 def read_table(folder: Path) -> dict[str, ObjectRow]:
-    """Read the rows of a folder's table by object name; none without a table."""
+    """Read the rows of a folder's `objects.csv` by object name; empty without one."""
     path = folder / FOLDER_TABLE
     if not path.exists():
         return {}
@@ -176,7 +176,7 @@ def _clean_name(name: str) -> str:
 
 
 def _read_taxonomy(folder: Path) -> dict[str, str]:
-    """Read the name of every synset: the first of its synonyms."""
+    """Read the category name of every ShapeNet synset: the first of its synonyms."""
     path = folder / TAXONOMY
     if not path.exists():
         return {}

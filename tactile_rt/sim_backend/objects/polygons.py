@@ -12,7 +12,7 @@ Floats = NDArray[np.float64]
 
 
 def cut_polygons(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
-    """Cut polygons into triangles that cover them, in their order.
+    """Cut polygons into triangles, in the order of the polygons.
 
     Args:
         vertices: (n, 3) positions.
@@ -55,7 +55,7 @@ def _cross(a: Floats, b: Floats) -> Floats:
 
 
 def flat(points: Floats, normal: Floats) -> Floats:
-    """Project points (n, 3) along a normal to (n, 2)."""
+    """Project points (n, 3) along a normal to plane coordinates (n, 2)."""
     one = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     one /= np.linalg.norm(one)
     seen: Floats = points @ np.stack([one, np.cross(normal, one)], axis=1)

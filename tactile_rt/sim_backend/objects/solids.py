@@ -21,7 +21,7 @@ ROUND = 24
 
 @dataclass(frozen=True)
 class TactileObject:
-    """Rigid object, bounding box centred at the origin, largest extent 1 (no unit), z up."""
+    """A rigid object of convex pieces, centred at the origin, largest extent 1, z up."""
 
     name: str  # "mug-17", or the file's stem
     category: str  # "mug", or the file's stem for a mesh file
@@ -31,7 +31,7 @@ class TactileObject:
 
 
 def fit_unit_box(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
-    """Return the pieces moved and scaled together into the unit box."""
+    """Return the pieces, centred at the origin and scaled together to largest extent 1."""
     corners = np.vstack([piece.bounds for piece in pieces])
     low, high = corners.min(axis=0), corners.max(axis=0)
     centre, scale = (low + high) / 2, 1 / (high - low).max()
@@ -82,7 +82,7 @@ def slab(x: float, y: float, z: float, cut: float = 0.0, centre: float = 0.0) ->
 
 
 def box(centre: Sequence[float], size: Sequence[float]) -> trimesh.Trimesh:
-    """Return an axis-aligned box."""
+    """Return an axis-aligned box from its centre and its sizes along x, y and z."""
     signs = np.array([(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
     return hull(np.asarray(centre) + signs * np.asarray(size) / 2)
 
@@ -99,7 +99,7 @@ def ball(centre: npt.ArrayLike, radius: float) -> trimesh.Trimesh:
 def _find_section_axes(start: Points, end: Points) -> Points:
     """Return unit vectors (2, 3) across the line from start to end.
 
-    They lie along x and y for a steep line, horizontal and upward for a flat one, so that a
+    For a steep line they are along x and y, for a flat line horizontal and upward, so that a
     rectangular section never rolls about its own axis.
     """
     along = (end - start) / np.linalg.norm(end - start)
@@ -111,7 +111,7 @@ def _find_section_axes(start: Points, end: Points) -> Points:
 
 
 def _loft(start: npt.ArrayLike, end: npt.ArrayLike, one: Points, two: Points) -> trimesh.Trimesh:
-    """Return the hull of sections `one` and `two` (n, 2), set across a line's ends."""
+    """Return the hull of cross-sections `one` and `two` (n, 2) at a line's ends."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     across = _find_section_axes(a, b)
     return hull(a + one @ across, b + two @ across)
@@ -124,7 +124,7 @@ def rod(
     end_radius: float | None = None,
     sides: int = 12,
 ) -> trimesh.Trimesh:
-    """Return a round bar, tapered if `end_radius` is given."""
+    """Return a round bar from start to end, tapered if `end_radius` is given."""
     circle = ring(1.0, 0.0, sides)[:, :2]
     return _loft(start, end, radius * circle, (end_radius or radius) * circle)
 

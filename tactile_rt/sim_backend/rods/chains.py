@@ -19,11 +19,11 @@ A = Any  # a contiguous array of float64: numba infers the types of arguments
 
 
 class Chain(NamedTuple):
-    """The mechanical parameters of a whisker, or of many with concatenated rows.
+    """The mechanical parameters of one whisker, or of many, their rows concatenated.
 
     Attributes:
         clamped: The number of links without a joint: 1, or 0 on a compliant base.
-        turn: (link, 2) cosine and sine of the resting angle from the link before, about z.
+        turn: (link, 2) cosine and sine of the resting angle from the previous link, about z.
         length: (link,) lengths of the links, mm.
         inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
             inertia (mg mm^2).
@@ -59,10 +59,10 @@ class Pose(NamedTuple):
 
 @compile_cached
 def place(chain: Chain, q: A, pose: Pose) -> None:
-    """Compute a chain's pose from the first node and first resting frame in `pose`.
+    """Fill a chain's pose from joint angles and from its first node and first frame.
 
     Args:
-        q: (degree of freedom,) rad.
+        q: (degree of freedom,) joint angles, rad.
     """
     clamped, turn, length = chain.clamped, chain.turn, chain.length
     nodes, frames, axes = pose
@@ -91,7 +91,7 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
 
 @compile_cached
 def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
-    """Compute the pose of a chain on a base (4, 3): point, then frame."""
+    """Fill the pose of a chain on a base, `root` (4, 3): point, then frame."""
     for i in range(3):
         pose.nodes[0, i] = root[0, i]
         for k in range(3):
@@ -101,7 +101,7 @@ def place_at(root: A, chain: Chain, q: A, pose: Pose) -> None:
 
 @compile_cached
 def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
-    """Compute the lower triangle of the mass matrix.
+    """Compute the lower triangle of a chain's joint-space mass matrix, mg mm^2.
 
     Args:
         work: (3, 3) scratch.
@@ -132,7 +132,7 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
         d0, d1, d2 = h0 - mass * p0, h1 - mass * p1, h2 - mass * p2
         for k in range(2 * (b - clamped), 2 * (b - clamped) + 2):
             a0, a1, a2 = axes[k, 0], axes[k, 1], axes[k, 2]
-            # Momentum of all that turns with this joint at unit speed, and its moment.
+            # Momentum of all links that rotate with this joint at unit speed, and its moment.
             l0, l1, l2 = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
             v0, v1, v2 = a2 * p1 - a1 * p2, a0 * p2 - a2 * p0, a1 * p0 - a0 * p1
             m0 = work[0, 0] * a0 + work[0, 1] * a1 + work[0, 2] * a2 + h1 * v2 - h2 * v1
@@ -155,11 +155,11 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
 def inertial_forces(
     chain: Chain, pose: Pose, v: A, a: A, base: A, pushed: A, work: A, torques: A, wrench: A
 ) -> None:
-    """Compute the torques of a motion (inverse dynamics), less those of external forces.
+    """Compute a motion's joint torques (inverse dynamics), less those of external forces.
 
     Args:
         v, a: (degree of freedom,) rad/ms and rad/ms^2.
-        base: (4, 3) of the base: velocity (not used), angular velocity, acceleration, angular
+        base: (4, 3) the base's velocity (not used), angular velocity, acceleration, angular
             acceleration.
         pushed: (link, 6) force (mN) and moment about the world's origin (uN m) on each link.
         work: (link, 6) scratch.
@@ -258,7 +258,7 @@ def factor(matrix: A, n: int) -> bool:
 
 @compile_cached
 def solve_forth(lower: A, n: int, x: A) -> None:
-    """Solve L y = x, in place."""
+    """Solve L y = x for y, which replaces x."""
     for i in range(n):
         s = x[i]
         for k in range(i):
@@ -268,7 +268,7 @@ def solve_forth(lower: A, n: int, x: A) -> None:
 
 @compile_cached
 def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
-    """Solve L y = x for `count` columns of x, in place."""
+    """Solve L y = x for y, which replaces x: `count` columns at once."""
     for i in range(n):
         for k in range(i):
             for c in range(count):
@@ -279,7 +279,7 @@ def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
 
 @compile_cached
 def solve_back(lower: A, n: int, x: A) -> None:
-    """Solve L' y = x, in place."""
+    """Solve L' y = x for y, which replaces x."""
     for i in range(n - 1, -1, -1):
         x[i] /= lower[i, i]
         s = x[i]
@@ -288,7 +288,7 @@ def solve_back(lower: A, n: int, x: A) -> None:
 
 
 def chain_mass(chain: Chain) -> A:
-    """Compute the full mass matrix of a chain at rest: (degree of freedom, same)."""
+    """Compute the full joint-space mass matrix of a chain at rest, mg mm^2."""
     links, n = len(chain.length), 2 * (len(chain.length) - chain.clamped)
     pose = Pose(np.zeros((links + 1, 3)), np.zeros((links, 3, 3)), np.zeros((n, 3)))
     pose.frames[0], matrix = np.eye(3), np.zeros((n, n))

@@ -30,7 +30,7 @@ STAMP = tuple(
 
 
 class _DiskCache(_caching.FunctionCache):  # type: ignore[misc]
-    """Numba's disk cache of a function, whose failures are ignored."""
+    """Numba's disk cache of a function; failures to read or write it are ignored."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
@@ -63,7 +63,7 @@ _compiling: set[_DiskCache] = set()  # caches of the functions that are being co
 
 @cache
 def _watch_once() -> None:
-    """Warn if compilation still goes on after `PATIENCE_S`."""
+    """Start a timer, once, that warns if compilation takes more than `PATIENCE_S`."""
     timer = threading.Timer(PATIENCE_S, _warn_of_compilation)
     timer.daemon = True
     timer.start()
@@ -85,8 +85,8 @@ def _warn_uncached_once() -> None:
 def compile_cached(function: Function) -> Function:
     """Return a function that is compiled when first called, and cached on disk.
 
-    It releases the interpreter lock, and its sums keep the order of the source: the same numbers
-    on every machine.
+    The function releases the interpreter lock, and its sums keep the order of the source, so that
+    results are the same on every machine.
     """
     made: Any = numba.njit(nogil=True, error_model="numpy")(function)
     try:
@@ -97,7 +97,7 @@ def compile_cached(function: Function) -> Function:
 
 
 def is_kept(function: Callable[..., Any]) -> bool:
-    """Return whether other processes find this version of a function compiled."""
+    """Return whether a compiled function is cached on disk, for other processes to load."""
     cache: Any = getattr(function, "_cache", None)
     try:
         return isinstance(cache, _DiskCache) and bool(cache._cache_file._load_index())

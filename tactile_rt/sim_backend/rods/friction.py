@@ -23,7 +23,7 @@ TOLERANCE = 1e-4  # of the largest impulse
 
 @compile_cached
 def impulses(count: int, response: A, free: A, friction: float, drag: A, found: A) -> int:
-    """Solve for the impulses of contacts.
+    """Solve for the contact impulses that prevent overlap, with Coulomb friction.
 
     Args:
         count: number of contacts, each with a normal and two tangential directions.

@@ -19,7 +19,7 @@ WORK = (6, 4)  # shape of the scratch
 def _find_weights(simplex: A, count: int, weights: A, w: A) -> float:
     """Compute the squared distance from the origin to the hull of up to four points.
 
-    Tries all subsets, fifteen at most; `weights` is filled with those of the nearest inner point.
+    All subsets are tried, at most fifteen; `weights` is filled with those of the nearest point.
     """
     best = np.inf
     for mask in range(1, 1 << count):

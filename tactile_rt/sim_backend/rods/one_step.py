@@ -26,7 +26,7 @@ GIVES_MM = 1e-4  # deflection of a sticking contact before it slides
 
 @compile_cached
 def _fill_directions(normal: A, frame: A, rows: A) -> None:
-    """Fill rows with a normal and two tangents, one along the link if possible."""
+    """Fill `rows` with the normal and two tangents, the first along the link if possible."""
     for axis in range(2):
         x0, x1, x2 = frame[0, axis], frame[1, axis], frame[2, axis]
         onto = x0 * normal[0] + x1 * normal[1] + x2 * normal[2]
@@ -43,7 +43,7 @@ def _fill_directions(normal: A, frame: A, rows: A) -> None:
 
 
 class Scratch(NamedTuple):
-    """Work arrays of a step; only the results that outlast it are documented.
+    """Work arrays of a time step; only those read after the step are documented.
 
     Attributes:
         mass, lower: The mass matrix and the Cholesky factor of the system, of the last step for
@@ -114,8 +114,8 @@ def step(
         h: length of the step, ms.
         fresh: whether to compute mass matrix and factor anew; else those of an earlier step of the
             same length are used.
-        level: how often the whisker's usual step is halved: selects the added masses and damping.
-        q, v: (degree of freedom,) rad and rad/ms.
+        level: how many times the usual step is halved, which selects added masses and damping.
+        q, v: (degree of freedom,) joint angles and their rates, rad and rad/ms.
         surface: (3,) velocity of the object, mm/ms.
         last: (link, 6) see `stepping.RodState`; updated.
     """
@@ -264,7 +264,7 @@ def _push_out(
     near: Contacts,
     room: Scratch,
 ) -> None:
-    """Resolve overlaps by the smallest displacement, without changing velocities."""
+    """Move a whisker out of overlaps by the smallest displacement, without changing velocities."""
     n = len(q)
     gaps, points, nodes = near.gaps, near.points, pose.nodes
     lower, rows, reply, response = room.lower, room.rows, room.reply, room.response
@@ -273,7 +273,7 @@ def _push_out(
         turned[k] = 0.0
         for j in range(k, n):
             turned[k] += lower[j, k] * v[j]
-    # free: the gap of each contact after the step, mm; negative: still overlapping
+    # free: the gap of each contact after the step, mm; negative if still overlapping
     for c in range(count):
         i = 3 * c
         r0 = points[c, 0] - nodes[0, 0]

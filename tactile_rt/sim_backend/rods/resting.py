@@ -1,4 +1,4 @@
-"""A whisker's rest under its weight, and its linearised free motion near rest."""
+"""A whisker's equilibrium under its weight, and its linearised free motion near it."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ LITTLE = 0.005  # rad, sum over all joints: the limit of the linear range
 
 @compile_cached
 def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool:
-    """Find the angles at which a whisker rests under its weight, by Newton's method.
+    """Find the joint angles at which a whisker rests under its weight, by Newton's method.
 
     Args:
         root: (4, 3) see `stepping.advance`.
@@ -35,7 +35,7 @@ def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool
         nodes: (2, link + 1, 3) filled: ends of the links without weight and with it, mm.
 
     Returns:
-        False if there is no solution: the whisker is too soft to carry itself.
+        False without a solution: the whisker is too soft to carry its weight.
     """
     links, n = len(chain.length), len(q)
     pose = Pose(np.empty((links + 1, 3)), np.empty((links, 3, 3)), np.empty((n, 3)))
@@ -77,7 +77,7 @@ def settle(chain: Chain, root: A, gravity: A, q: A, weight: A, nodes: A) -> bool
 
 @compile_cached
 def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None:
-    """Compute the matrix that moves a whisker near rest through a sample of 1 ms.
+    """Compute the matrix that advances a whisker near rest by a sample of 1 ms.
 
     Args:
         steps: time steps in a sample.
@@ -85,7 +85,7 @@ def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None
         rest: (degree of freedom,) see `settle`, rad.
         answers: (2 degree of freedom + 6 or 8, 2 degree of freedom + 3) filled. Rows (outputs):
             angles relative to rest and their rates after the sample, mean force and moment of the
-            base (mN and uN m) and, on a compliant base, its two mean turns. Columns (inputs):
+            base (mN and uN m) and, on a compliant base, its two mean rotations. Columns (inputs):
             angles relative to rest, rates, and acceleration of the base, in that frame.
     """
     links, n = len(chain.length), len(rest)
@@ -143,10 +143,10 @@ def linearise(steps: int, chain: Chain, gravity: A, rest: A, answers: A) -> None
 
 @compile_cached
 def move_on(free: float, state: A, root: A, shaken: A, x: A, felt: A) -> float:
-    """Advance a whisker near rest by a whole sample, if nothing is in its way.
+    """Advance a whisker near rest by a whole sample, if no object is near.
 
     Args:
-        free: distance from the whisker that is free of objects, divided by its length.
+        free: object-free distance around the whisker, divided by the whisker's length.
         state: see `stepping.RodState`; angles and rates are updated.
         root: (4, 3) see `stepping.advance`.
         shaken: (3,) acceleration of the base, mm/ms^2.
@@ -154,7 +154,7 @@ def move_on(free: float, state: A, root: A, shaken: A, x: A, felt: A) -> float:
         felt: (6,) loads and (6,) contacts of the sample, filled: see `stepping.advance`.
 
     Returns:
-        The sum of the joints' turns, rad; negative: the whisker is bent too far and did not move.
+        The sum of the joints' rotations, rad; negative if not advanced: too bent or an object near.
     """
     q, v, rest, answers = state.q, state.v, state.rest, state.answers
     load, contact = felt

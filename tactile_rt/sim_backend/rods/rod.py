@@ -29,12 +29,12 @@ HEARD_HZ = 500.0  # samples at 1 kHz cannot represent resonances above
 
 @dataclass(frozen=True)
 class Rod:
-    """One whisker, cut into links and ready to be stepped.
+    """A whisker cut into links, with a time step at which it rings correctly.
 
     Attributes:
         resonance_hz: The first resonance of the whisker on its mount, Hz.
         wanted_ratio: The target damping ratio of the first mode, including the mount's damping.
-        damping_ratio: The damping ratio with which it rings when stepped.
+        damping_ratio: The damping ratio of the first mode as simulated.
         to_element: The (3, 3) rotation from the frame of the first link to that of the element.
     """
 
@@ -48,7 +48,7 @@ class Rod:
 
 
 def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
-    """Cut a whisker into equal cells, and choose a step with which it rings correctly.
+    """Cut a whisker into cells, and choose a time step at which it rings correctly.
 
     A step that is long against a period makes a mode slower and damps it more. Both are corrected
     for every mode, see `match_ringing`, as far as the step allows. If it does not for the first
@@ -114,7 +114,7 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
 
 
 def _cut_chain(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
-    """Cut a whisker into cells.
+    """Cut a whisker into a chain of links, jointed at the middle of `links` cells.
 
     Returns:
         The chain without added masses and damping, the stiffness-proportional damping of each
@@ -147,7 +147,7 @@ def _cut_chain(whisker: Whisker, links: int) -> tuple[Chain, Floats, Floats]:
 
 
 def _find_modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
-    """Find the modes of a chain at rest, in and out of plane.
+    """Find the vibration modes of a chain at rest, in and out of plane.
 
     Returns:
         Angular frequencies (mode,), rad/ms, slowest first in each plane; shapes (joint, mode) of
@@ -166,7 +166,7 @@ def match_ringing(omega: float, ratio: float, h: float) -> tuple[float, float]:
     """Compute mass factor and damping that make backward Euler ring a mode exactly.
 
     The step x' = x + h v', m (v' - v) = -h (k x' + beta k v') multiplies the mode by two numbers.
-    With more mass and less damping than the mode has, they are exp(h lambda), lambda its own poles.
+    With more mass and less damping than the mode has, they are exp(h lambda), its poles lambda.
 
     Returns:
         The factor of the mass, and beta (ms), negative if the step alone damps more than `ratio`.
@@ -185,7 +185,7 @@ def match_ringing(omega: float, ratio: float, h: float) -> tuple[float, float]:
 def _cut_segments(
     whisker: Whisker, link: int, s: Floats, nodes: Floats, heading: float
 ) -> tuple[Floats, ...]:
-    """Cut a link into segments: ends, bows, radii and arcs, as in `Segments`."""
+    """Cut a link into contact segments: ends, bows, radii and arcs, as in `Segments`."""
     longest = math.sqrt(8 * SAG_MM / max(2 * abs(whisker.curvature), 1e-12))
     count = max(1, math.ceil((s[link + 1] - s[link]) / longest))
     at = np.linspace(s[link], s[link + 1], count + 1)

@@ -1,4 +1,4 @@
-"""Time stepping of a whisker beside a moving object, on a base that may turn.
+"""Time stepping of a whisker beside a moving object, on a base that may rotate.
 
 A step is implicit in stiffness and damping (backward Euler in the joint angles) and in contact:
 
@@ -46,10 +46,10 @@ STILL = 1e-9  # rad and rad/ms: below, a whisker with nothing near is not steppe
 
 
 class RodState(NamedTuple):
-    """State of a whisker between steps, and its rest under its weight.
+    """The state of a whisker between steps, and its equilibrium under its weight.
 
     Attributes:
-        q, v: (degree of freedom,) angles and their rates, rad and rad/ms.
+        q, v: (degree of freedom,) joint angles and their rates, rad and rad/ms.
         last: (link, 6) the last contact force on each link, normal and tangential (mN), and its
             drag, as initial values; the deflection of the sticking contact, see `one_step`, mm.
         rest: (degree of freedom,) angles at rest, bent by its weight, rad.
@@ -66,7 +66,7 @@ class RodState(NamedTuple):
 
 
 class RowBounds(NamedTuple):
-    """Starts of each whisker's rows, and the last end, (whisker + 1,) each."""
+    """Row offsets of each whisker in concatenated arrays, with the end: (whisker + 1,) each."""
 
     links: A
     joints: A
@@ -91,15 +91,15 @@ def advance(
     loads: A,
     contacts: A,
 ) -> int:
-    """Step whiskers through samples of 1 ms.
+    """Simulate whiskers through samples of 1 ms; return the number of computed steps.
 
     Args:
         steps: (whisker,) number of steps in a sample.
         state, seen: updated. `travelled` and `soonest` have a row for each whisker.
         roots: (whisker, sample or 1, 4, 3) base point and, in the rows after it, the frame of the
-            first link at rest, at the beginning of each sample; 1: it does not turn.
-        bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1: the same for all.
-            During a sample a frame turns with its base's angular velocity.
+            first link at rest, at the beginning of each sample; 1 if it does not rotate.
+        bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1 if equal for all.
+            During a sample a frame rotates with its base's angular velocity.
         quiet: whether the bases stand still.
         gravity: (3,) mm/ms^2; `bases` contains it as the opposite acceleration.
         way: (sample + 1, 3) positions of the object at the beginning of each sample and at the end
@@ -107,8 +107,8 @@ def advance(
         loads: (whisker, sample, 6) zeros, filled: means of force (mN) and moment (uN m) on the
             base, in the world.
         contacts: (whisker, sample, 6) zeros, filled: share of the time in contact, mean normal
-            force (mN), mean of normal force times arc length (uN m), mean turns of a compliant base
-            about the element's y and z (rad), and the depth of overlap with the object, mm.
+            force (mN), mean of normal force times arc length (uN m), mean angles of a compliant
+            base about the element's y and z (rad), and the depth of overlap with the object, mm.
 
     Returns:
         The number of computed steps; negative if a step still fails in `WILDEST_PARTS` parts.
@@ -183,7 +183,7 @@ def _advance(
     loads: A,
     contacts: A,
 ) -> int:
-    """Step one whisker, see `advance`."""
+    """Simulate one whisker; arguments and result are those of `advance`."""
     q, v, last, rest, weight, answers = state
     travelled, soonest = seen.travelled, seen.soonest
     links, n = len(chain.length), len(q)
@@ -372,7 +372,7 @@ def _measure_distance(way: A, sample: int) -> float:
 
 @compile_cached
 def _find_largest_move(old: A, new: A) -> float:
-    """Return the largest motion of a node; not a number if any is."""
+    """Return the largest distance that a node moved, mm; NaN if the tip's is."""
     furthest = 0.0
     for b in range(len(old)):
         square = 0.0
@@ -385,7 +385,7 @@ def _find_largest_move(old: A, new: A) -> float:
 
 @compile_cached
 def _rotate_base(root: A, base: A, t: float, here: A) -> None:
-    """Compute a base's frame at a time after the sample's start (Rodrigues' rotation)."""
+    """Compute a base's frame at `t` ms after the sample's start (Rodrigues' rotation)."""
     x, y, z = base[1, 0] * t, base[1, 1] * t, base[1, 2] * t
     angle = math.sqrt(x * x + y * y + z * z)
     here[:] = root

@@ -11,15 +11,15 @@ from tactile_rt.sim_backend.rods.nearest import WORK, nearest
 
 A = Any
 NEAR_MM = 0.1  # places that are nearer are constraints of a step
-STALE_MM, CLOSE_MM = 0.05, 1.0  # within the second, a plane is updated after so much travel
+STALE_MM, CLOSE_MM = 0.05, 1.0  # a plane closer than CLOSE_MM is updated after STALE_MM of travel
 MOST_CONTACTS = 8  # of one whisker at one time: the nearest ones
 
 
 class Segments(NamedTuple):
     """The segments of a whisker that are searched for contacts with an object.
 
-    The nearest place is searched along the chord; the arc's distance from the chord is
-    approximated by a parabola.
+    The search runs along a segment's chord; the arc's distance from the chord is approximated by a
+    parabola.
 
     Attributes:
         link: (segment,) numbers of the segments' links.
@@ -41,13 +41,13 @@ class Object(NamedTuple):
 
     Attributes:
         corners: (corner, 3) corners of the pieces, mm.
-        corner_at: (piece + 1,) numbers at which the corners of each piece begin.
+        corner_at: (piece + 1,) index of each piece's first corner.
         faces: (face, 4) outward normals and offsets.
-        face_at: (piece + 1,) numbers at which the faces of each piece begin.
-        rounding: (piece,) the radius by which each is grown, mm.
+        face_at: (piece + 1,) index of each piece's first face.
+        rounding: (piece,) the radius by which each piece is grown, mm.
         beside: The neighbours of each corner along its edges, numbered in its piece, see
             `nearest`; none for pieces with few corners.
-        beside_at: (corner + 1,) numbers at which the neighbours of each corner begin.
+        beside_at: (corner + 1,) index of each corner's first neighbour in `beside`.
     """
 
     corners: A
@@ -65,7 +65,7 @@ class Seen(NamedTuple):
     Attributes:
         travelled: (1,) the distance that object and whisker have travelled since the start, mm.
         reach: (segment, piece) lower bound of the gap, plus `travelled` when it was computed.
-        soonest: (piece + 1,) the least of them over segments, and infinity at the end.
+        soonest: (piece + 1,) the least `reach` over segments, and infinity at the end.
         known: (segment, piece, 4) initial pairs of points for the search, see `nearest`.
         planes: (segment, piece, 5) outward normal and offset of a plane that the piece does not
             cross, and `travelled` when it was computed.
@@ -96,7 +96,7 @@ class Contacts(NamedTuple):
 
 
 def unseen(whiskers: int, segments: int, pieces: int) -> Seen:
-    """Return bounds before the first search, with the whiskers' segments concatenated."""
+    """Return the initial bounds of several whiskers, their segments concatenated."""
     return Seen(
         np.zeros((whiskers, 1)),
         np.full((segments, pieces), -np.inf),
@@ -108,7 +108,7 @@ def unseen(whiskers: int, segments: int, pieces: int) -> Seen:
 
 @compile_cached
 def forget(seen: Seen) -> None:
-    """Reset all bounds, as before the first search."""
+    """Reset all bounds to those before the first search."""
     seen.reach[:] = -np.inf
     seen.soonest[:-1] = -np.inf
     seen.known[:] = -1
@@ -132,8 +132,8 @@ def find_near(
     """Find the places where a whisker is nearest to pieces, and return their number.
 
     For each piece these are the minima of the gap along each link. A plane that a piece does not
-    cross bounds the gap of a segment from below. As pieces do not turn, the last search's plane
-    still does: only segments whose bound is less than their neighbours' are searched again.
+    cross bounds the gap of a segment from below. As pieces do not rotate, the last search's plane
+    remains valid: only segments whose bound is less than their neighbours' are searched again.
 
     Args:
         centre: (3,) position of the object, mm.
@@ -239,7 +239,7 @@ def find_near(
 
 @compile_cached
 def _is_nearest(s: int, now: A, link_of: A) -> bool:
-    """Return whether no neighbour on the same link is nearer, by present bounds."""
+    """Return whether segment `s` is nearer than its neighbours on the link, by present bounds."""
     gap, link = now[s, 0], link_of[s]
     if s > 0 and link_of[s - 1] == link and now[s - 1, 0] <= gap:
         return False

@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
 
 WEIGHTLESS, NO_EDGES = np.zeros(3), np.zeros((0, 2), np.int64)
 FASTEST = 3.01  # mm/ms, or m/s
-FEW_CORNERS = 64  # up to so many, trying them all is faster
+FEW_CORNERS = 64  # for so many corners or fewer, trying all is faster
 
 _make_rod = lru_cache(maxsize=512)(make_rod)  # 10 ms each; the same whiskers meet many objects
 
@@ -35,8 +35,8 @@ class Piece:
         corners: The (corner, 3) corners, mm, relative to the object's position.
         faces: The (face, 4) outward normals and offsets of the hull; none for a point or a line.
         rounding: The radius by which the hull is grown, mm.
-        edges: The (2 * edge, 2) corners that an edge joins, both ways, sorted; none if there are
-            only few corners, which are all tried.
+        edges: The (2 * edge, 2) corners that an edge joins, both ways, sorted; none for few
+            corners, which are all tried.
     """
 
     corners: Floats
@@ -46,7 +46,7 @@ class Piece:
 
     @classmethod
     def of(cls, mesh: trimesh.Trimesh) -> "Piece":
-        """Make a piece of a convex mesh."""
+        """Make a piece from a convex mesh."""
         normals = np.asarray(mesh.face_normals, dtype=np.float64)
         offsets = np.einsum("fi,fi->f", normals, mesh.triangles[:, 0])
         faces = np.concatenate([normals, offsets[:, None]], axis=1)
@@ -65,7 +65,7 @@ class Piece:
 
 
 class RodWorld:
-    """Whiskers on bases that turn or stand still, and an object that only translates.
+    """The `rods` engine: whiskers on fixed or rotating bases, and an object that only translates.
 
     Args:
         roots: (whisker, 4, 3) base point (mm) and, in the rows after it, the element's frame in the
@@ -78,7 +78,7 @@ class RodWorld:
 
     Attributes:
         angles: The (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
-        turns: The (sample, whisker, 2) mean turns of compliant bases in the samples of the last
+        turns: The (sample, whisker, 2) mean rotations of compliant bases in the samples of the last
             `advance`, about the element's y and z, rad.
         sag: The (link + 1, 3) displacements of each whisker's nodes by gravity, mm.
         overlap: The (sample, whisker) depth of overlap with the object in those samples, mm;
@@ -169,12 +169,12 @@ class RodWorld:
 
         Args:
             shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; `way` is then
-                relative to the head. None: it is not accelerated.
-            turning: (sample + 3, whisker, 3, 3) frames of the elements in the world if bases turn:
-                at the beginning of each sample, from the sample before the first to the sample
-                after the last, and at the end of that. Each turns at a constant rate in a sample,
-                by less than 90 degrees. Loads are in the frame at the middle of their sample.
-                None: the frames stay as at construction.
+                relative to the head. If None, the head is not accelerated.
+            turning: (sample + 3, whisker, 3, 3) frames of the elements in the world if bases
+                rotate: at the beginning of each sample, from the sample before the first to the
+                sample after the last, and at the end of that. Each rotates at a constant rate in a
+                sample, by less than 90 degrees. Loads are in the frame at the middle of their
+                sample. If None, the frames stay as at construction.
         """
         samples = len(way) - 1
         fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0.0)
@@ -215,7 +215,7 @@ class RodWorld:
 
 
 def _cut_rod(whisker: Whisker, links: int, steps_per_sample: int) -> Rod:
-    """Call `make_rod` once for all whiskers of one shape and material."""
+    """Return a whisker's rod, cached for all whiskers of the same shape and material."""
     rod = _make_rod(_strip_pose(whisker), links, steps_per_sample)
     return replace(rod, chain=rod.chain._replace(friction=whisker.friction))
 
@@ -229,13 +229,13 @@ def _linearise(rod: Rod, gravity: Floats, rest: Floats) -> Floats:
 
 @lru_cache(maxsize=512)
 def _linearise_bare(shape: Whisker, links: int, steps_per_sample: int) -> Floats:
-    """Call `resting.linearise` for a whisker without weight."""
+    """Compute the linear response of a weightless whisker, cached by its shape."""
     rod = _make_rod(shape, links, steps_per_sample)
     return _linearise(rod, WEIGHTLESS, np.zeros(len(rod.chain.stiffness)))
 
 
 def _strip_pose(whisker: Whisker) -> Whisker:
-    """Return a whisker of this shape and material alone, as a key for the cache."""
+    """Return a copy without name, pose and friction: a cache key of shape and material."""
     here = (0.0, 0.0, 0.0)
     return replace(whisker, name="any", row=0, column=0, base=here, angles=here, friction=0.0)
 
@@ -250,7 +250,7 @@ def _rotate_loads(loads: Floats, frames: Floats) -> Floats:
 
 
 def _compute_rates(frames: Floats) -> Floats:
-    """Compute (whisker, sample, 3) rates, rad/ms, of frames (sample + 1, whisker, 3, 3)."""
+    """Compute rotation rates (whisker, sample, 3), rad/ms, of frames at samples' starts."""
     step = (frames[1:] @ frames[:-1].swapaxes(-1, -2)).swapaxes(0, 1)
     turns = Rotation.from_matrix(step.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(turns.reshape(step.shape[:-1]) / SAMPLE_MS)
@@ -267,5 +267,5 @@ def _stack(each: Sequence[Any]) -> NDArray[Any]:
 
 
 def _find_starts(each: Sequence[Any]) -> NDArray[np.int64]:
-    """Return the start of each array's rows when concatenated, and the end of the last."""
+    """Return the offset of each array's rows when concatenated, and the end of the last."""
     return np.cumsum([0, *(len(rows) for rows in each)])

@@ -19,10 +19,10 @@ def write_contact_sheet(
     things: Mapping[str, Sequence[trimesh.Trimesh] | None],
     whiskers: Sequence[NDArray[np.float64]] = (),
 ) -> None:
-    """Write a picture (.png) of named objects.
+    """Write a picture (.png) that shows each object with its name.
 
     Args:
-        things: the pieces of each object; None: it cannot be used.
+        things: the pieces of each object by name; None if it cannot be used.
         whiskers: (point, 3) from base to tip, mm, in the world, drawn with every object, which
             moves along -y; the pieces are then in the world, too.
     """

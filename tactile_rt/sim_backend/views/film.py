@@ -46,7 +46,7 @@ class Dressed:
     """A copy of a simulation's model and state, prepared for drawing.
 
     Attributes:
-        sites: The number of the site at each element's base, in the order of the elements.
+        sites: The id of the MuJoCo site at each element's base, in the order of the elements.
     """
 
     def __init__(self, model: mujoco.MjModel, spec: ArraySpec) -> None:
@@ -77,7 +77,7 @@ class Dressed:
         visual.quality.offsamples = 0  # drawing finer gives smooth edges at half the cost
 
     def points(self) -> NDArray[np.float64]:
-        """Compute the (n, 3) ends of all links in the world, mm, as posed."""
+        """Compute the (n, 3) ends of all links in the present pose, world, mm."""
         half = self.model.geom_size[self._whiskers, 1, None]
         axes = self.data.geom_xmat[self._whiskers].reshape(-1, 3, 3)[:, :, 2]
         middle = self.data.geom_xpos[self._whiskers]
@@ -102,7 +102,7 @@ class Dressed:
         self.model.geom_rgba[self._others, 3] = opacity
 
     def pose(self, footage: Footage, moment: int, scale: ForceScale) -> None:
-        """Restore a moment, with each whisker in the colour of its force."""
+        """Restore the state of a moment, and colour each whisker by its force."""
         footage.restore(moment, self.data)
         for geoms, size in zip(self.links, scale.per_si * footage.sizes[moment], strict=True):
             self.model.geom_rgba[geoms] = scale.colour(size)
@@ -130,7 +130,7 @@ class Stage:
     """An offscreen renderer of the states in footage; call `close` when done.
 
     Args:
-        width, height: of the pictures, pixels.
+        width, height: size of the pictures, pixels.
     """
 
     def __init__(
@@ -197,9 +197,9 @@ class Stage:
 
 
 def _open_gl(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
-    """Open an OpenGL context with MuJoCo's: from MUJOCO_GL, else the first that works.
+    """Open an OpenGL and a MuJoCo context, by MUJOCO_GL or the first backend that works.
 
-    mujoco.Renderer is not used, because it chooses when mujoco is first imported: too early.
+    mujoco.Renderer is not used, because it chooses the backend too early: at mujoco's first import.
     """
     choice = os.environ.get("MUJOCO_GL", "").lower().strip()
     if choice in ("egl", "osmesa", "glfw", "cgl"):
@@ -237,7 +237,7 @@ def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:
 
 
 class Film:
-    """Complete pictures of footage; call `close` when done.
+    """A renderer of complete pictures of footage; call `close` when done.
 
     Args:
         pixels: width of the pictures; their height is 9/16 of the width.
@@ -275,7 +275,7 @@ class Film:
 
 
 def check_suffix(path: Path) -> str:
-    """Return the suffix of a file's name: one of `IMAGES` and `VIDEOS`."""
+    """Return a file's suffix; raise a `ConfigError` unless in `IMAGES` or `VIDEOS`."""
     suffix = path.suffix.lower()
     if suffix not in IMAGES + VIDEOS:
         raise ConfigError(

@@ -134,16 +134,16 @@ class Footage:
 
     @property
     def strongest(self) -> int:
-        """The moment with the largest sum of sizes; the middle if all are 0."""
+        """Index of the moment of the largest total force; the middle if all are 0."""
         total = self.sizes.sum(axis=1)
         return int(total.argmax()) if total.any() else len(self) // 2
 
     def at(self, ms: float) -> int:
-        """Return the moment nearest to a time, ms since the start."""
+        """Return the index of the moment nearest to a time, ms since the start."""
         return int(np.clip(round(ms / self.period_ms) - 1, 0, len(self) - 1))
 
     def restore(self, moment: int, data: mujoco.MjData) -> None:
-        """Restore a moment's state in `data` of this model or a copy."""
+        """Set `data`, of this model or a copy, to the state of a moment."""
         mujoco.mj_setState(self.model, data, self.states[moment], _STATE)
         mujoco.mj_kinematics(self.model, data)
 
@@ -155,12 +155,12 @@ def record(
     progress: Callable[[float], None] = lambda done: None,
     sensor: SensorSpec | None = None,
 ) -> Footage:
-    """Run a simulation to its end, and record it.
+    """Run a simulation to its end; return loads and states every `period_ms` ms.
 
     Args:
         simulation: made with `whole=True`, so that it has all whiskers of the array; it continues
             from its present state.
-        sensor: the array's sensor, which `spec` describes; None: `spec` describes base loads.
+        sensor: the array's sensor, which `spec` describes; None if `spec` describes base loads.
     """
     moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)

@@ -39,7 +39,7 @@ _TOP_PERCENTILE = 98.0  # of the moments' strongest forces, which sets the top c
 
 
 def round_number(value: float) -> float:
-    """Round to the nearest of 1, 2, 5, 10, 20, ... on a logarithmic scale."""
+    """Round to the nearest of ..., 1, 2, 5, 10, 20, ... on a logarithmic scale."""
     if not value > 0:
         return 1.0
     choices = [m * 10.0**e for e in range(-9, 10) for m in (1, 2, 5)]
@@ -88,7 +88,7 @@ class ForceScale:
 
 
 class Sheet:
-    """Pictures of footage, one for each moment; static parts are drawn once.
+    """A renderer of footage with map and traces; static parts are drawn once.
 
     Attributes:
         size: The (width, height) of the pictures in pixels, both even.
@@ -167,13 +167,13 @@ def _round_size(pixels: int) -> tuple[int, int]:
 
 
 def scene_size(pixels: int) -> tuple[int, int]:
-    """Compute the scene's (width, height) in a sheet of a width, pixels."""
+    """Compute the scene's (width, height), pixels, in a sheet that is `pixels` wide."""
     width, height = _round_size(pixels)
     return round(SCENE[2] * width), round(SCENE[3] * height)
 
 
 def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artist]:
-    """Draw a reference arrow, as long as at the camera's focus, and its label."""
+    """Draw a labelled reference arrow, as long as the top force's arrow in the scene."""
     right, y = SCENE[0] + SCENE[2] - 0.022, SCENE[1] + 0.03  # bases are often on the left
     long = scale.arrow_mm / camera.extent_mm * SCENE[3] * TALL / WIDE
     head: dict[str, Any] = {"arrowstyle": "-|>", "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
@@ -187,7 +187,7 @@ def _draw_ruler(figure: Figure, camera: Camera, scale: ForceScale) -> list[Artis
 
 
 def _must_mirror(footage: Footage, camera: Camera) -> bool:
-    """Return whether to mirror the map so that its nose is on the picture's side."""
+    """Return whether to mirror the map, so that its rostral side matches the scene's."""
     data = mujoco.MjData(footage.model)
     footage.restore(0, data)
     whisker = footage.model.site_bodyid[footage.model.site(footage.spec.elements[0]).id]
@@ -200,13 +200,13 @@ def _must_mirror(footage: Footage, camera: Camera) -> bool:
 
 
 class ForceMap:
-    """The array's grid, with each cell in the colour of its force, and its direction.
+    """A map of the array's grid: each cell shows its force by colour and arrow.
 
     The arrow in a cell is the component of the force along y and z of the mount frame, rostral and
     dorsal on an animal; it is longest if all of the force is in that plane.
 
     Args:
-        place: in the figure: left, bottom, width, height, fractions.
+        place: left, bottom, width and height in the figure, as fractions.
         mirrored: whether column 0 is on the right, as in a picture with +y on the left.
     """
 
@@ -250,7 +250,7 @@ class ForceMap:
         axes.axis("off")
 
     def show(self, loads: NDArray[np.float64], sizes: NDArray[np.float64]) -> list[Artist]:
-        """Set loads (element, 6), SI, in the element frames, and sizes (element,).
+        """Update the map to loads (element, 6), SI, element frames, and sizes (element,).
 
         Returns:
             The artists that differ from the map of an untouched array, in drawing order.
@@ -276,7 +276,7 @@ class ForceMap:
 
 
 def rostral_sign(spec: ArraySpec) -> NDArray[np.float64]:
-    """Return (element,) signs: 1 if columns go rostral, -1 if caudal (left of a face)."""
+    """Return (element,) signs: 1 if columns count rostrally, -1 if caudally (left of a face)."""
     place = np.array(spec.positions)
     columns = np.array([column for _, column in spec.grid], dtype=np.float64)
     signs = np.ones(len(columns))
@@ -306,7 +306,7 @@ def draw_scale(figure: Figure, place: Place, scale: ForceScale) -> None:
 def draw_traces(
     axes: Axes, times_ms: NDArray[np.float64], forces: NDArray[np.float64], names: tuple[str, ...]
 ) -> None:
-    """Draw forces (sample, element), mN, over time; the strongest in colour and by name."""
+    """Draw forces (sample, element), mN, over time; colour and name only the strongest."""
     peaks = forces.max(axis=0)
     top = max(float(peaks.max()), 1e-6)
     for rank, i in enumerate(np.argsort(-peaks)):

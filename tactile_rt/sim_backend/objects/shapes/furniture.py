@@ -58,7 +58,7 @@ def ladder(rng: Generator) -> list[Trimesh]:
         return (-0.04 - reach * (1 - z), side * (bottom + (top - bottom) * z) / 2, z)
 
     def rear(side: float, z: float) -> tuple[float, float, float]:
-        """Return the same point of the back legs."""
+        """Return a point of the back legs at height z, side -1 to 1."""
         return (0.04 + back * (1 - z), 0.9 * side * (bottom + (top - bottom) * z) / 2, z)
 
     pieces = [box((0, 0, 0.985), (0.16, top + rail, 0.03))]
@@ -101,7 +101,7 @@ def stool(rng: Generator) -> list[Trimesh]:
     turns = 2 * np.pi * (np.arange(legs) + 0.5) / legs
 
     def on(turn: float, z: float) -> tuple[float, float, float]:
-        """Return the point of a leg's axis at height z; `turn` in rad."""
+        """Return a point of a leg's axis at height z; `turn` is its azimuth, rad."""
         r = spread + (0.7 * seat - spread) * z
         return (r * np.cos(turn), r * np.sin(turn), z)
 

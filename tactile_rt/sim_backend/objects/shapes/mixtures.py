@@ -1,4 +1,4 @@
-"""Objects of no kind, from which a model can learn to refuse unknown objects.
+"""Random objects of no kind, from which a model can learn to refuse unknown objects.
 
 Each builder draws one object from `rng`, upright, in a unit of its own.
 """
@@ -22,7 +22,7 @@ Builder = Callable[[Generator], list[Trimesh]]
 
 
 def assembly(rng: Generator) -> list[Trimesh]:
-    """Build two to seven solids of any form, each grown into an earlier one."""
+    """Build two to seven random solids, each overlapping an earlier one."""
     pieces = [_draw_solid(rng)]
     for _ in range(int(rng.integers(1, 7))):
         other = _draw_solid(rng)
@@ -38,7 +38,7 @@ def assembly(rng: Generator) -> list[Trimesh]:
 
 
 def medley(rng: Generator, builders: Sequence[Builder]) -> list[Trimesh]:
-    """Build the lower part of one kind, a board on it, and another's upper part.
+    """Build one kind's lower half, a board on it, and another kind's upper half.
 
     Pieces that the board does not reach hang in the air.
     """
@@ -56,7 +56,7 @@ def medley(rng: Generator, builders: Sequence[Builder]) -> list[Trimesh]:
 
 
 def _draw_solid(rng: Generator) -> Trimesh:
-    """Draw a box, prism, cone or ball, stretched, half of them turned; about 1 large."""
+    """Draw a stretched, perhaps rotated box, prism, cone or ball, about 1 large."""
     form = rng.integers(4)
     if form == 0:
         points = np.vstack([slab(1, 1, -0.5), slab(1, 1, 0.5)])
@@ -77,7 +77,7 @@ def _draw_solid(rng: Generator) -> Trimesh:
 
 
 def _take_half(pieces: Sequence[Trimesh], below: bool) -> list[Trimesh]:
-    """Return the pieces centred below or above the middle of the whole; all if none."""
+    """Return the pieces centred below or above the middle of an object; all if none."""
     whole = fit_unit_box(pieces)
     mine = [piece for piece in whole if (float(piece.centroid[2]) < 0) == below]
     return mine or list(whole)

@@ -89,7 +89,7 @@ def castle(rng: Generator) -> list[Trimesh]:
 
 
 def grapes(rng: Generator) -> list[Trimesh]:
-    """Build a bunch on a stalk: rounds of berries, fewer in each lower round.
+    """Build a bunch on a stalk: layers of berries, fewer in each lower layer.
 
     By touch: small round bumps on all sides, above and beside one another, no flat between.
     """

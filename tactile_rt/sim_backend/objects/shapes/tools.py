@@ -31,7 +31,7 @@ def birdcage(rng: Generator) -> list[Trimesh]:
 
 
 def dumbbell(rng: Generator) -> list[Trimesh]:
-    """Build a lying bar with a weight at either end: prism, plates or ball."""
+    """Build a horizontal bar with a weight at either end: prism, plates or ball."""
     u = rng.uniform
     r, grip = u(0.19, 0.26), u(0.03, 0.045)
     kind, sides, inner = rng.integers(3), int(rng.choice([6, 8])), u(0.14, 0.22)

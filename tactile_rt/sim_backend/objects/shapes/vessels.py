@@ -1,4 +1,4 @@
-"""Vessels turned on a wheel, with or without a spout or a handle."""
+"""Vessels of revolution, with or without a spout or a handle."""
 
 import numpy as np
 from numpy.random import Generator

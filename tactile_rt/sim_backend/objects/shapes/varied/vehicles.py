@@ -8,7 +8,7 @@ from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, rod, s
 
 
 def car(rng: Generator) -> list[Trimesh]:
-    """Build any car, its wheels hidden or not: racer, saloon, van, bus, rover, open."""
+    """Build any car, with hidden or visible wheels: racer, saloon, van, bus, rover, open."""
     u = rng.uniform
     wide, wheel = u(0.3, 0.65), u(0.06, 0.17)
     low, belt = u(0.3, 1.1) * wheel, wheel + u(0.06, 0.24)
