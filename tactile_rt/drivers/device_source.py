@@ -31,7 +31,7 @@ DESCRIBED_S = 0.5  # longest wait for a description after a reconnection
 
 
 class ArrayChanged(SourceError):
-    """The array at the port is no longer the one that the stream began with."""
+    """Error: another array is at the port than at the start of the stream."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class DeviceOptions:
 
 
 class DeviceSource(Source):
-    """Samples from a device on a serial line or a CAN bus.
+    """Source of samples from a device on a serial line or a CAN bus.
 
     Args:
         connect: Opens the line; called again after the line was lost.
@@ -149,7 +149,7 @@ class DeviceSource(Source):
         return -1 if link is None or self._early or self.codec.polls else link.fileno()
 
     def tap(self, on_packet: Tap | None) -> None:
-        """Pass every raw packet to this function before it is decoded; None: stop.
+        """Pass every raw packet to `on_packet` before it is decoded; stop if it is None.
 
         Packets received while the device was started are passed at once, if nothing has been
         read yet: without them, a replay could not decode a device that describes itself.
@@ -210,7 +210,7 @@ class DeviceSource(Source):
         """Command an active array's protraction: offset + amplitude sin(2 pi f t), rad.
 
         Raises:
-            SourceError: this device takes no such command, or is away.
+            SourceError: the device has no such command, or is not connected.
         """
         whisk = getattr(self.codec, "whisk", None)
         if whisk is None:
@@ -220,7 +220,7 @@ class DeviceSource(Source):
         self._link.send(whisk(frequency_hz, amplitude_rad, offset_rad).send)
 
     def _receive(self, end: float | None) -> Chunk | None:
-        """Wait for one packet, a slice of time at most."""
+        """Receive one packet within `SLICE_S`, and return its chunk, or None."""
         now = time.monotonic()
         left = SLICE_S if end is None else min(SLICE_S, max(0.0, end - now))
         if self._link is None:
@@ -438,12 +438,12 @@ class DeviceSource(Source):
 
 
 def device_of(source: Source) -> DeviceSource | None:
-    """Return the device that a source reads, through any calibration; None if none."""
+    """Return the `DeviceSource` under a source's calibrations; None if it reads no device."""
     while isinstance(source, CalibratedSource):
         source = source.source
     return source if isinstance(source, DeviceSource) else None
 
 
 def share_of_changes(source: Source) -> float:
-    """Return the share of readings that changed during the source's tare; 0: unknown."""
+    """Return the share of readings that changed during the source's tare; 0 if unknown."""
     return source.calibration.changes if isinstance(source, CalibratedSource) else 0.0
