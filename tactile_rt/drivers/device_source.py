@@ -26,7 +26,7 @@ Tap = Callable[[Any, int], None]
 SLICE_S = 0.1  # longest time until a waiting read notices that the source was closed
 FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # short, since checking for a path is cheap
 ATTEMPTS = 3  # at a step of the start that gets no answer
-ASK_NS = NS_PER_S  # without a sample, after which a device that describes itself is asked again
+ASK_NS = NS_PER_S  # time without a sample, after which a description is requested again
 DESCRIBED_S = 0.5  # longest wait for a description after a reconnection
 
 
@@ -99,7 +99,7 @@ class DeviceSource(Source):
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
         self._found_empty_ns = 0  # time of the last read that found nothing
-        self._noise_ns = 0  # since when no input was a sample; 0: the last one was
+        self._noise_ns = 0  # time since which no input was a sample; 0 if the last input was
         self._asked_ns, self._resets = 0, 0  # last request for a description; counter resets then
         self.describes = codec.describes and codec.spec is None
         self._early: list[Samples] = []  # received while the device was being started
@@ -199,7 +199,7 @@ class DeviceSource(Source):
     def measured(self) -> tuple[int, int]:
         """Number of samples that the device has measured, and the time of the newest, ns.
 
-        Both are by its own counter and clock if it has them, so independent of losses and the host.
+        Both are by the device's counter and clock, if it has them, so independent of losses.
         """
         stamper = self._stamper
         assert stamper is not None
@@ -220,7 +220,7 @@ class DeviceSource(Source):
         self._link.send(whisk(frequency_hz, amplitude_rad, offset_rad).send)
 
     def _receive(self, end: float | None) -> Chunk | None:
-        """Receive one packet within `SLICE_S`, and return its chunk, or None."""
+        """Receive one packet within `SLICE_S`; return the chunk that it completes, or None."""
         now = time.monotonic()
         left = SLICE_S if end is None else min(SLICE_S, max(0.0, end - now))
         if self._link is None:

@@ -25,7 +25,7 @@ class Link(abc.ABC, Generic[Packet]):
 
     name: str
     can_errors = 0
-    usb_number = ""  # serial number of the USB device of the line; empty: unknown
+    usb_number = ""  # serial number of the line's USB device; empty if unknown
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> tuple[Packet, int] | None:
@@ -45,10 +45,10 @@ class Link(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Release the line; it may be called twice."""
+        """Close the line; safe to call twice."""
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable when input has arrived; -1 for none."""
+        """Return the descriptor that becomes readable when input arrives; -1 if none exists."""
         return -1
 
 

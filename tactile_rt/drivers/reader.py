@@ -53,7 +53,7 @@ class Reader:
         os.close(self._wake_writer)
 
     def add(self, source: Source) -> None:
-        """Start reading a source, too."""
+        """Add a source to the sources that are read."""
         self.sources.append(source)
         self._register(source)
 

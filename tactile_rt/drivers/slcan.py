@@ -37,7 +37,7 @@ _LONGEST: Final = 1 + 8 + 1 + 2 * 64 + 8
 
 
 class SlcanDecoder:
-    """Decoder of bytes from an adapter to CAN frames. It never raises, and buffers one line.
+    """Decoder of an adapter's bytes to CAN frames. It never raises, and buffers at most one line.
 
     Answers to commands and anything else that is no frame are skipped. Time stamps, 4 or 8
     hexadecimal digits after a frame's data, are allowed but not used: they are the adapter's, not

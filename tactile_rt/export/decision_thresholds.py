@@ -248,7 +248,7 @@ def _fit_usual(scores: Doubles, weights: Doubles) -> Doubles:
 
 
 def _fit_envelope(scores: Doubles, weights: Doubles, usual: Doubles, coverage: float) -> Doubles:
-    """Return scores, (step,), that a share of the sweeps exceeds at no step.
+    """Return bounds of the scores, (step,), that a share of sweeps keeps at every step.
 
     Args:
         scores: (sweep, step), in [0, 1).

@@ -23,8 +23,8 @@ class Subject:
 
     Attributes:
         path: The model file, of kind "step".
-        step_ms: Limit of the median step's CPU time, ms; empty: the time is only reported.
-        load_ms: Limit of the CPU time of loading, ms; empty: the time is only reported.
+        step_ms: Limit of the median step's CPU time, ms; empty to only report the time.
+        load_ms: Limit of the CPU time of loading, ms; empty to only report the time.
     """
 
     name: str

@@ -50,8 +50,8 @@ def write_dataset(
 
     Args:
         folder: The dataset to write; an existing one is replaced.
-        task: Description of the task of all episodes; empty: the note ``task`` of each recording,
-            or its array's name.
+        task: Description of the task of all episodes; if empty, the note ``task`` of each
+            recording, or its array's name.
 
     Raises:
         ConfigError: An extra is missing, or a film cannot be used.

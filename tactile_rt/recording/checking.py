@@ -38,7 +38,7 @@ class RecordedModel:
 
     name: str  # name of the model in the configuration, and in its decisions
     file: Path  # path of the model's file at the time of recording
-    sha256: str  # SHA-256 of the file, in hexadecimal; empty: not recorded
+    sha256: str  # SHA-256 of the file, in hexadecimal; empty if not recorded
     table: Fields = field(default_factory=dict)  # model's table ``[[model]]`` in the configuration
 
 
@@ -68,7 +68,7 @@ def live_model(
     """Return the model that decided live; None if no model did.
 
     Args:
-        name: name of the model; empty: the only model, or the one whose file is `model`.
+        name: name of the model; if empty, the only model, or the one whose file is `model`.
 
     Raises:
         ConfigError: no model has that name, or several models match.
@@ -121,7 +121,7 @@ class Checked:
     late: int = 0
     # number of replayed decisions that were not recorded because they were late (``late = "skip"``)
     withheld: int = 0
-    difference: str = ""  # first difference, in words; empty: none
+    difference: str = ""  # first difference, in words; empty without any
 
 
 def check_decisions(
@@ -245,7 +245,7 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
     """Decode a recording's packets again, and compare the result with its samples.
 
     Args:
-        options: ``codec`` and the codec's own, as in a ``replay:`` URL; None: as recorded.
+        options: ``codec`` and the codec's own, as in a ``replay:`` URL; None for those recorded.
 
     Raises:
         ConfigError: the recording has no packets, or the codec is invalid.

@@ -53,7 +53,7 @@ class LabelledTouches:
 
     spec: ArraySpec
     period_ns: int  # sample period of the touches, ns
-    sensor: SensorSpec | None  # description of the array's sensor; None: not described
+    sensor: SensorSpec | None  # description of the array's sensor; None if unknown
     used: list[LabelledTouch] = field(default_factory=list)
     sums: dict[Path, str] = field(default_factory=dict)  # sha256 of each recording's file
     found: Counter[Path] = field(default_factory=Counter)

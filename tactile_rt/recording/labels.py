@@ -38,9 +38,9 @@ class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         start_s, end_s: Seconds since the recording's first sample; the end is not included.
-        object: The name of the individual object; empty: not labelled.
-        recording: The file name in the table of labels; empty: the only recording.
-        where: File and line, for messages; empty: not read from a file.
+        object: The name of the individual object; empty if not labelled.
+        recording: The file name in the table of labels; empty for the only recording.
+        where: File and line, for messages; empty if not read from a file.
     """
 
     label: str

@@ -16,7 +16,7 @@ from tactile_rt.drivers.codec import CanFrame
 SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
 DECISIONS, EVENTS = "decisions", "events"  # the daemon's messages
 
-Packet = bytes | Sequence[CanFrame] | None  # None: the line was opened here
+Packet = bytes | Sequence[CanFrame] | None  # None marks where the line was opened
 
 _CDR = b"\x00\x01\x00\x00"  # little-endian, no options
 _FRAME = struct.Struct("<I???xI")  # followed by its data, padded to 4 bytes

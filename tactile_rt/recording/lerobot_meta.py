@@ -36,7 +36,7 @@ class CameraFilm:
 
     @property
     def key(self) -> str:
-        """Name of the film's feature."""
+        """Name of the film's feature in the dataset."""
         return f"observation.images.{self.name}"
 
     def feature(self, fps: int) -> dict[str, Any]:
@@ -238,7 +238,7 @@ class Statistics:
         """Return the statistics by LeRobot's names; 0 where no value was valid.
 
         Args:
-            repeat: Number of copies along a new first axis; 0: no such axis.
+            repeat: Number of copies along a new first axis; 0 for no such axis.
         """
         n = np.maximum(self._n, 1)
         mean = self._sum / n

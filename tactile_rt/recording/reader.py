@@ -58,7 +58,7 @@ class Recording:
         return self._decode(layout.SAMPLES, lambda raw: layout.decode_samples(raw.data, shape))
 
     def packets(self) -> Iterator[tuple[layout.Packet, int]]:
-        """Yield (packet, host time of arrival in ns); packet None: the line was opened."""
+        """Yield (packet, host time of arrival in ns); a packet of None marks an opened line."""
         wire = self.description.wire
         decode = layout.decode_packet
         return self._decode(layout.WIRE, lambda raw: (decode(raw.data, wire), raw.t_ns))
@@ -167,7 +167,7 @@ def _open_finished(path: Path) -> Iterator[BinaryIO]:
 
 
 def is_finished(path: Path) -> bool:
-    """Return whether a file ends as a finished recording; nothing else is checked."""
+    """Return whether a file has the end of a finished recording; check nothing else."""
     try:
         with open_regular(path) as file:
             return _has_end(file)

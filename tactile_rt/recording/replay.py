@@ -151,7 +151,7 @@ class ReplaySource(Source):
 
     Args:
         timed: yields (due time in ns, chunk); it counts lost samples in its argument.
-        speed: multiple of the recorded pace; 0: each chunk at once.
+        speed: multiple of the recorded pace; 0 to deliver each chunk at once.
         loop: whether to begin again at the end, with numbers and times that continue.
     """
 
@@ -293,10 +293,10 @@ class _Decoder:
 class SweepOptions:
     """Options of ``replay:`` of a sweep set's object."""
 
-    speed: float = 1.0  # pace as a multiple of real time; 0: as fast as it is read
+    speed: float = 1.0  # pace as a multiple of real time; 0 for as fast as it is read
     # whether the sweeps begin again at their end; sample numbers and times continue
     loop: bool = False
-    # number of the only sweep to stream, from 0; None: all, one after another
+    # number of the only sweep to stream, from 0; None to stream all, one after another
     sweep: int | None = None
     # rest before each sweep, s, in addition to the stored lead, so that the contact ends and a new
     # baseline is taken before the next sweep

@@ -28,8 +28,8 @@ class Rotation:
 
     folder: Path
     stem: str
-    mb: float = 0.0  # size beyond which the next file begins, MB; 0: no limit
-    seconds: float = 0.0  # time after which the next file begins, s; 0: never
+    mb: float = 0.0  # size beyond which the next file begins, MB; 0 for no limit
+    seconds: float = 0.0  # time after which the next file begins, s; 0 for no limit
 
     def begin(self, source: Source, about: Description, **further: Any) -> RecordingWriter:
         """Begin the next file; never overwrite an existing one.

@@ -47,11 +47,11 @@ class StreamWriter:
         session: further notes: who, where, why.
         force: whether to replace an existing file.
         flush_s: time between two writes to the file, s.
-        sync_s: time between two syncs to the medium, s; 0: only at the end.
+        sync_s: time between two syncs to the medium, s; 0 to sync only at the end.
         queue_bytes: largest size of the data that wait for the disk, bytes.
-        rotate_mb: size after which a new file begins, MB; 0: never. The names of rotated files have
-            the time of their beginning: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
-        rotate_s: time after which a new file begins, s; 0: never.
+        rotate_mb: size after which a new file begins, MB; 0 for no limit. Rotated files have
+            the time of their beginning in their names: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
+        rotate_s: time after which a new file begins, s; 0 for no limit.
 
     Attributes:
         path: The path of the file that is being written, or was written last.

@@ -41,7 +41,7 @@ class RecordedTouch:
     # (sample, element, channel) float32: `REST` samples of rest, then the window, SI; an element
     # that a classifier treats as untouched has its baseline throughout
     values: NDArray[np.float32]
-    flaw: str = ""  # reason why nothing can be learnt from the touch; empty: it is usable
+    flaw: str = ""  # reason why nothing can be learnt from the touch; empty if usable
 
 
 def find_touches(

@@ -135,7 +135,7 @@ class RecordingWriter:
         prelude: packets in which a device described itself, and their arrivals, ns, so that every
             file can be decoded by itself.
         dropped: numbers of samples and packets that were dropped before this file.
-        syncer: syncs the file in its thread; None: the calling thread syncs.
+        syncer: syncs the file in its thread; if None, the calling thread syncs.
 
     Raises:
         FileExistsError: the file exists already.
@@ -160,7 +160,7 @@ class RecordingWriter:
         self._written_state: tuple[Any, ...] = ()  # health and losses that were last written
         self.flushed = Extent()  # held by the operating system, so it survives a kill
         self._synced, self._newest_ns = Extent(), 0
-        self.unsynced_ns = 0  # host time since which data wait for a sync; 0: none wait
+        self.unsynced_ns = 0  # host time since which data wait for a sync; 0 if none wait
         self.failed: OSError | None = None  # error of a sync
         self.done = False  # whether the file is closed, and its last sync has ended
         self._syncer, self._waiting, self._name_synced = syncer, False, False
@@ -272,7 +272,7 @@ class RecordingWriter:
         return "there" if os.path.samestat(mine, named) else "moved"
 
     def close(self, finish: bool = True) -> None:
-        """Write the index and close the file, also if that fails: it can be recovered.
+        """Write the index and close the file, even if writing fails: it can be recovered.
 
         Args:
             finish: whether to write the index; False if writing has failed before.
@@ -346,7 +346,7 @@ def _select_state(health: Health | None) -> tuple[Any, ...]:
 
 
 def check_not_recorded(path: Path) -> None:
-    """Refuse to replace a file that a `RecordingWriter` of any process has open.
+    """Raise a ConfigError if a `RecordingWriter` of any process has a file open.
 
     The writer holds a lock on the file itself, which ends with the writer in any case, and follows
     the file when it is moved.
@@ -403,7 +403,7 @@ def _reveal(hidden: Path, path: Path, force: bool) -> None:
         hidden.replace(path)
         return
     try:
-        path.hardlink_to(hidden)  # unlike renaming, fails if such a file exists by now
+        path.hardlink_to(hidden)  # unlike renaming, fails if such a file exists by then
     except FileExistsError:
         raise
     except OSError:  # a file system without links, as on a memory card

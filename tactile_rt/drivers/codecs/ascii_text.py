@@ -166,7 +166,7 @@ def in_seconds(line: str, order: str = "") -> str:
     """Replace dates by seconds since 1970 (UTC by default), times of day since midnight.
 
     Args:
-        order: order of 05/10/2024, ``mdy`` or ``dmy``; empty: inferred from a number over 12.
+        order: order of 05/10/2024, ``mdy`` or ``dmy``; empty to infer it from a number over 12.
     """
     if ":" not in line:
         return line

@@ -267,7 +267,7 @@ class SampleParts:
     def forget(self) -> None:
         """Discard all state, as after a reconnection."""
         self.fresh = True  # no sample yet
-        self._low = -1  # low byte of the newest sample's sequence; -1: none yet
+        self._low = -1  # low byte of the newest sample's sequence; -1 before the first
         self._head: bytes | None = None  # header of the incomplete sample
         self._parts: list[bytes | None] = []
         self._missing = 0  # parts
@@ -379,7 +379,7 @@ class DescriptionParts:
 
     def __init__(self) -> None:
         self._text = bytearray()
-        self._next = -1  # index; -1: none before the first
+        self._next = -1  # index of the next part; -1 before the first
 
     def add(self, data: bytes) -> DeviceDescription | bool | None:
         """Add a part; return the description that it completes.

@@ -111,7 +111,7 @@ class Tsf85(SerialCodec):
         self._buffer.data.clear()
         self._synchronised = False
         self._set: dict[tuple[int, int], bytes] = {}  # signals of the incomplete sample
-        self._order: list[tuple[int, int]] = []  # of the signals in a sample; empty: unknown
+        self._order: list[tuple[int, int]] = []  # order of a sample's signals; empty if unknown
 
     # the host's side
 

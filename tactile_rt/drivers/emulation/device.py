@@ -85,7 +85,7 @@ class EmulatedSerial(EmulatedDevice):
 
     Args:
         link: A symbolic link to the port, so that the port has the same name when it is plugged
-            in again; None: /dev/pts/N.
+            in again; None for only /dev/pts/N.
         pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read, over a line
             without a speed.
     """
@@ -118,8 +118,8 @@ class EmulatedCan(EmulatedDevice):
     host chose; with an option ``bitrate=0`` they take no time.
 
     Args:
-        bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None: slcan.
-        fd: Whether to open that bus for CAN FD; None: by the codec's own option.
+        bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None for an slcan adapter.
+        fd: Whether to open that bus for CAN FD; None to follow the codec's option.
 
     The other arguments are those of `EmulatedSerial`.
     """

@@ -43,8 +43,8 @@ class Emulator:
         pace: ``realtime`` sends samples when they are due (a live source has its own pace);
             ``fast`` as soon as the host takes them. In real time a device sends at its own rate or
             at the rate that a host has commanded, not the source's.
-        seconds: Time after which to stop, s of the source's time; None: at the stream's end. No
-            fault happens just before that end; for a live source, only if it is given here.
+        seconds: Time after which to stop, s of the source's time; None to stop at its end. No fault
+            happens just before the end, which for a live source must be given here.
         start_count: First value of the device's counter, e.g. just before it wraps.
         start_tick: First value of the device's clock, in ticks.
         drift_ppm: Excess speed of the device's clock, parts per million.
@@ -139,7 +139,7 @@ class Emulator:
         return True
 
     def close(self) -> None:
-        """Stop the threads and remove the device; it may be called twice."""
+        """Stop the threads and remove the device; safe to call twice."""
         with self._state:
             self._stopping = True
             self._state.notify_all()

@@ -68,7 +68,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Send this many CAN error frames."""
 
     def gather(self, seconds: float) -> None:
-        """Set the interval at which the adapter passes on data, s; 0: at once."""
+        """Set the interval at which the adapter passes on data, s; 0 to do so at once."""
 
     @property
     def backlog(self) -> int:
@@ -79,7 +79,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Make a `receive` that waits in another thread return."""
 
     def close(self) -> None:
-        """Disconnect the device for good; it may be called twice."""
+        """Disconnect the device for good; safe to call twice."""
         self.pull()
 
 

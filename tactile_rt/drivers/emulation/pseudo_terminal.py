@@ -117,9 +117,9 @@ class Pty:
         link: A symbolic link, created and removed with the terminal; None for none.
         fifo_bytes: Capacity of the queue for a host that does not read, in addition to the kernel's
             18 kB; with a wire, for data that it has not yet carried.
-        wire: Timing of the line; None: written data arrives at once.
-        baud: Speed at which bytes are sent, bit/s: a host with another speed receives nonsense; 0:
-            any host receives it.
+        wire: Timing of the line; None delivers written data at once.
+        baud: Speed at which bytes are sent, bit/s: a host with another speed receives nonsense; 0
+            for a line without a speed.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class Pty:
             self.wake()
 
     def close(self) -> None:
-        """Remove the terminal for good; it may be called twice."""
+        """Remove the terminal for good; safe to call twice."""
         with self.lock:
             self.pull()
             for end in self._waking:

@@ -201,7 +201,7 @@ class EmulatedClock:
             self._ppm, self._drift_ends = self._base_ppm, np.inf
 
     def drift(self, t_ns: int, ppm: float, duration_s: float) -> None:
-        """Set the drift, ppm, from `t_ns` on for a duration, s; 0: until the end."""
+        """Set the drift, ppm, from `t_ns` on for a duration, s; 0 for no end."""
         self._anchor(t_ns)
         self._ppm = ppm
         self._drift_ends = t_ns + duration_s * NS_PER_S if duration_s else np.inf
@@ -214,7 +214,7 @@ class EmulatedClock:
             self._device_ns += self._wrap_ns  # which is the same on the wire
 
     def restart(self, t_ns: int | None) -> None:
-        """Reset the clock to zero at this source time; None: at the last known time."""
+        """Reset the clock to zero at this source time, or, if None, at the last known."""
         if t_ns is not None:
             self._source_ns = t_ns
         self._device_ns = 0

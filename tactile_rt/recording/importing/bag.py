@@ -96,10 +96,10 @@ def import_bag(
 
     Args:
         output: the recording to write, whole or not at all.
-        topic: name of the topic; empty: the only one that can become a recording.
-        columns: the meaning of a message's fields, in words or as a TOML file; empty: the built-in
-            columns of the type.
-        rate_hz: rate of the samples, Hz; 0: by their times.
+        topic: name of the topic; if empty, the only topic that can become a recording.
+        columns: the meaning of a message's fields, in words or as a TOML file; if empty, the
+            built-in columns of the type.
+        rate_hz: rate of the samples, Hz; 0 to estimate it from their times.
 
     Raises:
         ConfigError: no such topic, invalid columns, or the extra is not installed.
@@ -246,7 +246,7 @@ def _read_row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[A
     """Return (numbers of a message, NaN if missing; count of missing numbers).
 
     Args:
-        steps: path of each number; None: the number is left out, as NaN.
+        steps: path of each number; None leaves the number out, as NaN.
     """
     row, missing = [], 0
     for path in steps:

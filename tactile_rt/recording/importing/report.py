@@ -39,11 +39,11 @@ class Import:
     total: int = 0
     read: int = 0
     passed_over: int = 0
-    out_of_order: int | None = None  # number of times that go back; None: not counted
+    out_of_order: int | None = None  # number of times that go back; None if not counted
     first: str = ""
     last: str = ""
-    found_hz: float | None = None  # rate by the times of the file; None: it has no times
-    # rate by the codec or the user; None: only the times give a rate
+    found_hz: float | None = None  # rate by the times in the file; None if it has no times
+    # rate by the codec or the user; None if only the times give a rate
     said_hz: float | None = None
     first_missing: int | None = None  # number of the sample before the first missing one
     invalid: int = 0  # number of samples with an invalid element

@@ -63,14 +63,14 @@ class Table:
 
     path: Path
     names: tuple[str, ...]
-    # rows, each with as many cells as there are columns: texts or numbers
+    # rows, each with one cell per column: texts or numbers
     rows: Iterable[Sequence[Any]]
     # times of the rows read so far, ns, if the table has times beside its columns; else None
     times_ns: list[int] | None = None
     # sentences on what could not be read; complete once all rows were read
     notes: list[str] = field(default_factory=list)
     line: int = 0  # number of the text line that was read last
-    width: int = 0  # number of cells of every complete row; 0: any number
+    width: int = 0  # number of cells of every complete row; 0 for any number
 
 
 def shown_names(names: Sequence[str]) -> str:
@@ -119,7 +119,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     Args:
         output: the recording to write, whole or not at all.
         columns: the meaning of the columns: words, or the path of a TOML file.
-        rate_hz: rate of the samples, Hz; 0: by their times.
+        rate_hz: rate of the samples, Hz; 0 to estimate it from their times.
 
     Raises:
         ConfigError: the columns are invalid, or neither times nor a rate are given.

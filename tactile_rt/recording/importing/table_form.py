@@ -84,7 +84,7 @@ def csv_form(
 
     Args:
         path: the file; gzip is unpacked.
-        delimiter: separator of cells: a character, tab or space; empty: it is detected.
+        delimiter: separator of cells: a character, tab or space; empty to detect it.
 
     Raises:
         RecordingError: the lines are no table of numbers.

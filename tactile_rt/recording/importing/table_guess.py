@@ -38,7 +38,7 @@ class ProposedColumns:
     timed: bool
     said: str
     samples: int = 0
-    rate_hz: float = 0.0  # rate by the header, Hz; 0: the header contains none
+    rate_hz: float = 0.0  # rate in the header, Hz; 0 if it has none
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:

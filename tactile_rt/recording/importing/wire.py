@@ -40,7 +40,7 @@ def import_wire(
     Args:
         output: the recording to write, whole or not at all.
         fields: ``codec`` and its options, as in a URL, also ``array``.
-        rate_hz: rate of the samples, Hz; 0: the codec's rate.
+        rate_hz: rate of the samples, Hz; 0 for the codec's rate.
 
     Raises:
         ConfigError: no such codec or option, or the log lacks the device's description of itself.
