@@ -29,14 +29,14 @@ from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codec import Samples
 
 REMEMBERED = 1024  # last samples among which a duplicate is searched
-HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
+HARDLY = 0.25  # of a counter step's nominal time; a faster step ahead shows a restart
 RATE_TOLERANCE = 0.02  # of the nominal rate, where the clock shows how many samples passed
 STANDING = 5  # samples in a row with an unchanged count: the counter is useless
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
 class Sequencer:
-    """Numbers samples and counts losses, by the method described in this module's docstring.
+    """Counter of samples and losses, by the method in this module's docstring.
 
     Args:
         bits: Width of the device's counter, which wraps at 2^bits; None for a device without one.

@@ -213,7 +213,7 @@ class Codec(abc.ABC, Generic[Packet]):
 
 
 class SerialCodec(Codec[bytes]):
-    """A protocol over a serial line.
+    """Base of codecs for serial lines.
 
     Attributes:
         baud: Default speed of the device's line, bit/s.
@@ -228,7 +228,7 @@ class SerialCodec(Codec[bytes]):
 
 
 class CanCodec(Codec[Sequence[CanFrame]]):
-    """A protocol over a CAN bus.
+    """Base of codecs for CAN buses.
 
     Attributes:
         bitrate: Default speed of the device's bus, bit/s.

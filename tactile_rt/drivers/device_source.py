@@ -31,7 +31,7 @@ DESCRIBED_S = 0.5  # longest wait for a description after a reconnection
 
 
 class ArrayChanged(SourceError):
-    """Error: another array is at the port than at the start of the stream."""
+    """Raised when the array at the port is not that at the stream's start."""
 
 
 @dataclass(frozen=True)

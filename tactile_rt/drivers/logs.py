@@ -28,7 +28,7 @@ CAN_FORMS: Final = ("candump", "slcan", "gvret", "asc", "blf", "trc", "csv", "db
 BINARY: Final = ("blf", "db")
 FORMS: Final = ("raw", "hex", "terminal", *CAN_FORMS)
 HEAD: Final = 16_384  # bytes by which the form is recognised
-MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
+MOSTLY: Final = 0.8  # of the first lines must have the form
 BLF: Final = b"LOGG"
 SQLITE: Final = b"SQLite format 3\0"  # of python-can's logger, .db; bags of ROS 2 are .db3
 GZIP: Final = b"\x1f\x8b"
@@ -47,7 +47,7 @@ OTHERS: Final = {
 CSV_HEADER: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
 SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
 DAY_NS: Final = 86_400 * NS_PER_S
-FALLING: Final = 0.2  # of the times of candump -td are less than the previous one
+FALLING: Final = 0.2  # of the times in candump -td, at least, are less than the previous one
 
 LINES: Final[dict[str, Callable[[str], log_lines.Found]]] = {
     "candump": log_lines.parse_candump, "slcan": log_lines.parse_slcan,

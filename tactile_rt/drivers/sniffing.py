@@ -31,15 +31,15 @@ from tactile_rt.drivers.opening import make_codec, open_line
 LOOK_BYTES: Final = 65_536
 LOOK_FRAMES: Final = 20_000
 PIECE: Final = 512  # bytes fed at a time
-LEAST: Final = 3  # frames, and samples of a device that has described itself
+LEAST: Final = 3  # least number of frames, and of samples of a described device
 EXPLAINED: Final = 0.6  # least share of the bytes that a codec must explain
 EXPLAINED_UNPROVED: Final = 0.95  # the same, for a codec that notices no damage
 PROVED: Final = 0.1  # least share of damaged frames that the codec notices
-OF_THE_BUS: Final = 0.02  # least share of a bus's frames: it may have other devices
-COMPLETE: Final = 0.5  # least share of the samples
+OF_THE_BUS: Final = 0.02  # least share of a bus's frames, since it may have other devices
+COMPLETE: Final = 0.5  # least share of complete samples
 BORNE: Final = 0.9  # of the full scale: a load is less, except in an impact
 DAMAGE_EVERY: Final = 24  # bytes
-NEEDS_A_FILE: Final = ("mapping", "columns")  # options that such a codec requires
+NEEDS_A_FILE: Final = ("mapping", "columns")  # options of codecs that users must describe
 # Further usual speeds of boards that print text, bit/s.
 SPEEDS: Final = (9600, 57600, 230_400, 38_400, 250_000, 500_000)
 FIRST_S: Final = 2.5  # for a board that resets when its port is opened

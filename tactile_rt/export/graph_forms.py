@@ -176,7 +176,7 @@ def _quantise_taps(
             )
         for step in reversed(taps):
             inputs = [value, *step.input[1:]]
-            if step.op_type == "Pad":  # a silent site is the code of zero
+            if step.op_type == "Pad":  # a padded site has the code of zero
                 inputs = [value, step.input[1], zero]
             output = f"{step.output[0]}_int8"
             copy = helper.make_node(step.op_type, inputs, [output], f"{step.name}_int8")

@@ -274,7 +274,7 @@ class Pointwise(nn.Module):
         self.register_buffer("bias", None if bias is None else bias.detach().clone())
 
     def forward(self, x: Tensor) -> Tensor:
-        missing = 4 - x.dim()  # not lanes as the batch: each would read the weights anew
+        missing = 4 - x.dim()  # a batch of lanes would read the weights once per lane
         out = F.conv2d(x[(None,) * missing].permute(0, 3, 1, 2), self.weight, self.bias)
         return out.permute(0, 2, 3, 1).flatten(0, missing)
 

@@ -79,7 +79,7 @@ def convert(path: str | Path, output: str | Path) -> int:
 
 
 def about_text(about: Description) -> str:
-    """Return a description as one line of JSON, without the wire of raw packets."""
+    """Return a description as one line of JSON, for a file without raw packets."""
     fields = {
         "tactile_rt": replace(about, wire="").to_metadata(),
         "session": seal(about.session) if about.session else {},

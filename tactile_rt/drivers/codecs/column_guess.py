@@ -24,7 +24,7 @@ MOSTLY: Final = 0.8  # least share of alike lines, and of cells with numbers
 PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
 FASTEST_HZ: Final = 50_000  # highest rate of tactile readings
 DAYS: Final = (25_569, 80_000)  # of a spreadsheet: 1970 to 2119
-SELDOM: Final = 50  # rows at least between wraps or resets of a counter
+SELDOM: Final = 50  # least number of rows between wraps or resets of a counter
 Rows = Sequence[Sequence[float | None]]
 
 _UNITS_OF_TIME: Final = {  # by their names, with the word for the column

@@ -48,7 +48,7 @@ class EndFinder:
         self._joined = False
 
     def find(self, packet: bytes, t_ns: int) -> Found:
-        """Return the frames that received bytes complete."""
+        """Return the frames that these bytes complete, their damage counts and arrivals."""
         self._data += packet
         frames: list[bytes] = []
         damaged: list[int] = []
@@ -124,7 +124,7 @@ class StrideFinder:
         return 1.0 / (1 + len(self._rivals)) if self._locked else 0.0
 
     def find(self, packet: bytes, t_ns: int) -> Found:
-        """Return the frames that received bytes complete."""
+        """Return the frames that these bytes complete, their damage counts and arrivals."""
         self._data += packet
         self._times.append((self._taken + len(self._data), t_ns))
         frames: list[bytes] = []

@@ -209,7 +209,7 @@ def _read_rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
 
 
 def _measure_end(cells: Sequence[str], width: int) -> tuple[int, int]:
-    """Count the last cell's digits: (after its point, all if it has no point)."""
+    """Return (digits after the last cell's decimal point, its digits if it has none)."""
     whole, point, rest = cells[-1].strip().partition(".") if len(cells) == width else ("", "", "")
     return len(rest), 0 if point else len(whole)
 

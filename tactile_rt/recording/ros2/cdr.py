@@ -57,7 +57,7 @@ def fields_of(message: str) -> tuple[Field, ...]:
 
 @cache
 def schema_text(message: str) -> str:
-    """Return a definition with all others that it uses, in MCAP's form ``ros2msg``."""
+    """Return a message's definition, with those that it uses, in MCAP's form ``ros2msg``."""
     needed: list[str] = []
 
     def collect(name: str) -> None:
