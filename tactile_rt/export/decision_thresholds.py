@@ -163,7 +163,7 @@ def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSE
     Args:
         groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
             objects (sweep,); `refused` holds in each group.
-        refused: largest share of sweeps of new objects that is refused.
+        refused: largest share of refused sweeps, of new objects of known kinds.
 
     Raises:
         RecordingError: no contact in any sweep.

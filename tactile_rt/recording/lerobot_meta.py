@@ -83,10 +83,10 @@ def film_of(text: str) -> CameraFilm:
 
 
 def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
-    """Write a video with a frame per row: the newest then, or the first.
+    """Write a video of the newest frame at each row's time, or else the first.
 
     Returns:
-        The statistics of colours, from 0 to 1, of regularly sampled frames, as LeRobot has them.
+        The statistics of colours, from 0 to 1, of regularly sampled frames, by LeRobot's names.
 
     Raises:
         ConfigError: The film cannot be decoded.

@@ -50,7 +50,7 @@ class StreamWriter:
         sync_s: time between two syncs to the medium, s; 0 to sync only at the end.
         queue_bytes: largest size of the data that wait for the disk, bytes.
         rotate_mb: size after which a new file begins, MB; 0 for no limit. Rotated files have
-            the time of their beginning in their names: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
+            the time of their beginning in the name: ``run-20261121T170512Z.mcap``.
         rotate_s: time after which a new file begins, s; 0 for no limit.
 
     Attributes:

@@ -346,7 +346,7 @@ def _select_state(health: Health | None) -> tuple[Any, ...]:
 
 
 def check_not_recorded(path: Path) -> None:
-    """Raise a ConfigError if a `RecordingWriter` of any process has a file open.
+    """Raise a ConfigError if a `RecordingWriter` of any process has the file open.
 
     The writer holds a lock on the file itself, which ends with the writer in any case, and follows
     the file when it is moved.

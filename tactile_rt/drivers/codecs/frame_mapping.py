@@ -51,7 +51,7 @@ class Values(_Table, frozen=True, kw_only=True):
         elements: Names of the elements; an integer n for ``T0`` to ``Tn-1``, two for the rows
             (``A``, ``B``, ...) and columns (``A0``, ``A1``, ...) of a matrix.
         unit: Unit of `scale`; empty for the SI unit of channels with usual names.
-        scale: Value of a one in `unit`, for all channels or for each in turn.
+        scale: Value of a raw 1 in `unit`, for all channels or for each in turn.
         stride: Bytes from one element to the next, if other numbers lie between; 0 for none. (By
             channel: from one channel to the next.)
         possible: Least and largest raw number that the device can send; any other number is no
