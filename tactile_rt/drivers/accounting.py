@@ -29,7 +29,7 @@ from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codec import Samples
 
 REMEMBERED = 1024  # last samples among which a duplicate is searched
-HARDLY = 0.25  # of a counter step's nominal time; a faster step ahead shows a restart
+HARDLY = 0.25  # of a step's nominal time: rates are off by less, so a faster step is a restart
 RATE_TOLERANCE = 0.02  # of the nominal rate, where the clock shows how many samples passed
 STANDING = 5  # samples in a row with an unchanged count: the counter is useless
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back

@@ -101,7 +101,7 @@ class Stamper:
             self.clock.resume()
 
     def chunk(self, samples: Samples) -> Chunk | None:
-        """Return new samples as a chunk with numbers and times; None if all are duplicates."""
+        """Return new samples as a chunk with numbers and times; None if none are new."""
         if samples.values.shape[1:] != self._shape:
             return None  # the codec has counted them
         seq, keep = self.sequencer.number(samples)

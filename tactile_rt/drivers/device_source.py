@@ -199,7 +199,7 @@ class DeviceSource(Source):
     def measured(self) -> tuple[int, int]:
         """Number of samples that the device has measured, and the time of the newest, ns.
 
-        Both are by the device's counter and clock, if it has them, so independent of losses.
+        Both are by the device's counter and clock if it has them, so independent of the host.
         """
         stamper = self._stamper
         assert stamper is not None

@@ -85,7 +85,7 @@ class LineLog:
         buses: Number of packets of each bus, by its name; complete once all packets are read.
         names: Identifier, and whether it has 29 bits, of each known message name.
         total: Number of bytes, lines or frames in the file; complete once all packets are read.
-        frames: Number of those that were read as frames, or as lines from a device.
+        frames: Number of entries that were read as frames, or as lines from a device.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:

@@ -58,7 +58,7 @@ class Recording:
         return self._decode(layout.SAMPLES, lambda raw: layout.decode_samples(raw.data, shape))
 
     def packets(self) -> Iterator[tuple[layout.Packet, int]]:
-        """Yield (packet, host time of arrival in ns); a packet of None marks an opened line."""
+        """Yield (packet, host time of arrival in ns); None marks an opened line."""
         wire = self.description.wire
         decode = layout.decode_packet
         return self._decode(layout.WIRE, lambda raw: (decode(raw.data, wire), raw.t_ns))

@@ -266,7 +266,7 @@ class _Reader:
 
 
 def _decompress(compression: str, packed: memoryview, size: int) -> Any:
-    """Decompress data to at most `size` + 1 bytes, regardless of the size that it declares."""
+    """Decompress data to at most `size` + 1 bytes, regardless of its declared size."""
     if not compression:
         return bytes(packed)
     if compression == "zstd":

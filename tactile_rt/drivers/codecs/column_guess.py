@@ -177,7 +177,7 @@ def _guess_named(each: list[dict[str, float]]) -> list[str] | None:
 
 
 def _guess_places(lines: list[str]) -> list[str] | None:
-    """Guess the columns of numbers between separators; return None if widths or cells vary."""
+    """Guess the columns of numbers between separators; return None for other lines."""
     cut = [fields(line) for line in lines]
     width, often = Counter(len(c) for c in cut).most_common(1)[0]
     if often < MOSTLY * len(lines):

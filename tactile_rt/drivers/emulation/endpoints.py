@@ -68,7 +68,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Send this many CAN error frames."""
 
     def gather(self, seconds: float) -> None:
-        """Set the interval at which the adapter passes on data, s; 0 to do so at once."""
+        """Set the interval at which the adapter passes on data, s; 0 for no delay."""
 
     @property
     def backlog(self) -> int:

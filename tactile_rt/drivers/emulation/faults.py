@@ -77,7 +77,7 @@ class Fault:
         rate: Mean number of faults per second, at random times; 0 if `at_s` is given.
         at_s: Time of the single fault, in seconds of the stream; None if `rate` is given.
         duration_s: Length of the fault, s, for ``stall``, ``unplug``, ``clock_drift`` and
-            ``gather``; 0 makes the last two last to the end.
+            ``gather``; with 0, the last two go on to the end.
         amount: Size of the fault, in the unit given in `KINDS`; None for the default of its kind.
     """
 

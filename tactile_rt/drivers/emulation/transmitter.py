@@ -214,7 +214,7 @@ class EmulatedClock:
             self._device_ns += self._wrap_ns  # which is the same on the wire
 
     def restart(self, t_ns: int | None) -> None:
-        """Reset the clock to zero at this source time, or, if None, at the last known."""
+        """Reset the clock to zero at this source time; if None, the last known."""
         if t_ns is not None:
             self._source_ns = t_ns
         self._device_ns = 0
