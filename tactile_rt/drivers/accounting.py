@@ -7,8 +7,8 @@ Requirement: this sum adds up, whatever happens on the wire:
 The left side is the device's, the right side `SourceStats`. A sample number counts from 0, goes on
 over restarts of the device, and has a gap exactly where the stream has one.
 
-Method. A device's counter is narrow, may begin anywhere and starts again with the device. So only
-its steps count, modulo its width:
+Method. A device's counter is narrow, starts at any value and restarts with the device. So only its
+steps between samples are used, modulo its width:
 - a sample with the counter and the exact content of a recent one is a copy of it;
 - a step of one is the next sample; a step of g + 1 is a gap of g. If d damaged frames came within
   the gap, min(d, g) of it count as corrupt and the rest as missing: noise looks like damage, too;
@@ -29,14 +29,14 @@ from tactile_rt.core.stream import SourceStats
 from tactile_rt.drivers.codec import Samples
 
 REMEMBERED = 1024  # last samples among which a duplicate is searched
-HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
+HARDLY = 0.25  # of a step's nominal time: rates are off by less, so a faster step is a restart
 RATE_TOLERANCE = 0.02  # of the nominal rate, where the clock shows how many samples passed
 STANDING = 5  # samples in a row with an unchanged count: the counter is useless
 LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
 class Sequencer:
-    """Numbers samples and counts losses, by the method described in this module's docstring.
+    """Counter of samples and losses, by the method in this module's docstring.
 
     Args:
         bits: Width of the device's counter, which wraps at 2^bits; None for a device without one.
@@ -65,17 +65,17 @@ class Sequencer:
         self._damaged = 0  # frames since the newest sample
         self.numbered = 0
         self._seen: dict[int, None] = {}  # hashes of the last samples, oldest first
-        # Without a clock, a sample of an earlier turn of the counter can look like this one.
+        # Without a clock, a sample before the counter's last wrap can look like this one.
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
 
     @property
     def useless(self) -> bool:
-        """Whether the counter stands still, so that it shows no loss."""
+        """Whether the device's counter stands still, so it cannot reveal losses."""
         return self._standing >= STANDING
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return (n,) sequence numbers, and (n,) whether to keep each sample (no duplicate).
+        """Return the sequence number of each sample, (n,), and False for duplicates, (n,).
 
         Sequence numbers count from 0 and go on over a reset; a gap in them is a gap in the stream.
         """
@@ -97,11 +97,11 @@ class Sequencer:
         return np.array([number or 0 for number in seq], np.int64), keep
 
     def _number_sample(self, count: int, tick: int, damaged: int, values: bytes) -> int | None:
-        """Return the number of one sample; None if it is a duplicate."""
+        """Return the sequence number of one sample; None if it is a duplicate."""
         content = hash((count, tick, values))
         self._damaged += damaged
         gap = self._find_gap(count, tick)
-        # While the clock stands still, the same content may be a sample of a later turn.
+        # While the clock stands still, the same content may come after a wrap of the counter.
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
@@ -126,7 +126,7 @@ class Sequencer:
         return number
 
     def _find_gap(self, count: int, tick: int) -> int:
-        """Return the number of samples missing before this one; negative if it is not newer."""
+        """Return the number of samples missing before this one; negative if it is not later."""
         assert self._wrap is not None
         if self._count is None:
             return 0

@@ -1,4 +1,4 @@
-"""Catalogue of the codecs by wire and name: the place of each, and its devices.
+"""Catalogue of the codecs by wire and name: the module of each, and its devices.
 
 No codec is imported here, so that `tactile-rt codecs` answers at once.
 """
@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 
 class Entry(NamedTuple):
-    """A codec of the catalogue.
+    """Entry of the catalogue: where a codec's class is, and which devices it is for.
 
     Attributes:
-        attribute: Name of its class in the module; for a described frame, its file in `FRAMES`.
+        attribute: Class in the module; for a frame described in TOML, its file in `FRAMES`.
     """
 
     module: str

@@ -43,7 +43,7 @@ COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the de
 FIRST_BUCKET_NS: Final = NS_PER_S // 4  # only the promptest arrival of a bucket is kept
 BUCKETS: Final = 240
 LONGEST_BUCKET_NS: Final = 5 * NS_PER_S // 2  # so that the fit spans ten minutes
-DRIFT_SEEN_AFTER: Final = 1e-3  # s of jitter; over the largest drift: s until a slope is fitted
+DRIFT_SEEN_AFTER: Final = 1e-3  # jitter, s; over the largest drift: time to the first slope, s
 EARLY_NS: Final = 20_000_000  # a sample this early shows that the device's clock stepped
 # ... and so does one that is only this early, if the promptest arrivals of the last buckets lie
 # within half of that.
@@ -51,7 +51,7 @@ PROMPT_EARLY_NS: Final = 4_000_000
 PROMPT_BUCKETS: Final = 8
 LATE_NS: Final = 30_000_000  # samples this late ...
 LATE_FOR_NS: Final = 2 * NS_PER_S  # ... for this long show that it stepped back
-LEAST_STEP: Final = 0.5  # of the device's, between two samples when the estimate moves back
+LEAST_STEP: Final = 0.5  # of the device's step, between two samples when the estimate moves back
 LONG_NS: Final = 60_000_000_000  # a clock that wraps sooner cannot show that it went back
 STEADY_TOLERANCE, STRAYED = 1.5, 0.5  # largest drift fitted; above the latter, use arrivals
 SETTLED_NS: Final = 2 * NS_PER_S  # after which the rate is known well enough
@@ -61,7 +61,7 @@ OFTEN, OFTEN_NS = 5, 10 * NS_PER_S  # losses within this time, beyond which arri
 
 
 class Stamper:
-    """Numbers and dates a device's samples.
+    """Converter of a codec's samples to chunks with sequence numbers and times.
 
     Args:
         codec: The codec of the device, which specifies its counter and clock.
@@ -101,7 +101,7 @@ class Stamper:
             self.clock.resume()
 
     def chunk(self, samples: Samples) -> Chunk | None:
-        """Return the samples that are no duplicates, numbered and dated; None if none."""
+        """Return new samples as a chunk with numbers and times; None if none are new."""
         if samples.values.shape[1:] != self._shape:
             return None  # the codec has counted them
         seq, keep = self.sequencer.number(samples)
@@ -135,7 +135,7 @@ class Stamper:
 
 
 class DeviceClock:
-    """Maps a device's ticks to the host's monotonic clock.
+    """Converter of a device's ticks to times of the host's monotonic clock.
 
     Args:
         tick_ns: Nominal length of a tick, ns.
@@ -163,7 +163,7 @@ class DeviceClock:
         return 1e6 * self.drift
 
     def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (n,) host times of samples, ns: increasing, not after arrival if possible.
+        """Convert ticks, (n,), to increasing host times, (n,) ns, not after arrival if possible.
 
         Args:
             arrived_ns: Host times of arrival, (n,), ns, never decreasing.
@@ -187,18 +187,18 @@ class DeviceClock:
         return np.array(stamps + [self._date_sample(*sample) for sample in waiting], np.int64)
 
     def resume(self) -> None:
-        """Accept any device time next: it may have restarted before a reconnection."""
+        """Accept any device time next, since the clock may have restarted while disconnected."""
         self._tick = None
 
     def _date_sample(self, x: float, step: float, arrived: int) -> int:
-        """Return the host time of a sample by the current fit of the clock."""
+        """Return a sample's host time, ns, by the current fit of offset and drift."""
         t = min(self._base + round(x + self._offset + self.drift * x), arrived)
         room = min(LEAST_STEP * step, arrived - self._stamp_ns)
         self._stamp_ns = max(t, self._stamp_ns + max(1, round(room)))
         return self._stamp_ns
 
     def _measure_step(self, tick: int, arrived: int) -> float:
-        """Return the device time since the last sample, ns."""
+        """Return the device time that passed since the last sample, ns."""
         if self._tick is None:
             return 0.0
         ticks = (tick - self._tick) % self._wrap
@@ -259,7 +259,7 @@ class DeviceClock:
     def _fit(self) -> None:
         points = [*self._points, self._bucket_best]
         if points[-1][0] - points[0][0] >= self._drift_after_ns:
-            slope = _slope_below(points)
+            slope = _fit_slope(points)
             self.drift = min(max(slope, -self._tolerance), self._tolerance)
         above = [d - self.drift * x for x, d in points]
         self._offset = min(above)
@@ -268,7 +268,7 @@ class DeviceClock:
         self._early_ns = PROMPT_EARLY_NS if prompt else EARLY_NS
 
 
-def _slope_below(points: Sequence[tuple[float, float]]) -> float:
+def _fit_slope(points: Sequence[tuple[float, float]]) -> float:
     """Return the slope of the line under all points and nearest to them on average."""
     hull: list[tuple[float, float]] = []
     for x, d in points:
@@ -286,11 +286,11 @@ def _slope_below(points: Sequence[tuple[float, float]]) -> float:
 
 
 class SteadyClock:
-    """Dates samples of a device without clock or counter by its steady rate.
+    """Clock for a device without clock or counter, by its steady rate.
 
-    A lost sample shows in all later ones, which come a period late. In the first two seconds, also
-    after a silence, and if the rate is far from nominal or losses are frequent, samples are dated
-    by their arrival.
+    A lost sample delays all later ones by a period, which reveals it. Samples are dated by their
+    arrival in the first two seconds, also after a silence, and if the rate is far from nominal or
+    losses are frequent.
 
     Args:
         period_ns: Nominal time between samples, ns.
@@ -313,7 +313,7 @@ class SteadyClock:
         self._losses: list[int] = []  # times of lost samples
 
     def to_host(self, arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (n,) host times of the samples of one packet, ns, strictly increasing."""
+        """Return strictly increasing host times, (n,) ns, for the samples of one packet."""
         n, last = len(arrived_ns), int(arrived_ns[-1])
         silent_ns = last - self._late[-1][0] if self._late else 0
         if silent_ns > max(SILENCE_NS, SILENT_PERIODS * self._period_ns, 4 * n * self._period_ns):
@@ -336,7 +336,7 @@ class SteadyClock:
         return t_ns
 
     def _count_lost(self, arrived: int, late_ns: int, settled: bool) -> None:
-        """Skip the numbers of samples that must have been lost."""
+        """Count samples as lost, and skip their numbers, if all recent packets are late."""
         self._late.append((arrived, late_ns))
         while len(self._late) > LOST_PACKETS and arrived - self._late[1][0] >= LOST_NS:
             del self._late[0]
@@ -351,11 +351,11 @@ class SteadyClock:
 
 
 class DeviceTime:
-    """Substitute for `DeviceClock` that gives the device's time instead of the host's.
+    """Substitute for `DeviceClock` that returns the device's own time, not the host's.
 
-    The first sample has the time of the device's clock. If the clock leaps forward, the stream has
-    a silence. If it goes back or restarts, time goes on from the last sample by the time that
-    passed on the host's clock.
+    The first sample has the time of the device's clock. A forward jump of the clock becomes a gap
+    in the stream. If the clock goes back or restarts, the next time is that of the last sample
+    plus the time that passed on the host's clock.
 
     Attributes:
         drift_ppm: Always 0, since no other clock is compared with this one.
@@ -373,7 +373,7 @@ class DeviceTime:
         self._ticks, self._origin = 0, 0  # ticks since the clock started, and its time then, ns
 
     def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (n,) device times of samples, ns, strictly increasing."""
+        """Convert ticks, (n,), to strictly increasing device times, (n,) ns."""
         stamps = np.empty(len(ticks), np.int64)
         for i, (tick, arrived) in enumerate(zip(ticks.tolist(), arrived_ns.tolist(), strict=True)):
             if self._tick is None:
@@ -397,15 +397,15 @@ class DeviceTime:
 
 
 def host_stamps(arrived_ns: NDArray[np.int64], before_ns: int, period_ns: int) -> NDArray[np.int64]:
-    """Return (n,) times for samples of a device that sends neither time nor count.
+    """Estimate the times of one packet's samples from its arrival, (n,) ns.
 
-    Samples that arrive together were not taken together: they are spread over the time before
+    For a device that sends neither time nor count. The samples are spread over the time before
     their arrival, a nominal period apart, or less if the previous sample leaves less room.
 
     Args:
         arrived_ns: Host times at which the samples of one packet arrived, (n,), ns, never
             decreasing.
-        before_ns: Time given to the previous sample, ns.
+        before_ns: Time assigned to the previous sample, ns.
         period_ns: Nominal time between samples, ns.
     """
     n = len(arrived_ns)

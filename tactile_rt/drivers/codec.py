@@ -76,7 +76,7 @@ class Step(Generic[Packet]):
 
 @dataclass(eq=False, slots=True)
 class Samples:
-    """n >= 1 samples with the device's own numbers and times.
+    """Decoded samples, n >= 1, with the device's own counter and clock.
 
     Attributes:
         values: Measured values, (n, element, channel) float32, SI units.
@@ -119,7 +119,7 @@ class WireStats:
 
 
 class Codec(abc.ABC, Generic[Packet]):
-    """One device's protocol; base class of `SerialCodec` and `CanCodec`.
+    """Encoder and decoder of one device's protocol; base of `SerialCodec` and `CanCodec`.
 
     Args (of every implementation):
         options: The codec's options, an instance of its class `Options`.
@@ -131,14 +131,14 @@ class Codec(abc.ABC, Generic[Packet]):
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
         status_bits: Meaning of each status bit when set, by the number of the bit.
         harmless_bits: Status bits that are no fault of the device: an overload, a state.
-        cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
+        cannot_detect: Losses and damage that this protocol cannot reveal, in a sentence.
         spec: The array that the samples are of; None until the device has described itself. If
             it is set beforehand, the device is not asked.
-        measures: Device's side: whether it measures although no host has asked for samples.
+        measures: Emulation: whether the device measures before any host requests samples.
         describes: Whether the device describes itself when started; `spec` is then a new object.
         serial_number: Serial number that the device has reported; empty for none.
-        newest: Device's side: newest sample of a device that measures and does not send, or None.
-        commanded_hz: Device's side: rate that hosts have commanded, Hz; None for none.
+        newest: Emulation: newest sample of a device that measures and does not send, or None.
+        commanded_hz: Emulation: sample rate that a host has commanded, Hz; None for none.
         complaint: Reason, for the user, why the last input is no sample; empty if unknown.
         full_scale: Largest load that a sample can hold, (channel,), SI; None if a frame itself
             proves which device it is from. `sniffing` attributes samples near it to another
@@ -170,13 +170,13 @@ class Codec(abc.ABC, Generic[Packet]):
     def feed(self, packet: Packet, t_ns: int) -> Samples | None:
         """Decode received data, cut anywhere; return the samples that it completes, or None.
 
-        Never raises, whatever comes. Except for arrival times, the result does not depend on how
-        the input was cut.
+        Never raises on bad input. Except for arrival times, the result does not depend on how the
+        input was cut.
         """
 
     @abc.abstractmethod
     def encode(self, chunk: Chunk) -> list[Packet]:
-        """Return the packets that the device sends, one for each sample.
+        """Encode samples as the device does; return one packet for each sample.
 
         Args:
             chunk: Samples of `spec`; `seq` is the device's counter and `t_ns` its clock, neither
@@ -192,7 +192,7 @@ class Codec(abc.ABC, Generic[Packet]):
         return []
 
     def commands(self, command: Command) -> tuple[Step[Packet], ...]:
-        """Return the steps by which a host gives the device this command."""
+        """Return the packets, and the answers to await, by which a host sends a command."""
         return ()
 
     def respond(self, packet: Packet) -> Packet:
@@ -202,10 +202,10 @@ class Codec(abc.ABC, Generic[Packet]):
         """
         return packet[:0]
 
-    streaming = True  # the device's side: whether it sends without being asked, now
-    status = 0  # the device's side: status bits to send, where the codec has them
-    polled = 0  # the device's side: samples asked for and not yet sent
-    polls = False  # the host's side: whether each sample must be asked for (`Command.POLL`)
+    streaming = True  # emulation: whether the device now sends without requests
+    status = 0  # emulation: status bits to send, where the codec has them
+    polled = 0  # emulation: number of samples requested and not yet sent
+    polls = False  # whether the host must request each sample (`Command.POLL`)
 
     @abc.abstractmethod
     def forget(self) -> None:
@@ -213,7 +213,7 @@ class Codec(abc.ABC, Generic[Packet]):
 
 
 class SerialCodec(Codec[bytes]):
-    """A protocol over a serial line.
+    """Base of codecs for serial lines.
 
     Attributes:
         baud: Default speed of the device's line, bit/s.
@@ -228,7 +228,7 @@ class SerialCodec(Codec[bytes]):
 
 
 class CanCodec(Codec[Sequence[CanFrame]]):
-    """A protocol over a CAN bus.
+    """Base of codecs for CAN buses.
 
     Attributes:
         bitrate: Default speed of the device's bus, bit/s.
@@ -242,7 +242,7 @@ class CanCodec(Codec[Sequence[CanFrame]]):
 
 @dataclass
 class SampleBatch:
-    """Samples collected while a packet is decoded; `take` returns them as one `Samples`."""
+    """Samples decoded from a packet; each list is empty or as long as `values`."""
 
     values: list[Any] = field(default_factory=list)  # each (element, channel), or flat
     valid: list[Any] = field(default_factory=list)
@@ -252,7 +252,7 @@ class SampleBatch:
     status: list[int] = field(default_factory=list)
 
     def take(self, shape: tuple[int, int], t_ns: int) -> Samples | None:
-        """Return the collected samples, or None. Each list is empty or has one entry per sample.
+        """Return the collected samples as one `Samples`; None if none were collected.
 
         Args:
             t_ns: Host time at which the samples arrived, ns.
@@ -272,7 +272,7 @@ class SampleBatch:
 
 
 def six_axis(name: str, rate_hz: float) -> ArraySpec:
-    """Return a spec of one element at the origin of the frame ``sensor``.
+    """Return the spec of a six-axis sensor: one element at the origin of ``sensor``.
 
     Its channels are fx, fy, fz in N and mx, my, mz in N m.
     """
@@ -283,11 +283,11 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
     """Return the class of the codec with this name for ``serial`` or ``can``."""
     if (wire, name) in CODECS:
         module, attribute, _ = CODECS[wire, name]
-        there = import_module(module)
+        imported = import_module(module)
         if attribute.endswith(".toml"):
-            described: type[Codec[Any]] = there.frame_codec(name)
+            described: type[Codec[Any]] = imported.frame_codec(name)
             return described
-        found: type[Codec[Any]] = getattr(there, attribute)
+        found: type[Codec[Any]] = getattr(imported, attribute)
         return found
     theirs: type[Codec[Any]] | None = packages.import_addition(packages.CODECS, f"{wire}.{name}")
     if theirs is not None:

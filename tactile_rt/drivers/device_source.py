@@ -26,12 +26,12 @@ Tap = Callable[[Any, int], None]
 SLICE_S = 0.1  # longest time until a waiting read notices that the source was closed
 FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # short, since checking for a path is cheap
 ATTEMPTS = 3  # at a step of the start that gets no answer
-ASK_NS = NS_PER_S  # without a sample, after which a device that describes itself is asked again
+ASK_NS = NS_PER_S  # time without a sample, after which a description is requested again
 DESCRIBED_S = 0.5  # longest wait for a description after a reconnection
 
 
 class ArrayChanged(SourceError):
-    """The array at the port is no longer the one that the stream began with."""
+    """Raised when the array at the port is not that at the stream's start."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class DeviceOptions:
 
 
 class DeviceSource(Source):
-    """Samples from a device on a serial line or a CAN bus.
+    """Source of samples from a device on a serial line or a CAN bus.
 
     Args:
         connect: Opens the line; called again after the line was lost.
@@ -99,7 +99,7 @@ class DeviceSource(Source):
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
         self._found_empty_ns = 0  # time of the last read that found nothing
-        self._noise_ns = 0  # since when no input was a sample; 0: the last one was
+        self._noise_ns = 0  # time since which no input was a sample; 0 if the last input was
         self._asked_ns, self._resets = 0, 0  # last request for a description; counter resets then
         self.describes = codec.describes and codec.spec is None
         self._early: list[Samples] = []  # received while the device was being started
@@ -149,7 +149,7 @@ class DeviceSource(Source):
         return -1 if link is None or self._early or self.codec.polls else link.fileno()
 
     def tap(self, on_packet: Tap | None) -> None:
-        """Pass every raw packet to this function before it is decoded; None: stop.
+        """Pass every raw packet to `on_packet` before it is decoded; stop if it is None.
 
         Packets received while the device was started are passed at once, if nothing has been
         read yet: without them, a replay could not decode a device that describes itself.
@@ -199,7 +199,7 @@ class DeviceSource(Source):
     def measured(self) -> tuple[int, int]:
         """Number of samples that the device has measured, and the time of the newest, ns.
 
-        Both are by its own counter and clock if it has them, so independent of losses and the host.
+        Both are by the device's counter and clock if it has them, so independent of the host.
         """
         stamper = self._stamper
         assert stamper is not None
@@ -210,7 +210,7 @@ class DeviceSource(Source):
         """Command an active array's protraction: offset + amplitude sin(2 pi f t), rad.
 
         Raises:
-            SourceError: this device takes no such command, or is away.
+            SourceError: the device has no such command, or is not connected.
         """
         whisk = getattr(self.codec, "whisk", None)
         if whisk is None:
@@ -220,7 +220,7 @@ class DeviceSource(Source):
         self._link.send(whisk(frequency_hz, amplitude_rad, offset_rad).send)
 
     def _receive(self, end: float | None) -> Chunk | None:
-        """Wait for one packet, a slice of time at most."""
+        """Receive one packet within `SLICE_S`; return the chunk that it completes, or None."""
         now = time.monotonic()
         left = SLICE_S if end is None else min(SLICE_S, max(0.0, end - now))
         if self._link is None:
@@ -438,12 +438,12 @@ class DeviceSource(Source):
 
 
 def device_of(source: Source) -> DeviceSource | None:
-    """Return the device that a source reads, through any calibration; None if none."""
+    """Return the `DeviceSource` under a source's calibrations; None if it reads no device."""
     while isinstance(source, CalibratedSource):
         source = source.source
     return source if isinstance(source, DeviceSource) else None
 
 
 def share_of_changes(source: Source) -> float:
-    """Return the share of readings that changed during the source's tare; 0: unknown."""
+    """Return the share of readings that changed during the source's tare; 0 if unknown."""
     return source.calibration.changes if isinstance(source, CalibratedSource) else 0.0

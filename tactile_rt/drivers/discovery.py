@@ -1,6 +1,6 @@
 """Discovery of serial ports and CAN buses, the devices likely on them, and their problems.
 
-`serial_ports` and `can_buses` list them, each with a URL to begin with; `diagnose` checks
+`serial_ports` and `can_buses` list them, each with a URL to start from; `diagnose` checks
 permissions, latency timers and the state of buses, and suggests remedies; `udev_rules` makes part
 of these permanent.
 """
@@ -47,7 +47,7 @@ class Port:
         stable: Path in /dev/serial/by-id, the same after every reboot; empty if it has none.
         usb: Vendor and product numbers on USB; None for a port that is not on USB.
         serial_number: Serial number that the USB device reports; empty if none.
-        url: The URL to begin with; the codec in it is a guess.
+        url: URL to start from; its codec is guessed, or left for the user to fill in.
     """
 
     path: str
@@ -64,7 +64,7 @@ class CanBus:
 
     Attributes:
         bitrate: Speed of the bus, bit/s; 0 if the kernel does not know it.
-        url: The URL to begin with; the user fills in the codec.
+        url: URL to start from; the user fills in the codec.
     """
 
     name: str
@@ -75,7 +75,7 @@ class CanBus:
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check."""
+    """Result of one check: its subject, whether it passed, a message, and a remedy."""
 
     what: str
     good: bool
@@ -128,7 +128,7 @@ def diagnose(
     sys: Path = Path("/sys"),
     run: Callable[[list[str]], str] | None = None,
 ) -> list[Finding]:
-    """Check permissions, latency timers, the states of CAN buses and ModemManager.
+    """Return findings on permissions, latency timers, CAN bus states and ModemManager.
 
     Args:
         sys: Where sysfs is mounted.

@@ -9,14 +9,14 @@ from tactile_rt.drivers.codec import WireStats
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity of an array, as far as its device and port reveal it; see `difference`."""
+    """Identity of an array: its spec, and serial numbers of its device and USB port."""
 
     spec: ArraySpec
     serial_number: str = ""
     usb_number: str = ""  # serial number of its USB port
 
     def difference(self, other: "Identity") -> str:
-        """Explain why this cannot be the same array as another; empty if it can be."""
+        """Return why this array cannot be `other`; empty if it can be the same."""
         if found := other.spec.differences(self.spec):
             return f"it describes itself otherwise: {found[0]}"
         for what in ("serial_number", "usb_number"):

@@ -25,7 +25,7 @@ class Link(abc.ABC, Generic[Packet]):
 
     name: str
     can_errors = 0
-    usb_number = ""  # serial number of the USB device of the line; empty: unknown
+    usb_number = ""  # serial number of the line's USB device; empty if unknown
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> tuple[Packet, int] | None:
@@ -45,15 +45,15 @@ class Link(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Release the line; it may be called twice."""
+        """Close the line; safe to call twice."""
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable when input has arrived; -1 for none."""
+        """Return the descriptor that becomes readable when input arrives; -1 if none exists."""
         return -1
 
 
 class SerialLink(Link[bytes]):
-    """Any port that pyserial opens: a device, a pty, ``socket://``, ``rfc2217://``.
+    """Link over any port that pyserial opens: a device, a pty, ``socket://``, ``rfc2217://``.
 
     Args:
         baud: Speed of the line, bit/s.
@@ -102,7 +102,7 @@ class SerialLink(Link[bytes]):
         except BlockingIOError:
             return None
         except (OSError, ValueError, TypeError) as error:  # closed by now, or unplugged
-            raise SourceError(f"{self.name}: the line is gone ({_reason(error)})") from None
+            raise SourceError(f"{self.name}: the line is gone ({_explain(error)})") from None
         finally:
             self._last_read_s = time.monotonic()
         if not data:
@@ -110,7 +110,7 @@ class SerialLink(Link[bytes]):
         return data, time.monotonic_ns()
 
     def _read(self, fd: int, whole: bool) -> bytes:
-        """Read the waiting bytes; all of them, however many, if `whole`.
+        """Read waiting bytes; if `whole`, read until none wait or `READ_BYTES` are read.
 
         A backlog that is read in parts would be dated as if its parts had arrived one by one.
         """
@@ -149,13 +149,13 @@ class SerialLink(Link[bytes]):
                 self._port.parity = parity
             self._port.reset_input_buffer()
         except (OSError, ValueError, TypeError, AttributeError) as error:
-            raise SourceError(f"{self.name}: not at {baud} bit/s ({_reason(error)})") from None
+            raise SourceError(f"{self.name}: not at {baud} bit/s ({_explain(error)})") from None
 
     def send(self, packet: bytes) -> None:
         try:
             self._port.write(packet)
         except (OSError, ValueError, TypeError) as error:
-            raise SourceError(f"{self.name}: cannot be written to ({_reason(error)})") from None
+            raise SourceError(f"{self.name}: cannot be written to ({_explain(error)})") from None
 
     def close(self) -> None:
         self._fd = None
@@ -169,7 +169,7 @@ class SerialLink(Link[bytes]):
 
 
 def convert_message(message: Any) -> CanFrame:
-    """Convert a message of python-can."""
+    """Convert a message of python-can to a `CanFrame`."""
     return CanFrame(
         message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_fd,
         message.is_remote_frame,
@@ -177,7 +177,7 @@ def convert_message(message: Any) -> CanFrame:
 
 
 class CanLink(Link[Sequence[CanFrame]]):
-    """Any interface of python-can: socketcan, pcan, kvaser, virtual, ...
+    """Link over any interface of python-can: socketcan, pcan, kvaser, virtual, ...
 
     Args:
         interface: Name of the interface in python-can, such as ``socketcan``.
@@ -202,7 +202,7 @@ class CanLink(Link[Sequence[CanFrame]]):
         except can.CanInterfaceNotImplementedError as error:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             raise ConfigError(
-                f"can:{self.name}: {_reason(error)}; python-can knows {known}"
+                f"can:{self.name}: {_explain(error)}; python-can knows {known}"
             ) from None
         except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
             raise SourceError(f"can:{self.name}: {_explain_bus_error(channel, error)}") from None
@@ -225,7 +225,7 @@ class CanLink(Link[Sequence[CanFrame]]):
                     f"can:{self.name}: the controller is bus-off after too many errors: check "
                     "bit rate, termination and wiring"
                 ) from None
-            raise SourceError(f"can:{self.name}: the bus is gone ({_reason(error)})") from None
+            raise SourceError(f"can:{self.name}: the bus is gone ({_explain(error)})") from None
         return (frames, time.monotonic_ns()) if frames else None
 
     def send(self, packet: Sequence[CanFrame]) -> None:
@@ -241,7 +241,7 @@ class CanLink(Link[Sequence[CanFrame]]):
                     timeout=self._patience_s,
                 )  # fmt: skip
         except (can.CanError, OSError, ValueError) as error:
-            raise SourceError(f"can:{self.name}: cannot send ({_reason(error)})") from None
+            raise SourceError(f"can:{self.name}: cannot send ({_explain(error)})") from None
 
     def close(self) -> None:
         import can
@@ -261,7 +261,7 @@ class CanLink(Link[Sequence[CanFrame]]):
 
 
 class SlcanLink(Link[Sequence[CanFrame]]):
-    """A CAN adapter that speaks slcan (LAWICEL) over a serial port.
+    """Link over a CAN adapter that speaks slcan (LAWICEL) on a serial port.
 
     python-can reads it, too, but byte by byte: 5,500 frames/s, while a full bus carries 9,000.
     """
@@ -305,7 +305,7 @@ def _find_usb_number(path: str) -> str:
     return next((p.serial_number or "" for p in list_ports.comports() if p.device == path), "")
 
 
-def _reason(error: BaseException) -> str:
+def _explain(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return describe_error(error)
@@ -314,7 +314,7 @@ def _reason(error: BaseException) -> str:
 def _explain_port_error(port: str, error: Exception) -> str:
     """Explain why a serial port cannot be opened, and what to do."""
     number = getattr(error, "errno", None)
-    text = _reason(error)
+    text = _explain(error)
     if number == errno.ENOENT or "No such file" in text:
         return "no such port: is it plugged in? `tactile-rt list` shows what there is"
     if number in (errno.EACCES, errno.EPERM):
@@ -327,7 +327,7 @@ def _explain_port_error(port: str, error: Exception) -> str:
 
 
 def _explain_bus_error(channel: str, error: Exception) -> str:
-    text = _reason(error)
+    text = _explain(error)
     if getattr(error, "errno", None) == errno.ENODEV or "No such device" in text:
         return (
             f"no such bus: `ip link show {channel}`; bring it up with "

@@ -1,7 +1,7 @@
 """Parsers of the lines of text logs.
 
-The logs are of candump, SavvyCAN, slcan adapters, tools of Vector and PEAK, python-can, terminals
-and hexadecimal dumps. A line of another form gives None, a damaged one a ValueError with the cause.
+Logs of candump, SavvyCAN, slcan adapters, Vector, PEAK, python-can, terminals, and hex dumps. Each
+parser returns None for a line of another form, and raises a ValueError for a damaged one.
 """
 
 import base64
@@ -56,7 +56,7 @@ BESIDE: Final = ("", None, None)
 
 
 def parse_candump(line: str) -> Found:
-    """Read a line that candump printed or logged."""
+    """Parse a line that candump printed or logged."""
     found = _CANDUMP.fullmatch(line)
     if found is None:
         return None
@@ -75,7 +75,7 @@ def parse_candump(line: str) -> Found:
 
 
 def parse_gvret(line: str) -> Found:
-    """Read a line of a GVRET file, as saved by SavvyCAN."""
+    """Parse a line of a GVRET file, as saved by SavvyCAN."""
     if line.lower().startswith("time stamp,"):
         return BESIDE
     found = _GVRET.fullmatch(line)
@@ -87,7 +87,7 @@ def parse_gvret(line: str) -> Found:
 
 
 def read_csv_line(line: str) -> Found:
-    """Read a line of a CSV table written by python-can."""
+    """Parse a line of a CSV table written by python-can."""
     if line.startswith("timestamp,"):
         return BESIDE
     t, number, extended, remote, error, n, text = line.split(",")
@@ -98,7 +98,7 @@ def read_csv_line(line: str) -> Found:
 
 
 class AscLines:
-    """Reader of the lines of an .asc log; its identifiers may be names.
+    """Parser of the lines of an .asc log, in which names may replace identifiers.
 
     Args:
         names: Identifier, and whether it has 29 bits, of each known message name.
@@ -116,7 +116,7 @@ class AscLines:
         self._began_ns = self._now_ns = 0
 
     def read(self, line: str) -> Found:
-        """Read a line."""
+        """Parse the next line of the log."""
         words = line.split()
         first = words[0].lower()
         if re.fullmatch(r"\d+[.,]\d+", first):
@@ -146,7 +146,7 @@ class AscLines:
             self.odd_date = self.odd_date or " ".join(words)
 
     def _read_event(self, words: list[str]) -> Found:
-        """Read the rest of a line after its time."""
+        """Parse the words of a line after its time."""
         fd = words[:1] == ["CANFD"]
         bus, text, way, *rest = [*words[fd:], "", "", ""]
         if fd:
@@ -189,7 +189,7 @@ class AscLines:
 
 
 class TrcLines:
-    """Reader of the lines of a .trc log, whose header names its version and columns.
+    """Parser of the lines of a .trc log, whose header defines its version and columns.
 
     Attributes:
         version: Version of the format.
@@ -200,7 +200,7 @@ class TrcLines:
         self._columns, self._began_ns = TRC_COLUMNS["1.0"], 0
 
     def read(self, line: str) -> Found:
-        """Read a line; in an unknown version, no line is taken for a frame."""
+        """Parse the next line; in an unknown version, no line counts as a frame."""
         if line.startswith(";"):
             key, _, value = line.strip().partition("=")
             if key == ";$FILEVERSION":
@@ -233,7 +233,7 @@ class TrcLines:
 
 
 def parse_slcan(line: str) -> Found:
-    """Read a line that an slcan adapter sent."""
+    """Parse a line that an slcan adapter sent."""
     if _SLCAN.fullmatch(line) is None:
         return None
     frames = SlcanDecoder().feed(line.encode("ascii") + b"\r")
@@ -241,7 +241,7 @@ def parse_slcan(line: str) -> Found:
 
 
 def parse_heard(line: str) -> Found:
-    """Read a line that a terminal received and logged with its time."""
+    """Parse a line that a terminal program logged with its time of arrival."""
     found = _TERMINAL.fullmatch(line)
     if found is None:
         return None
@@ -251,7 +251,7 @@ def parse_heard(line: str) -> Found:
 
 
 def parse_hex(line: str) -> Found:
-    """Read a line of hexadecimal bytes, such as of xxd or hexdump."""
+    """Parse a line of hexadecimal bytes, such as xxd or hexdump prints."""
     found = _HEX.fullmatch(line) or _XXD.fullmatch(line)
     if found is None:
         return None
@@ -260,7 +260,7 @@ def parse_hex(line: str) -> Found:
 
 
 def _read_hex_bytes(text: str) -> bytes:
-    """Read bytes of two hexadecimal digits each; raise a ValueError at anything else."""
+    """Convert pairs of hexadecimal digits to bytes; raise a ValueError at anything else."""
     if not re.fullmatch(r"(?:\s*[0-9A-Fa-f]{2})*\s*", text):
         raise ValueError("its bytes are damaged")
     return bytes.fromhex(text)
@@ -276,7 +276,7 @@ def _to_frame(
     fd: bool = False,
     remote: bool = False,
 ) -> Found:
-    """Make a frame; raise a ValueError unless it has n bytes and a valid identifier."""
+    """Return a frame; raise a ValueError unless it has n bytes and a valid identifier."""
     if number > (_EXTENDED if extended else _STANDARD):
         raise ValueError("no such identifier")
     if n > _FD_BYTES[-1] or (len(data) != n and not remote):

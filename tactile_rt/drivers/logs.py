@@ -3,8 +3,8 @@
     log = read_log(Path("can.log"))       # candump, asc, blf, ...; bytes, hex
     for packet, t_ns in log.packets(): ...  # t_ns is None where the log has no times
 
-The first bytes of a file determine its form, whatever its name; gzip is unpacked. Logs may be cut
-and hold foreign lines: whatever is readable is read, and `notes` list what is not.
+The first bytes of a file determine its form, not its name; gzip is unpacked. Logs may be cut short
+or contain foreign lines: all that is readable is read, and `notes` list the rest.
 """
 
 import gzip
@@ -28,7 +28,7 @@ CAN_FORMS: Final = ("candump", "slcan", "gvret", "asc", "blf", "trc", "csv", "db
 BINARY: Final = ("blf", "db")
 FORMS: Final = ("raw", "hex", "terminal", *CAN_FORMS)
 HEAD: Final = 16_384  # bytes by which the form is recognised
-MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
+MOSTLY: Final = 0.8  # of the first lines must have the form
 BLF: Final = b"LOGG"
 SQLITE: Final = b"SQLite format 3\0"  # of python-can's logger, .db; bags of ROS 2 are .db3
 GZIP: Final = b"\x1f\x8b"
@@ -47,7 +47,7 @@ OTHERS: Final = {
 CSV_HEADER: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
 SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
 DAY_NS: Final = 86_400 * NS_PER_S
-FALLING: Final = 0.2  # of the times of candump -td are less than the previous one
+FALLING: Final = 0.2  # of the times in candump -td, at least, are less than the previous one
 
 LINES: Final[dict[str, Callable[[str], log_lines.Found]]] = {
     "candump": log_lines.parse_candump, "slcan": log_lines.parse_slcan,
@@ -58,13 +58,13 @@ Read = tuple[str, Any, int | None]  # bus, packet (empty for an error frame), ti
 
 
 class Occurrences:
-    """Count of occurrences, with the number of the first one and its cause."""
+    """Counter of one kind of problem in a log, with the first place and cause."""
 
     def __init__(self, what: str) -> None:
         self.what, self.n, self.first, self.why = what, 0, 0, ""
 
     def add(self, number: int, why: str = "") -> None:
-        """Count an occurrence, at the line, frame or packet of this number."""
+        """Count one more problem, at the line, frame or packet of this number."""
         if not self.n:
             self.first, self.why = number, why
         self.n += 1
@@ -85,7 +85,7 @@ class LineLog:
         buses: Number of packets of each bus, by its name; complete once all packets are read.
         names: Identifier, and whether it has 29 bits, of each known message name.
         total: Number of bytes, lines or frames in the file; complete once all packets are read.
-        frames: Number of those that were read as frames, or as lines from a device.
+        frames: Number of entries that were read as frames, or as lines from a device.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:
@@ -99,7 +99,7 @@ class LineLog:
         self.back = Occurrences("packet")  # whose time is before the previous one
 
     def packets(self) -> Iterator[tuple[Any, int | None]]:
-        """Yield (packet, time in ns or None), in order of time. Packets are bytes or CAN frames."""
+        """Yield (bytes or list of CAN frames, time in ns or None); times never decrease."""
         self.notes.clear()
         self.buses.clear()
         self.total = self.frames = 0
@@ -139,7 +139,7 @@ class LineLog:
             )
 
     def _read_raw(self, file: BufferedReader) -> Iterator[Read]:
-        """Read bytes; convert UTF-16 text, if it is mostly ASCII, to UTF-8."""
+        """Yield the file's bytes; UTF-16 text that is mostly ASCII is converted to UTF-8."""
         head, decode = _read_head(self.path), getincrementaldecoder("utf-16")("replace").decode
         text = head.decode("utf-16", "replace") if _guess_encoding(head) == "utf-16" else ""
         plain = sum(c.isascii() and (c.isprintable() or c.isspace()) for c in text)
@@ -149,7 +149,7 @@ class LineLog:
                 yield "", data, None
 
     def _read_text(self, file: BufferedReader) -> Iterator[Read]:
-        """Read lines of text, and note those of another form."""
+        """Yield the packets in lines of text, and note lines of another form."""
         asc, trc = log_lines.AscLines(self.names), log_lines.TrcLines()
         parse = {"asc": asc.read, "trc": trc.read, **LINES}[self.form]
         odd, number, now = Occurrences("line"), 0, 0
@@ -192,7 +192,7 @@ class LineLog:
             self.notes.append(f"passed over, no {what} of {a} {self.form} log: {odd}")
 
     def _read_binary(self, file: BufferedReader) -> Iterator[Read]:
-        """Read messages by python-can, up to where the file is damaged."""
+        """Yield the messages that python-can reads, up to the first damage."""
         from can.io import BLFReader, SqliteReader
 
         warned = logging.getLogger("can.io.blf")
@@ -240,7 +240,7 @@ def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
 
 
 def open_log_file(path: Path) -> BufferedReader:
-    """Open a file for reading, unpacking gzip; a damaged one ends at the damage.
+    """Open a log file for reading; unpack gzip, up to the first damage.
 
     Raises:
         ConfigError: it is of a known type that is neither a log nor a table.
@@ -295,7 +295,7 @@ def _split_lines(head: bytes) -> list[str]:
 
 
 def _count_days(reads: Iterator[Read]) -> Iterator[Read]:
-    """Continue times of day past midnight. A single wrong time becomes 1 ns before the last."""
+    """Add days to times after midnight. A single wrong time becomes the last less 1 ns."""
     now, (reads, ahead) = 0, tee(reads)
     for read, after in zip_longest(reads, islice(ahead, 1, None)):
         t_ns, then = (  # add days to a time that is more than half a day earlier
@@ -324,7 +324,7 @@ def _has_time_differences(path: Path) -> bool:
     found = [
         _try_parse(log_lines.parse_candump, line)[0] for line in _split_lines(_read_head(path))
     ]
-    times = [one[2] for one in found if one is not None and one[2] is not None]
+    times = [line[2] for line in found if line is not None and line[2] is not None]
     if len(times) < 3 or times[0]:
         return False
     falling = sum(b < a for a, b in pairwise(times[1:]))

@@ -50,7 +50,7 @@ class Prepared:
         return Prepared(spec, opened, self.told)
 
     def with_array(self, array: ArraySpec) -> "Prepared":
-        """Return a copy that is a source of this array, see `calibration.declare`."""
+        """Return a copy whose samples are declared to be of this array; see `declare`."""
         if self.told:
             return self
         known = self.spec
@@ -124,7 +124,7 @@ def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None 
     """Prepare the device on a serial port for opening.
 
     Args:
-        array: The array, if a device that would describe itself is not to be asked.
+        array: Array to assume for a device that would otherwise describe itself; None asks it.
 
     Raises:
         ConfigError: wrong options. Opening the result raises `SourceError` if the port cannot be

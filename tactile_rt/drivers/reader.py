@@ -1,10 +1,10 @@
-"""Reader of many sources in one thread, each as soon as it has samples.
+"""Reader of many sources in one thread: each is read as soon as it has samples.
 
     reader = Reader([left, right])
     for source, chunk in reader:
         ...
 
-A thread for each device costs more: they contend for the interpreter's lock at every sample.
+A thread per device would cost more, since threads contend for Python's GIL at every sample.
 """
 
 import os
@@ -19,12 +19,12 @@ LOOK_S = 0.1  # interval at which every source is read: only a read shows that a
 
 
 class Reader:
-    """Reads sources as their samples come. Only `wake` may be called from another thread.
+    """Multiplexer of sources: reads each as its samples arrive, in one thread.
 
-    It waits for the descriptors of all sources at once (`Source.fileno`), and reads those without
-    a descriptor every 5 ms: simulations, polled devices and lost lines. While a lost line is
-    opened again, which takes until its device answers, the samples of the others wait in their
-    lines. Nothing is buffered here.
+    It polls the descriptors of all sources at once (`Source.fileno`), and reads sources without a
+    descriptor every 5 ms: simulations, polled devices and lost lines. While a lost line is being
+    reopened, until its device answers, the samples of the other sources wait in their lines.
+    Nothing is buffered here. Only `wake` may be called from another thread.
 
     Args:
         sources: Sources to read; the caller closes them.
@@ -53,7 +53,7 @@ class Reader:
         os.close(self._wake_writer)
 
     def add(self, source: Source) -> None:
-        """Add a source to those read."""
+        """Add a source to the sources that are read."""
         self.sources.append(source)
         self._register(source)
 
@@ -90,10 +90,10 @@ class Reader:
         return ready + self._blind if self._blind else ready
 
     def take(self, source: Source) -> Chunk | None:
-        """Read a source that is ready; return None if it has nothing or has ended.
+        """Read a source without waiting; return None if it has no samples or has ended.
 
         Raises:
-            SourceError: the device failed; it is read no longer.
+            SourceError: the device failed; it is removed from the sources.
         """
         try:
             chunk = source.read(0.0)

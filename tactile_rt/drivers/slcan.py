@@ -37,7 +37,7 @@ _LONGEST: Final = 1 + 8 + 1 + 2 * 64 + 8
 
 
 class SlcanDecoder:
-    """Decoder of the host's side: bytes to frames. It never raises and holds one line at most.
+    """Decoder of an adapter's bytes to CAN frames. It never raises, and buffers at most one line.
 
     Answers to commands and anything else that is no frame are skipped. Time stamps, 4 or 8
     hexadecimal digits after a frame's data, are allowed but not used: they are the adapter's, not
@@ -51,7 +51,7 @@ class SlcanDecoder:
         self._other: int | None = None  # those of the previous line, if they differed
 
     def feed(self, data: bytes) -> list[CanFrame]:
-        """Return the frames that these bytes complete, however the bytes are cut."""
+        """Return the CAN frames that these bytes complete; the bytes may be cut anywhere."""
         data = self._rest + data
         if BELL in data:
             data = data.replace(BELL, BELL + CR)
@@ -86,7 +86,7 @@ class SlcanDecoder:
         return frames
 
     def _accept_stamp(self, digits: int) -> bool:
-        """Return whether a line may have this many digits after its data."""
+        """Return whether a time stamp of this many digits may follow a line's data."""
         if digits not in (0, 4, 8):
             return False
         if self._stamp is not None and self._other != digits:
@@ -141,7 +141,7 @@ def closing() -> bytes:
 
 
 class SlcanAdapter:
-    """The device's side, for an emulator: an adapter that answers commands.
+    """Emulated slcan adapter, which answers a host's commands.
 
     Args:
         bitrate: Speed of the bus that the adapter is on, bit/s. If the host opens the channel at
@@ -149,7 +149,7 @@ class SlcanAdapter:
             speed that the host chooses.
 
     Attributes:
-        hears: Whether frames come through: the channel is open, and at the bus's bit rate.
+        hears: Whether frames pass: the channel is open, and at the bus's bit rate.
         flags: Status that F reports and clears: bit 3 is a data overrun, bit 7 a bus error.
         data_bitrate: Speed of CAN FD's data phase, bit/s, once the host has set it.
     """

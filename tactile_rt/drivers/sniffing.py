@@ -6,9 +6,9 @@ with and almost without checks; and no answer if nothing fits.
 Method. Each codec decodes all of the data, also with the options that change its device's frames
 (`Codec.variants`). A codec fits if it found frames, made samples of them, and skipped little. If
 several fit, the one whose frames prove more wins: the same bytes are decoded again with single bits
-flipped at intervals, and a codec that does not notice the damage had no proof before either. On a
-bus, two successive identifiers prove little; it counts there that a sensor hardly ever measures its
-full scale.
+flipped at intervals, and a codec that does not notice this damage proves nothing. On a bus, two
+successive identifiers prove little, so values near a sensor's full scale, which it hardly ever
+measures, speak against a codec.
 """
 
 import time
@@ -31,19 +31,19 @@ from tactile_rt.drivers.opening import make_codec, open_line
 LOOK_BYTES: Final = 65_536
 LOOK_FRAMES: Final = 20_000
 PIECE: Final = 512  # bytes fed at a time
-LEAST: Final = 3  # frames, and samples of a device that has described itself
-EXPLAINED: Final = 0.6  # least share of the bytes
-EXPLAINED_UNPROVED: Final = 0.95  # the same, if the codec notices no damage
+LEAST: Final = 3  # least number of frames, and of samples of a described device
+EXPLAINED: Final = 0.6  # least share of the bytes that a codec must explain
+EXPLAINED_UNPROVED: Final = 0.95  # the same, for a codec that notices no damage
 PROVED: Final = 0.1  # least share of damaged frames that the codec notices
-OF_THE_BUS: Final = 0.02  # least share of a bus's frames: it may have other devices
-COMPLETE: Final = 0.5  # least share of the samples
+OF_THE_BUS: Final = 0.02  # least share of a bus's frames, since it may have other devices
+COMPLETE: Final = 0.5  # least share of complete samples
 BORNE: Final = 0.9  # of the full scale: a load is less, except in an impact
 DAMAGE_EVERY: Final = 24  # bytes
-NEEDS_A_FILE: Final = ("mapping", "columns")  # options that such a codec requires
+NEEDS_A_FILE: Final = ("mapping", "columns")  # options of codecs that users must describe
 # Further usual speeds of boards that print text, bit/s.
 SPEEDS: Final = (9600, 57600, 230_400, 38_400, 250_000, 500_000)
 FIRST_S: Final = 2.5  # for a board that resets when its port is opened
-START_S: Final = 0.6  # for a device that was asked
+START_S: Final = 0.6  # for a device that was started or polled
 MOST_BYTES: Final = 262_144
 
 Heard = tuple[int, str, bytes]  # baud, parity, received bytes
@@ -52,10 +52,10 @@ Tried = tuple[str, Mapping[str, str]]  # codec, options
 
 @dataclass(frozen=True)
 class CodecFit:
-    """A codec that may fit, and how well.
+    """A candidate codec, with measures of how well it fits the data.
 
     Attributes:
-        samples: Number of samples; 0 for a device that has not described itself.
+        samples: Number of decoded samples; 0 for a device that has not described itself.
         explained: Share of the bytes, or of the bus's frames, that belong to this device.
         proof: Share of damaged frames that the codec notices, 0 to 1.
     """
@@ -138,7 +138,7 @@ def _list_candidates(
 
 
 def _list_codecs(wire: str) -> Iterator[tuple[str, type[Codec[Any]]]]:
-    """List the codecs of a wire, except those whose library is not installed."""
+    """Yield (name, class) of each codec of a wire whose library is installed."""
     for of, name in CODECS:
         if of == wire:
             with suppress(ConfigError):
@@ -174,7 +174,7 @@ def _try_codec(
 
 
 def _flip_bits(data: bytes) -> bytes:
-    """Flip one bit in every `DAMAGE_EVERY` bytes, reproducibly."""
+    """Return the data with a bit flipped every `DAMAGE_EVERY` bytes, reproducibly."""
     hurt = np.frombuffer(data, np.uint8).copy()
     draw = np.random.default_rng(0)
     at = np.arange(DAMAGE_EVERY // 2, len(hurt), DAMAGE_EVERY)
@@ -183,7 +183,7 @@ def _flip_bits(data: bytes) -> bytes:
 
 
 def _rank(fits: list[CodecFit]) -> list[CodecFit]:
-    """Sort by explained share weighted with proof, then share alone, fewest options, frames."""
+    """Sort, best first: by explained share times proof, share, fewest options, intact frames."""
     return sorted(fits, reverse=True, key=lambda fit: (
         round(min(1.0, fit.explained) * (0.5 + 0.5 * fit.proof), 1),
         round(fit.explained, 2), -len(fit.options), fit.intact,
@@ -194,7 +194,7 @@ def _rank(fits: list[CodecFit]) -> list[CodecFit]:
 
 
 def line_speeds() -> list[tuple[int, str]]:
-    """Return (baud, parity) of all serial codecs, the most usual first, then further speeds."""
+    """Return (baud, parity) of all serial codecs, most frequent first, then further speeds."""
     found: list[tuple[int, str]] = []
     for name, kind in _list_codecs("serial"):
         codec: Any = kind if _needs_file(kind) else make_codec("serial", name, {})
@@ -204,7 +204,7 @@ def line_speeds() -> list[tuple[int, str]]:
 
 
 def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Iterator[Heard]:
-    """Listen to a serial port at each of these speeds; the port is opened once.
+    """Yield (baud, parity, received bytes) of a serial port at each of these speeds.
 
     Args:
         seconds: time to listen at each speed, s.
@@ -226,7 +226,7 @@ def hear_port(port: str, seconds: float, speeds: list[tuple[int, str]]) -> Itera
 
 
 def hear_bus(url: str, seconds: float) -> list[CanFrame]:
-    """Return the frames received on a CAN bus during this time.
+    """Return the frames received on a CAN bus within this many seconds.
 
     Args:
         url: ``can:INTERFACE:CHANNEL``, with the bus's options.
@@ -243,7 +243,7 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
 def ask_devices(
     wire: str, connect: Callable[[Codec[Any]], Link[Any]], seconds: float
 ) -> Iterator[tuple[Codec[Any], Any]]:
-    """Start a device with each codec that has a start command; yield (codec, received data).
+    """Start or poll the device as each codec does; yield (codec, received data).
 
     Args:
         seconds: time to listen after the first sample, s.

@@ -1,12 +1,12 @@
 """Temperature, prediction sets and refusals of a model, fitted on validation sweeps.
 
-Prediction sets are conformal: the truth is in that of every step for as many touches of new objects
-as the coverage says, whatever the network makes of them, as long as these are drawn as those were
-that the rule was fitted on (Vovk, Gammerman & Shafer 2005). Sweeps of one object are alike, so that
-an object counts once, however often it was swept (Lee, Barber & Willett 2023, hierarchical
-conformal prediction). A robot may stop at any step, so that the coverage is that of all of them at
-once: a sweep's score is that of its worst step. Half of the objects give the usual score of each
-step, by which steps are compared; the other half show how far a sweep may exceed it.
+Prediction sets are conformal: the coverage is the share of touches of new objects for which the set
+of every step contains the true class. It holds for any network, as long as these touches are drawn
+like those of the fit (Vovk, Gammerman & Shafer 2005). Sweeps of one object are alike, so an object
+counts once, however often it was swept (Lee, Barber & Willett 2023, hierarchical conformal
+prediction). A robot may stop at any step, so the coverage holds for all steps at once: a sweep's
+score is that of its worst step. Half of the objects give the usual score of each step, which makes
+steps comparable; the other half show by how much a sweep may exceed it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,7 +56,7 @@ def fit_temperature(posteriors: Floats, labels: Labels) -> float:
 
     Args:
         posteriors: (sweep, class) at temperature 1; undecided sweeps (NaN) are left out.
-        labels: (sweep,).
+        labels: (sweep,) index of the true class.
 
     Returns:
         One of `TEMPERATURES`; 1 if no sweep is decided.
@@ -84,8 +84,8 @@ def fit_rules(
     Args:
         sets: labelled sweeps that the model was not trained on, in groups; the coverage holds in
             each group.
-        run: (samples, offset, sigma) of windows to (batch, step, label) logits.
-        classes: how many of the labels are classes; the others are refusals.
+        run: maps (samples, offset, sigma) of windows to logits, (batch, step, label).
+        classes: number of labels that are classes, the first ones; the others are refusals.
     """
     levels = {*REFUSED_AT, *(level for ends in NOISE.values() for level in ends)}
     posteriors = {
@@ -120,14 +120,14 @@ def fit_rules(
 def fit_names(
     sets: Sequence[SweepSet], run: Step, kinds: Mapping[str, Sequence[str]]
 ) -> dict[str, tuple[PredictionSetRule, ...]]:
-    """Fit prediction sets of the kinds within each class, each with the coverage.
+    """Fit, for each class, the prediction sets of its kinds, with the coverage.
 
-    With few objects of a class, its set holds all kinds.
+    The set of a class with few objects contains all its kinds.
 
     Args:
         sets: labelled sweeps that the model was not trained on. For each class, the coverage holds
             in every set with `ENOUGH` objects, and over the other sets together.
-        run: (samples, offset, sigma) of windows to (batch, step, name) logits.
+        run: maps (samples, offset, sigma) of windows to logits, (batch, step, name).
         kinds: the kinds that the model distinguishes, by class.
     """
     rules: dict[str, tuple[PredictionSetRule, ...]] = {}
@@ -158,12 +158,12 @@ def fit_names(
 
 
 def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSED) -> OpenSetRule:
-    """Fit thresholds that refuse few sweeps of known kinds at each step.
+    """Fit thresholds, one per step, that refuse few sweeps of known kinds.
 
     Args:
         groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
-            objects (sweep,); the share holds in each group.
-        refused: largest share of sweeps of new objects that is refused.
+            objects (sweep,); `refused` holds in each group.
+        refused: largest share of refused sweeps, of new objects of known kinds.
 
     Raises:
         RecordingError: no contact in any sweep.
@@ -171,7 +171,7 @@ def fit_open_set(groups: Sequence[tuple[Floats, Names]], refused: float = REFUSE
     each = []
     for posteriors, names in _drop_untouched(groups):
         order = np.argsort(posteriors, axis=0)
-        share = np.cumsum(_weights(names)[order], axis=0)
+        share = np.cumsum(_make_weights(names)[order], axis=0)
         rank = (share < 1 - refused - 1e-12).sum(axis=0)  # (step,) of the threshold
         ranked = np.vstack([np.take_along_axis(posteriors, order, axis=0), np.ones(rank.shape)])
         each.append(ranked[rank, np.arange(len(rank))])
@@ -190,8 +190,8 @@ def fit_prediction_sets(
     Args:
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)
             and objects (sweep,).
-        noise: largest noise at which they hold, in units of the rated noise.
-        fewest: the number of objects in a group below which there are too few.
+        noise: largest noise at which the quantiles hold, in units of the rated noise.
+        fewest: least number of objects in each group.
 
     Raises:
         RecordingError: no contact in any sweep.
@@ -204,8 +204,8 @@ def fit_prediction_sets(
         objects |= set(own)
         scores = mass_above(posteriors)[np.arange(len(labels)), :, labels]
         usual = np.isin(names, own[::2])
-        level = _fit_usual(scores[usual], _weights(names[usual]))
-        fitted.append(_fit_envelope(scores[~usual], _weights(names[~usual]), level, coverage))
+        level = _fit_usual(scores[usual], _make_weights(names[usual]))
+        fitted.append(_fit_envelope(scores[~usual], _make_weights(names[~usual]), level, coverage))
     quantiles = np.max(fitted, axis=0)
     return PredictionSetRule(
         MASS_ABOVE, coverage, tuple(float(q) for q in quantiles), len(objects), noise=noise
@@ -230,15 +230,15 @@ def _drop_untouched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     return kept
 
 
-def _weights(names: Names) -> Doubles:
-    """Return (sweep,) weights that sum to 1 / (objects + 1 new) for each object."""
+def _make_weights(names: Names) -> Doubles:
+    """Return weights of sweeps, (sweep,), that sum to 1 / (objects + 1) per object."""
     _, which, count = np.unique(names, return_inverse=True, return_counts=True)
     weights: Doubles = 1 / (count[which] * (len(count) + 1))
     return weights
 
 
 def _fit_usual(scores: Doubles, weights: Doubles) -> Doubles:
-    """Return the (step,) scores that few of the (sweep, step) scores in [0, 1) exceed."""
+    """Return the `USUAL` quantile at each step of scores, (sweep, step), in [0, 1)."""
     order = np.argsort(scores, axis=0)
     share = np.cumsum(weights[order], axis=0) / weights.sum()
     rank = np.minimum((share < USUAL).sum(axis=0), len(scores) - 1)
@@ -248,13 +248,13 @@ def _fit_usual(scores: Doubles, weights: Doubles) -> Doubles:
 
 
 def _fit_envelope(scores: Doubles, weights: Doubles, usual: Doubles, coverage: float) -> Doubles:
-    """Return (step,) scores that a share of the sweeps exceeds at no step.
+    """Return bounds of the scores, (step,), that a share of sweeps keeps at every step.
 
     Args:
         scores: (sweep, step), in [0, 1).
         weights: (sweep,), with a sum below 1.
-        usual: (step,), in (0, 1); the larger, the larger the returned score.
-        coverage: the share of sweeps.
+        usual: usual score of each step, (step,), in (0, 1); sets the form of the result.
+        coverage: share of sweeps.
     """
     # posterior at and below the true class, as a power of its usual value, at the worst step
     worst = (np.log1p(-np.minimum(scores, 1 - 1e-12)) / np.log1p(-usual)).max(axis=1)

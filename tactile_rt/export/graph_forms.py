@@ -1,17 +1,17 @@
 """Other forms of an exported step: its weights in fewer bits, and a whole window at once.
 
-window: a whole episode in, logits and embedding of every step out. It is the streaming step, run
-by ONNX's own `Scan` over the steps of the window from a zero state: so the two forms cannot differ,
-and the file is no larger than one step.
+window: a whole episode in, logits and embedding of every step out. ONNX's own `Scan` runs the
+streaming step over the steps of the window from a zero state: so the two forms cannot differ, and
+the file is no larger than that of one step.
 
 fp16, bf16: the weights of products are stored in 16 bits and cast back when the file is loaded:
 half the size, the same speed.
 
-int8: products are integer ones, weights quantised ahead, activations as they come. Products of
-one or a few rows (dense layers, attention) read their weights in blocks of their inputs, each
-with a scale of its own (`MatMulNBits`); convolutions, of a row per site, have one scale per output
-channel (`MatMulInteger`), and their activations are quantised before the taps are gathered, once
-per map. States, norms, biases and sums stay in single precision.
+int8: products are computed in integers; weights are quantised at export, activations at run time.
+Products of one or a few rows (dense layers, attention) read their weights in blocks of their
+inputs, each with a scale of its own (`MatMulNBits`); convolutions, with a row per site, have one
+scale per output channel (`MatMulInteger`), and their activations are quantised once per map, before
+the taps are gathered. States, norms, biases and sums stay in single precision.
 """
 
 from collections import Counter
@@ -52,7 +52,7 @@ def in_precision(proto: onnx.ModelProto, precision: Precision) -> onnx.ModelProt
 
 
 def _store_16_bits(proto: onnx.ModelProto, precision: Precision) -> None:
-    """Store weights in 16 bits, each with a Cast that loading the file folds."""
+    """Store weights in 16 bits, each with a Cast that is folded on loading."""
     casts = []
     for weight in proto.graph.initializer:
         if weight.data_type != TensorProto.FLOAT or np.prod(weight.dims) < SMALL:
@@ -122,7 +122,7 @@ def _quantise(proto: onnx.ModelProto) -> None:
 def _quantise_blocks(
     node: onnx.NodeProto, values: NDArray[np.float32], added: dict[str, TensorProto]
 ) -> Iterator[onnx.NodeProto]:
-    """Yield nodes for x (..., inputs) times weights (inputs, outputs) in blocks of inputs."""
+    """Yield nodes that multiply x, (..., inputs), by weights quantised in blocks of inputs."""
     inputs, outputs = values.shape
     block = min(BLOCK, max(LEAST_BLOCK, 1 << (inputs - 1).bit_length()))
     count = -(-inputs // block)
@@ -162,9 +162,9 @@ def _quantise_taps(
     gathered: dict[str, tuple[str, str, str]],
     bias: tuple[str, str] | None,
 ) -> Iterator[onnx.NodeProto]:
-    """Yield nodes for gathered taps times weights; the map is quantised before gathering.
+    """Yield nodes that quantise a map, gather its taps, and multiply them by weights.
 
-    `bias` names the vector to add, and the sum.
+    `bias` holds the names of the vector to add and of the sum.
     """
     final = taps[0].output[0]
     if final not in gathered:
@@ -176,7 +176,7 @@ def _quantise_taps(
             )
         for step in reversed(taps):
             inputs = [value, *step.input[1:]]
-            if step.op_type == "Pad":  # a silent site is the code of zero
+            if step.op_type == "Pad":  # a padded site has the code of zero
                 inputs = [value, step.input[1], zero]
             output = f"{step.output[0]}_int8"
             copy = helper.make_node(step.op_type, inputs, [output], f"{step.name}_int8")
@@ -203,7 +203,7 @@ def _quantise_taps(
 def _find_biases(
     graph: onnx.GraphProto, weights: dict[str, TensorProto]
 ) -> dict[str, tuple[str, str]]:
-    """Map each product that only an Add reads to the added vector and the sum."""
+    """Map each product that only an Add reads to (added vector, sum), by name."""
     uses = Counter(name for node in graph.node for name in node.input)
     uses.update(output.name for output in graph.output)
     found = {}
@@ -234,7 +234,7 @@ def _find_taps(name: str, makers: dict[str, onnx.NodeProto]) -> tuple[onnx.NodeP
 
 
 def _select_used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto]:
-    """Return the nodes that an output needs, in order."""
+    """Return the nodes on which the outputs depend, in order."""
     needed, kept = set(outputs), []
     for node in reversed(nodes):
         if needed.intersection(node.output):
@@ -244,15 +244,15 @@ def _select_used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.No
 
 
 def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.ModelProto:
-    """Return a model of kind "window" from the step that `onnx_step.step_graph` made.
+    """Make a model of kind "window" from a step that `onnx_step.step_graph` made.
 
-    samples (batch, step, sub-step, element, channel), offset and sigma as for the step
-    -> logits (batch, step, class), embedding (batch, step, unit), names (batch, step, name)
+    Inputs: samples (batch, step, sub-step, element, channel); offset and sigma as for the step.
+    Outputs: logits (batch, step, class), embedding (batch, step, unit), names (batch, step, name).
     """
     graph = step.graph
     values = {value.name: value for value in (*graph.input, *graph.output)}
     outputs = [name for name in OUTPUTS if name in values]
-    # The loop's body reads offset and sigma from outside; its other names must differ from outside.
+    # The body of the loop reads offset and sigma from outside; its other names must be unique.
     inside = {name: f"scan_{name}" for name in ("samples", *outputs, *(s.name for s in state))}
     nodes = []
     for node in graph.node:
@@ -317,7 +317,7 @@ def window_graph(step: onnx.ModelProto, state: Sequence[StateTensor]) -> onnx.Mo
 
 
 def _add_step_axis(value: onnx.ValueInfoProto) -> onnx.ValueInfoProto:
-    """Return an output (batch, number) as one of every step, (batch, step, number)."""
+    """Return an output, (batch, number), with a step axis: (batch, step, number)."""
     number = value.type.tensor_type.shape.dim[1].dim_value
     return helper.make_tensor_value_info(value.name, TensorProto.FLOAT, ["batch", "step", number])
 

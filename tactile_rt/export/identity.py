@@ -1,7 +1,7 @@
 """The rule that matches touches to enrolled objects, fitted on validation sweeps.
 
 Half of the objects give the Gaussians of objects and touches, the other half the score below which
-few touches of an enrolled object fall, and the other way round; a file has the Gaussians of all.
+few touches of an enrolled object fall, and vice versa; a file has the Gaussians of all objects.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def fit_identity(sets: Sequence[SweepSet], run: Step) -> IdentityRule | None:
 
     Args:
         sets: sweeps of objects that the network was not trained on.
-        run: (samples, offset, sigma) of windows to (batch, step, unit) embeddings.
+        run: maps (samples, offset, sigma) of windows to embeddings, (batch, step, unit).
     """
     embeddings, objects = [], []
     for k, one in enumerate(sets):
@@ -50,12 +50,12 @@ def identity_thresholds(embeddings: Floats, objects: Names) -> Doubles:
     """Return the log-odds below which few touches of enrolled objects fall.
 
     Args:
-        embeddings: (touch, unit) of touches, at their last step.
+        embeddings: (touch, unit) embeddings of touches at their last step.
         objects: (touch,) name of the object that each touch is of.
 
     Returns:
-        (among, enrolled, judged) thresholds by the numbers of objects and touches; with too few
-        objects for a number, the threshold of a smaller one; NaN without any.
+        Thresholds, (among, enrolled, judged), by the numbers of objects and touches; with too few
+        objects for a number, the threshold of a smaller number; NaN without any.
     """
     rng = np.random.default_rng(0)
     table = np.full((len(AMONG), enrolment.ENROLLED, enrolment.JUDGED), np.nan)

@@ -19,12 +19,12 @@ TAIL = "<= 1.3"  # p99 over p50 of every step
 
 @dataclass(frozen=True)
 class Subject:
-    """A model file to measure and its bars; without a bar it is only reported.
+    """Model file to measure, with the limits that its CPU times must meet.
 
     Attributes:
         path: The model file, of kind "step".
-        step_ms: The bar of the median step's CPU time in ms.
-        load_ms: The bar of the CPU time of loading in ms.
+        step_ms: Limit of the median step's CPU time, ms; empty to only report the time.
+        load_ms: Limit of the CPU time of loading, ms; empty to only report the time.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Subject:
 
 
 def measure_model(subject: Subject, steps: int) -> list[Record]:
-    """Measure one file of kind "step": size, loading, memory, steps.
+    """Return the size, loading time, memory and step times of a model file.
 
     Raises:
         ModelError: the file cannot be used.
@@ -66,7 +66,7 @@ def measure_model(subject: Subject, steps: int) -> list[Record]:
 
 
 def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> NDArray[np.float64]:
-    """Return (step,) CPU times in s of episodes of noise, run as the classifier does."""
+    """Run episodes of noise as the classifier does; return CPU times, (step,) s."""
     rng = np.random.default_rng(0)
     scale = np.array(card.scale, dtype=np.float32)
     offset = np.zeros(card.array.shape, dtype=np.float32)
@@ -87,6 +87,6 @@ def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> ND
 
 
 def _read_resident() -> int:
-    """Return the bytes of memory that this process holds."""
+    """Return the resident memory of this process, in bytes."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE")

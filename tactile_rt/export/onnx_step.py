@@ -46,7 +46,7 @@ PARITY_BAR = 1e-5  # largest difference of logits between the file and the torch
 
 
 class StreamingStep(nn.Module):
-    """One step of a classifier with its state as arguments and results.
+    """Module that computes one step of a classifier, with its state as inputs and outputs.
 
     Args:
         integer: whether its products will be quantised, see `streaming`.
@@ -63,7 +63,7 @@ class StreamingStep(nn.Module):
     ) -> tuple[Tensor, ...]:
         """Return logits (batch, class), embedding (batch, unit), names (batch, name), next state.
 
-        Samples are (batch, sub-step, element, channel), SI; some networks have no names."""
+        Samples are (batch, sub-step, element, channel), SI; some networks have no names output."""
         frame = self.inputs(samples, offset, sigma)
         outputs, following = self.network.step_outputs(
             frame, dict(zip(self.names, state, strict=True))
@@ -169,7 +169,7 @@ def export_step(
 def step_graph(
     model: TactileClassifier, card: ModelCard, integer: bool = False
 ) -> tuple[onnx.ModelProto, tuple[StateTensor, ...]]:
-    """Return the step's graph in single precision, without metadata, and its state.
+    """Export a classifier's step; return its graph in single precision, and its state.
 
     Args:
         integer: whether its products will be quantised, see `streaming`.
@@ -220,7 +220,7 @@ def step_graph(
 
 
 def _is_written_by_rows(graph: onnx.GraphProto, state: str) -> bool:
-    """Return whether only the `ScatterND` that makes a state's next value reads it."""
+    """Return whether a state is read only by the `ScatterND` that makes its next value."""
     readers = [n for n in graph.node if state in n.input and n.op_type != "Shape"]
     return (
         len(readers) == 1
@@ -240,7 +240,7 @@ def write_model(
     precision: Precision = "fp32",
     kind: Kind = "step",
 ) -> ModelCard:
-    """Write the graph of `step_graph` in a precision, as `export_step` does.
+    """Write a graph of `step_graph` as a model file; see `export_step`.
 
     Raises:
         OSError: the folder cannot be written into, or the medium is full; it names `path`.
@@ -299,8 +299,8 @@ def parity(
 ) -> dict[str, float]:
     """Return each output's largest difference, over all steps, between a file and torch's window.
 
-    In units of the output's largest number, where that is more than 1, as `align gate` measures:
-    single precision rounds a sum as its largest part is rounded. NaN if either computes one.
+    A difference is divided by the output's largest number if that is over 1, as in `align gate`:
+    single precision rounds a sum like its largest part. NaN if either output contains NaN.
     """
     session, card = load_model(path, kind=None)
     elements, channels = card.array.shape

@@ -1,4 +1,4 @@
-"""Release of a checkpoint for robots: calibration on validation sweeps, export, figures."""
+"""Release of a checkpoint for robots: calibration on validation sweeps, export, measures."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,12 +49,12 @@ def release(
     """
     model, saved = load_checkpoint(checkpoint)
     config = saved["config"]
-    there = trained_on(checkpoint, saved, data)
-    manifests = [manifest for _, manifest in there]
+    trained = trained_on(checkpoint, saved, data)
+    manifests = [manifest for _, manifest in trained]
     known = join_manifests(manifests).categories
     sets = [  # with windows drawn as in training, also to fit the decision rules
         drawn_as(relabel_set(SweepSet.read_known(folder, manifest, "validation"), known), config)
-        for folder, manifest in there
+        for folder, manifest in trained
         if manifest.split.get("validation")
     ]
     validation = join_sets(sets)
@@ -90,7 +90,7 @@ def release(
 
 
 def run_file(path: Path) -> Step:
-    """Load a model file of either kind as a function for `evaluation.measures.predict`."""
+    """Load a model file, step or window, as a function for `evaluation.measures.predict`."""
     session, card = load_model(path, kind=None)
 
     def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:
@@ -106,7 +106,7 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
     """Compare a file of reduced precision with the trained network at the last step.
 
     Returns:
-        Of sweeps without and with rated noise: ``quantisation_top1_drop``, percentage points;
+        On sweeps without and with rated noise: ``quantisation_top1_drop``, percentage points;
         ``quantisation_agreement`` of decisions, %; ``quantisation_posterior``, the largest
         difference of a posterior; and ``quantisation_sweeps``, the number of both.
     """
@@ -128,7 +128,7 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
 
 
 def _add_figures(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelCard:
-    """Add measured figures to the card in a model file; return the new card."""
+    """Add measured results to the card in a model file; return the new card."""
     card = msgspec.structs.replace(card, figures={**card.figures, **figures})
     proto = onnx.load(path)
     onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})

@@ -1,9 +1,9 @@
-"""A trained network rewritten for streaming: the same logits, laid out for the runtime's kernels.
+"""Trained network rewritten for streaming: the same logits, laid out for the runtime's kernels.
 
 Maps are `(lane, site, channel)`, sites row by row, in the state and inside, so nothing is
 transposed between steps; a convolution is one gather of every site's taps and one product, or two
-where that is less arithmetic. The cache of a layer of the GPT is written by rows: what was attended
-before stays where it is. Tokens are the rows of one matrix, (lane * token, width), or where that is
+where that is less arithmetic. The cache of a layer of the GPT is written by rows: earlier keys
+and values stay in place. Tokens are the rows of one matrix, (lane * token, width), or where that is
 faster (1, lane, token, width). Parts that cannot be rewritten stay as trained.
 """
 
@@ -28,13 +28,13 @@ WIDE = 256  # features from which on convolutions were the faster products
 
 
 def streaming(network: EAD, integer: bool = False) -> EAD:
-    """Return a network rewritten for the runtime: `step` and `initial_state`, not `forward`.
+    """Return a copy of a network that is rewritten to run step by step.
 
-    Its state has other names and layouts than the trained network's.
+    It has `step` and `initial_state`, but no `forward`; its state has other names and layouts.
 
     Args:
         network: as trained, in evaluation mode.
-        integer: whether its products will be quantised: then gather a convolution's taps at once.
+        integer: whether products will be quantised; convolutions then gather all taps at once.
     """
     out = copy.copy(network)
     out._modules = dict(network._modules)  # a shallow copy would share it
@@ -58,13 +58,13 @@ def _is_plain(encoder: GraphEncoder, name: str) -> bool:
 
 
 class Taps(nn.Module):
-    """2 x 2 convolution of maps (lane, site, channel) that are concatenated on channels.
+    """2 x 2 convolution of maps, (lane, site, channel), concatenated along channels.
 
     Args:
         weight: (output, 2, 2, input).
-        valid: without the padding that makes the output as large as the input.
-        whole: gather all four taps at once; else the lower two are a second product, without the
-            sites below the map, which need none.
+        valid: whether to omit the padding that makes the output as large as the input.
+        whole: whether to gather all four taps at once; else the lower two are a second product,
+            which omits the last row of sites: only padding is below it.
     """
 
     taps: Tensor
@@ -76,7 +76,7 @@ class Taps(nn.Module):
         rows, columns = size
         self.columns, self.sites = columns, rows * columns
         self.padded = not valid
-        site = torch.full((rows + 1, columns + 1), self.sites)  # the last one is silent
+        site = torch.full((rows + 1, columns + 1), self.sites)  # the last site is always zero
         site[:-1, :-1] = torch.arange(self.sites).view(size)
         if valid:
             site = site[:-1, :-1]
@@ -107,7 +107,7 @@ class Taps(nn.Module):
 
 
 class StreamingIntersection(Cell):
-    """An `IntersectionCell` with layer norm, whose norms have scale, offset and forget bias."""
+    """Streaming form of an `IntersectionCell`; its norms have scale, offset and forget bias."""
 
     gates, norms = 0, 0
 
@@ -134,7 +134,7 @@ class StreamingIntersection(Cell):
 
 
 class StreamingGraph(nn.Module):
-    """A `GraphEncoder` that only concatenates; see `streaming`."""
+    """Streaming form of a `GraphEncoder` whose nodes only concatenate; see `streaming`."""
 
     def __init__(self, encoder: GraphEncoder, integer: bool) -> None:
         super().__init__()
@@ -177,7 +177,7 @@ class StreamingGraph(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros: each node's cell state and, if a node reads it, its output ``NAME_h``."""
+        """Return a state of zeros: each node's cell state and, if read, output ``NAME_h``."""
         zeros = next(self.buffers()).new_zeros
         state = {}
         for node in self.graph.nodes:
@@ -190,7 +190,7 @@ class StreamingGraph(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Run one step: frame (batch, channel, row, column) -> features (batch, feature), state."""
+        """Run one step on a frame (batch, channel, row, column); return features, new state."""
         now = frame.flatten(2).transpose(1, 2)
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
@@ -209,7 +209,7 @@ class StreamingGraph(nn.Module):
         return new[f"{self.graph.readout}_h"], {key: new[key] for key in kept}
 
     def _apply_dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
-        """Apply a dense node to its sources, joined: every site's channels, then vectors."""
+        """Apply a dense node to its concatenated sources: maps site by site, then vectors."""
         maps, vectors = [m for m in read if m.dim() == 3], [m for m in read if m.dim() == 2]
         if not vectors:
             joined = torch.cat(maps, -1)
@@ -221,7 +221,7 @@ class StreamingGraph(nn.Module):
 
 
 class Product(nn.Module):
-    """x W + b of (..., input); W is stored as the kernels read it."""
+    """Linear layer on (..., input), with weights stored as the kernels read them."""
 
     weight: Tensor
     bias: Tensor | None
@@ -237,7 +237,7 @@ class Product(nn.Module):
 
 
 class Columns(nn.Module):
-    """W x + b of maps (lane, site, channel), the lanes as columns.
+    """Linear layer on maps, (lane, site, channel), with the lanes as columns.
 
     For one lane this reads the weights at memory speed, as a row times W does not. The bias is
     added after the transposition: onnxruntime would merge it with the product into a slow `Gemm`.
@@ -257,12 +257,12 @@ class Columns(nn.Module):
 
 
 class Pointwise(nn.Module):
-    """W x + b of a few rows, as a 1 x 1 convolution.
+    """Linear layer on a few rows, computed as a 1 x 1 convolution.
 
     Rows are (..., row, input), of up to four axes. For a few rows the runtime's blocked
     convolution reads large weights faster than its product does: for one row at 26 GB/s, not 22,
-    of 28; for two at 27, not 19, of 31; for 24 in 12 % less time. It has to reorder them (which
-    includes the transpositions here), so a `Product` is better for small weights.
+    of 28; for two at 27, not 19, of 31; for 24 in 12 % less time. It has to reorder the rows (by
+    the transpositions here, too), so a `Product` is better for small weights.
     """
 
     weight: Tensor
@@ -274,13 +274,13 @@ class Pointwise(nn.Module):
         self.register_buffer("bias", None if bias is None else bias.detach().clone())
 
     def forward(self, x: Tensor) -> Tensor:
-        missing = 4 - x.dim()  # not lanes as the batch: each would read the weights anew
+        missing = 4 - x.dim()  # a batch of lanes would read the weights once per lane
         out = F.conv2d(x[(None,) * missing].permute(0, 3, 1, 2), self.weight, self.bias)
         return out.permute(0, 2, 3, 1).flatten(0, missing)
 
 
 class StreamingGPT(nn.Module):
-    """A `GPT` with one cache tensor per layer and kind; steps write their own rows."""
+    """Streaming form of a `GPT`, with key and value caches; steps write their own rows."""
 
     positions: Tensor
 
@@ -333,9 +333,9 @@ class StreamingGPT(nn.Module):
 
 @dataclass(frozen=True)
 class Rows:
-    """Places of a step's tokens in a cache: lane, head, row, each (lane, head, token).
+    """Indices of a step's tokens in a cache: lane, head, row, each (lane, head, token).
 
-    `unseen` is (lane, 1, token, row): 0 where a token attends, else minus infinity.
+    `unseen` is the attention mask, (lane, 1, token, row): 0 to attend, else minus infinity.
     """
 
     lane: Tensor
@@ -344,12 +344,12 @@ class Rows:
     unseen: Tensor
 
     def write(self, cache: Tensor, values: Tensor) -> Tensor:
-        """Return a cache (lane, head, row, number) with values (lane, head, token, number) set."""
+        """Return a copy of a cache, (lane, head, row, number), with the tokens' values written."""
         return cache.index_put((self.lane, self.head, self.row), values)
 
 
 class StreamingBlock(nn.Module):
-    """One layer of `StreamingGPT`."""
+    """Transformer block of `StreamingGPT`."""
 
     def __init__(self, block: nn.Module, layout: tuple[int, ...]) -> None:
         super().__init__()

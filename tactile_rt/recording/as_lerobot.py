@@ -8,9 +8,9 @@
 Goal: a camera has 30 frames a second, a sensor a thousand samples, and no sample may be lost; but
 LeRobot has a single rate, that of the rows, and arrays of fixed shape.
 
-Plan: a row holds all samples since the row before, in an array as long as the fullest row needs,
-and their number. A row at time t holds samples up to t and none after it: only these could a policy
-know then. ``observation.state``, which every policy reads, is the newest sample.
+Plan: a row holds all samples since the previous row, padded to the length of the fullest row, and
+their number. A row at time t holds samples up to t and none after it, as a policy could know only
+these then. ``observation.state``, which every policy reads, is the newest sample.
 
 The data are read and written piece by piece; they need not fit into memory.
 """
@@ -50,8 +50,8 @@ def write_dataset(
 
     Args:
         folder: The dataset to write; an existing one is replaced.
-        task: Description of the task of all episodes; empty: the note ``task`` of each recording,
-            or its array's name.
+        task: Description of the task of all episodes; if empty, the note ``task`` of each
+            recording, or its array's name.
 
     Raises:
         ConfigError: An extra is missing, or a film cannot be used.
@@ -103,7 +103,7 @@ def write_dataset(
 
 
 def _find_row_ends(recording: Recording, fps: int) -> NDArray[np.int64]:
-    """Return (row,) the number of samples up to the end of each row. Row k ends k / fps seconds
+    """Return the number of samples up to the end of each row, (row,). Row k ends k / fps seconds
     after the first sample."""
     t_ns = np.concatenate([chunk.t_ns for chunk in recording] or [np.zeros(0, np.int64)])
     if not len(t_ns):
@@ -113,16 +113,16 @@ def _find_row_ends(recording: Recording, fps: int) -> NDArray[np.int64]:
     row = [-(-max(0, t - times[0]) * fps // NS_PER_S) for t in times]
     most = FREE_CELLS + MOST_PADDING * len(row)
     if max(row) >= most:
-        raise _uneven_error(recording, max(row), len(row))
+        raise _make_uneven_error(recording, max(row), len(row))
     # Where time goes back, samples keep their order.
     last = np.maximum.accumulate(np.array(row, np.int64))
     ends = np.searchsorted(last, np.arange(last[-1] + 1), side="right")
     if len(ends) * int(np.diff(ends, prepend=0).max()) > most:
-        raise _uneven_error(recording, len(ends), len(row))
+        raise _make_uneven_error(recording, len(ends), len(row))
     return ends
 
 
-def _uneven_error(recording: Recording, rows: int, samples: int) -> RecordingError:
+def _make_uneven_error(recording: Recording, rows: int, samples: int) -> RecordingError:
     return RecordingError(
         f"{recording.path}: its {samples} samples are spread over {rows} rows too unevenly for "
         "arrays of one length: convert what was recorded without a pause"
@@ -132,7 +132,7 @@ def _uneven_error(recording: Recording, rows: int, samples: int) -> RecordingErr
 def _read_blocks(
     recording: Recording, ends: NDArray[np.int64], width: int
 ) -> Iterator[tuple[_Arrays, _Arrays]]:
-    """Yield the columns of `BLOCK_ROWS` rows at a time, with the samples in them."""
+    """Yield (columns, samples in them) of `BLOCK_ROWS` rows at a time."""
     spec = recording.spec
     counts = np.diff(ends, prepend=0)
     chunks = iter(recording)
@@ -168,16 +168,16 @@ def _read_blocks(
         states = []
         for begin, many in zip(begins, count, strict=True):
             mine = slice(begin, begin + many)
-            newest = _newest_valid(newest, samples["values"][mine], samples["valid"][mine])
+            newest = _find_newest(newest, samples["values"][mine], samples["valid"][mine])
             states.append(newest.ravel())
         columns[STATE] = np.array(states)
         yield columns, samples
 
 
-def _newest_valid(
+def _find_newest(
     before: NDArray[np.float32], values: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """Return (element, channel) the newest valid values of each element."""
+    """Return each element's newest valid values, (element, channel), or those in `before`."""
     found = before.copy()
     for element in np.flatnonzero(valid.any(axis=0)):
         found[element] = values[np.flatnonzero(valid[:, element])[-1], element]
@@ -185,7 +185,7 @@ def _newest_valid(
 
 
 def _describe_features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
-    """Describe the columns for ``info.json``."""
+    """Return the entries of the columns for ``info.json``."""
     elements, channels, feature = list(spec.elements), list(spec.channels), meta.describe_feature
     flat = [f"{e}.{c}" for e in elements for c in channels]
     return {

@@ -34,16 +34,16 @@ Fields = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class RecordedModel:
-    """Model of the daemon that decided on the recorded source."""
+    """Model that the daemon ran on the source while recording it."""
 
     name: str  # name of the model in the configuration, and in its decisions
     file: Path  # path of the model's file at the time of recording
-    sha256: str  # SHA-256 of the file, in hexadecimal; empty: not recorded
+    sha256: str  # SHA-256 of the file, in hexadecimal; empty if not recorded
     table: Fields = field(default_factory=dict)  # model's table ``[[model]]`` in the configuration
 
 
 def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
-    """List the models that decided on the source while it was recorded by a daemon."""
+    """Return the models that the daemon ran on the source while recording it."""
     session = about.session
     try:
         config = parse_toml(session.get("config", ""), "config").plain()
@@ -65,10 +65,10 @@ def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
 def live_model(
     what: str, about: Description, name: str, model: Path | None, check: bool
 ) -> RecordedModel | None:
-    """Select the model that decided live; None: none did.
+    """Return the model that decided live; None if no model did.
 
     Args:
-        name: of the model; empty: the only one, or the one whose file is `model`.
+        name: name of the model; if empty, the only model, or the one whose file is `model`.
 
     Raises:
         ConfigError: no model has that name, or several models match.
@@ -92,7 +92,7 @@ def live_model(
 
 
 def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
-    """Find the file of the model to replay: `model`, else the live one.
+    """Return the model file to replay: `model`, else the live model's, else the shipped one.
 
     Raises:
         ConfigError: the file does not exist any more, or has changed.
@@ -121,7 +121,7 @@ class Checked:
     late: int = 0
     # number of replayed decisions that were not recorded because they were late (``late = "skip"``)
     withheld: int = 0
-    difference: str = ""  # first difference, in words; empty: none
+    difference: str = ""  # first difference, in words; empty without any
 
 
 def check_decisions(
@@ -132,12 +132,12 @@ def check_decisions(
     final_only: bool = False,
     may_withhold: bool = False,
 ) -> Checked:
-    """Compare recorded and replayed decisions of one model, in their order.
+    """Compare recorded and replayed decisions of one model, one by one.
 
     Args:
-        recorded: from `Recording.decisions`.
-        replayed: with `FACTS`, of every step.
-        span_ns: stream time of the first and the last sample.
+        recorded: the model's decisions from `Recording.decisions`.
+        replayed: decisions of every step, with the fields `FACTS`.
+        span_ns: stream times of the first and last sample, ns.
         final_only: whether only final decisions were recorded.
         may_withhold: whether late decisions were not recorded.
     """
@@ -163,10 +163,10 @@ def check_decisions(
 
 
 def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
-    """Select the samples of a chunk that reached the model live; None: none did.
+    """Return the samples of a chunk that reached the live model; None if none did.
 
     Args:
-        skips: from `Recording.skips`; the samples of a skip that is marked as lost are left out.
+        skips: from `Recording.skips`; samples of skips that are marked as lost are left out.
     """
     kept = np.ones(len(chunk), bool)
     for skip in skips:
@@ -204,7 +204,7 @@ Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 @dataclass(frozen=True)
 class Redecoded:
-    """Comparison of recorded samples with those that the packets decode to."""
+    """Result of comparing recorded samples with samples decoded again from the packets."""
 
     recorded: int
     decoded: int
@@ -219,7 +219,7 @@ class Redecoded:
     array: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
-        """Write the comparison as lines of text."""
+        """Return the comparison as lines of text."""
         if self.array:
             return [
                 f"{self.recorded} samples recorded, {self.decoded} decoded",
@@ -242,10 +242,10 @@ class Redecoded:
 
 
 def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None) -> Redecoded:
-    """Decode a recording's packets again, and compare with its samples.
+    """Decode a recording's packets again, and compare the result with its samples.
 
     Args:
-        options: ``codec`` and the codec's own, as in a ``replay:`` URL; None: as recorded.
+        options: ``codec`` and the codec's own, as in a ``replay:`` URL; None for those recorded.
 
     Raises:
         ConfigError: the recording has no packets, or the codec is invalid.
@@ -268,7 +268,7 @@ def _compare(old_spec: ArraySpec, old: Chunk, new_spec: ArraySpec, new: Chunk) -
     if array:
         return Redecoded(len(old), len(new), array=array)
     ways = [_pair_by_number(old, new, old_spec.rate_hz), _pair_by_time(old, new, old_spec.rate_hz)]
-    # Numbers restart in a file that continues a stream; those of a device that does not count shift
+    # Numbers restart in a file that continues a stream; without a device's counter, they shift
     # with each sample that only one side has.
     at, same = max(((way, _is_equal(old, new, way)) for way in ways), key=lambda w: int(w[1].sum()))
     i, j = at[0][~same], at[1][~same]

@@ -79,7 +79,7 @@ def convert(path: str | Path, output: str | Path) -> int:
 
 
 def about_text(about: Description) -> str:
-    """Write a description as one line of JSON, as of a recording without raw packets."""
+    """Return a description as one line of JSON, for a file without raw packets."""
     fields = {
         "tactile_rt": replace(about, wire="").to_metadata(),
         "session": seal(about.session) if about.session else {},
@@ -89,7 +89,7 @@ def about_text(about: Description) -> str:
 
 
 def write_csv(recording: Recording, file: BinaryIO) -> int:
-    """Write a line per sample, with empty cells for elements that are not valid."""
+    """Write a line per sample; cells of invalid elements are empty."""
     text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
     lines = csv.writer(text, lineterminator="\n")
     spec, n = recording.spec, 0
@@ -111,7 +111,7 @@ def _write_rows(chunk: Chunk) -> Iterator[list[Any]]:
 
 
 def write_npz(recording: Recording, file: BinaryIO) -> int:
-    """Write all arrays; the whole recording is in memory meanwhile."""
+    """Write a recording as arrays, with all of it in memory."""
     about, whole = recording.description, concatenate(list(_read_blocks(recording)))
     arrays: dict[str, Any] = {name: getattr(whole, name) for name in COLUMNS}
     for topic in TEXTS:
@@ -127,7 +127,7 @@ def write_npz(recording: Recording, file: BinaryIO) -> int:
 
 
 def write_hdf5(recording: Recording, file: BinaryIO) -> int:
-    """Write datasets block by block, with the names and units of the array."""
+    """Write a recording as datasets, block by block, with names and units."""
     h5py, about, n = _import_h5py(), recording.description, 0
     with _DeferredErrorFile(os.dup(file.fileno())) as out, h5py.File(out, "w") as made:
         for block in _read_blocks(recording):
@@ -165,7 +165,7 @@ def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
 
 
 def _read_blocks(recording: Recording) -> Iterator[Chunk]:
-    """Yield the samples in blocks of `BLOCK` or a few more. Refuse a recording without samples."""
+    """Yield the samples in blocks of about `BLOCK`; raise RecordingError if none exist."""
     waiting: list[Chunk] = []
     n = total = 0
     for chunk in recording:
@@ -181,7 +181,7 @@ def _read_blocks(recording: Recording) -> Iterator[Chunk]:
 
 
 def _read_texts(recording: Recording, topic: str) -> tuple[list[str], NDArray[np.int64]]:
-    """Read the messages of a topic, JSON, and the host monotonic time of each, ns."""
+    """Return a topic's JSON messages, and the host monotonic time of each, ns."""
     raws = list(recording.raw(topic))
     return [raw.data.decode() for raw in raws], np.array([raw.t_ns for raw in raws], np.int64)
 
@@ -269,7 +269,7 @@ def _write_file(recording: Recording, path: Path) -> tuple[int, _File]:
 
 
 def _add_wrenches(made: McapFile, raw: Raw) -> int:
-    """Add the wrench of each valid sample, if the array has one. Return the number of samples."""
+    """Add each valid sample's wrench, if the array has one; return the number of samples."""
     about = made.about
     chunk = decode_samples(raw.data, about.spec.shape)
     wrenches = messages.wrenches_of(about.spec, chunk.values)
@@ -284,7 +284,7 @@ def _add_wrenches(made: McapFile, raw: Raw) -> int:
 
 
 def _write_metadata(files: Sequence[_File]) -> str:
-    """Write the text of metadata.yaml, as JSON, which is a subset of YAML."""
+    """Return the text of metadata.yaml, as JSON, which is a subset of YAML."""
     totals = Counter[tuple[str, str]]()
     for file in files:
         totals.update(file.counts)

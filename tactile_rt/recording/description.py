@@ -24,12 +24,11 @@ class Description:
     Attributes:
         utc_offset_ns: UTC less the host's monotonic time when the recording began, ns.
         source: The URL of the source that was recorded, or the device's name.
-        wire: ``serial`` or ``can``; empty where the source is no device, so that no packets are
-            recorded.
+        wire: ``serial`` or ``can``; empty if the source is no device, so no packets are recorded.
         codec: The name of the codec that the device spoke; empty without a device.
         codec_options: The options of the codec, as in a URL; paths are absolute.
-        calibration: The calibration of the samples, not of the packets; None: the samples are as
-            the codec gave them.
+        calibration: The calibration that was applied to the samples, not to the packets; None if
+            the samples are as the codec decoded them.
         recovered: Whether the file was recovered after an interruption, and may have gaps.
     """
 
@@ -45,7 +44,7 @@ class Description:
     recovered: bool = False
 
     def to_metadata(self) -> dict[str, str]:
-        """Write the sealed fields of the record ``tactile_rt``; session notes have their own."""
+        """Return the sealed fields of the metadata record ``tactile_rt``, without session notes."""
         return seal(
             {
                 "version": LAYOUT_VERSION,
@@ -64,10 +63,10 @@ class Description:
     def from_metadata(
         cls, what: str, fields: Mapping[str, str], session: Mapping[str, str], recovered: bool
     ) -> "Description":
-        """Read what `to_metadata` wrote.
+        """Make a description from the fields that `to_metadata` returned.
 
         Raises:
-            RecordingError: it is damaged, or of another version.
+            RecordingError: the metadata is damaged, or of another version.
         """
         version = fields.get("version")
         if version != LAYOUT_VERSION:
@@ -95,28 +94,28 @@ class Description:
 
 
 def seal(fields: Mapping[str, str]) -> dict[str, str]:
-    """Add a checksum: MCAP guards chunks with one, but not metadata."""
-    return {**fields, "crc32": _crc(fields)}
+    """Return metadata fields with a checksum, which MCAP has only for chunks."""
+    return {**fields, "crc32": _make_crc(fields)}
 
 
 def unseal(what: str, fields: Mapping[str, str]) -> dict[str, str]:
-    """Check and remove the checksum of sealed fields.
+    """Check the checksum of sealed fields; return the fields without it.
 
     Raises:
         RecordingError: the checksum does not fit the fields.
     """
     plain = {k: v for k, v in fields.items() if k != "crc32"}
-    if fields.get("crc32") != _crc(plain):
+    if fields.get("crc32") != _make_crc(plain):
         raise RecordingError(f"{what} is damaged: the checksum of its metadata is wrong")
     return plain
 
 
-def _crc(fields: Mapping[str, str]) -> str:
+def _make_crc(fields: Mapping[str, str]) -> str:
     return f"{zlib.crc32(msgspec.json.encode(sorted(fields.items()))):08x}"
 
 
 def utc_offset_ns() -> int:
-    """Return the present difference of UTC and the host's monotonic time, ns."""
+    """Return the present UTC less the host's monotonic time, ns."""
     before = time.monotonic_ns()
     utc = time.time_ns()
     return utc - (before + time.monotonic_ns()) // 2
@@ -125,7 +124,7 @@ def utc_offset_ns() -> int:
 def describe(
     source: Source, url: str = "", session: Mapping[str, str] | None = None
 ) -> Description:
-    """Describe a recording of this source that begins now."""
+    """Return the description of a recording of a source that begins now."""
     notes = {**getattr(source, "notes", {}), **(session or {})}
     about = Description(source.spec, utc_offset_ns(), url, session=notes)
     device = device_of(source)

@@ -21,7 +21,7 @@ from tactile_rt.recording.touches import REST
 from tactile_rt.sets.manifest import RECORDED_VERSION, RECORDINGS, SPLITS, UNLABELLED, SweepManifest
 from tactile_rt.sets.objects import write_object
 
-SHARES = (0.7, 0.15, 0.15)  # of the objects of each category, by split
+SHARES = (0.7, 0.15, 0.15)  # shares of each category's objects, by split
 ENOUGH = 3  # recordings of a label from which each counts as an object: one for each split
 DIGITS = 6  # of a recording's checksum, in the names of its objects
 STEM = 100  # bytes of a recording's name, in the names of its objects
@@ -39,7 +39,7 @@ def write_set(
 
     Args:
         folder: the set to write; an existing one is replaced.
-        shares: of the objects of each category, for training, validation and test.
+        shares: shares of each category's objects for training, validation and test.
 
     Raises:
         ConfigError: no touch can be used, or the shares are invalid.
@@ -82,7 +82,7 @@ def write_set(
 
 
 def check_shares(shares: Sequence[float]) -> None:
-    """Refuse shares of another number than splits, negative ones, and none for training."""
+    """Raise a ConfigError unless the shares are valid, one per split, with some for training."""
     whole = len(shares) == len(SPLITS) and all(s >= 0 for s in shares) and sum(shares) < inf
     if not whole or not shares[0]:
         raise ConfigError(
@@ -93,8 +93,8 @@ def check_shares(shares: Sequence[float]) -> None:
 def _group_by_object(touches: LabelledTouches) -> dict[str, list[LabelledTouch]]:
     """Group the touches by the name of their object.
 
-    The labels may name the object. If not, each recording counts as an object where a label has
-    `ENOUGH` of them; else each touch does, and a line of `left_out` warns of the consequence.
+    The labels may name the object. If not, each recording counts as an object if a label has
+    `ENOUGH` recordings; else each touch counts as one, and a line of `left_out` warns of it.
     """
     recordings: defaultdict[str, set[Path]] = defaultdict(set)
     for used in touches.used:
@@ -122,7 +122,7 @@ def _group_by_object(touches: LabelledTouches) -> dict[str, list[LabelledTouch]]
 def _split_objects(
     category_of: Mapping[str, str], shares: Sequence[float], seed: int
 ) -> dict[str, tuple[str, ...]]:
-    """Split objects by a hash of their names; every category keeps some for training."""
+    """Assign objects to splits by a hash of their names; each category keeps training objects."""
     sides: dict[str, list[str]] = {split: [] for split in SPLITS}
     for category in sorted(set(category_of.values())):
         names = sorted(

@@ -3,7 +3,7 @@
     recordings + intervals -> touches with labels
 
 Module `touches` finds the touches, `labels` reads the labelled intervals. Touches that cannot be
-used are counted and reported, never silently dropped. `labelled_set` makes a sweep set of the rest.
+used are counted and reported, never silently dropped. `labelled_set` makes a set of the others.
 """
 
 import hashlib
@@ -53,7 +53,7 @@ class LabelledTouches:
 
     spec: ArraySpec
     period_ns: int  # sample period of the touches, ns
-    sensor: SensorSpec | None  # description of the array's sensor; None: not described
+    sensor: SensorSpec | None  # description of the array's sensor; None if unknown
     used: list[LabelledTouch] = field(default_factory=list)
     sums: dict[Path, str] = field(default_factory=dict)  # sha256 of each recording's file
     found: Counter[Path] = field(default_factory=Counter)
@@ -86,7 +86,7 @@ def intervals_beside(recordings: Sequence[Path], labels: Path | None = None) -> 
 
 
 def intervals_by_name(recordings: Sequence[Path]) -> Intervals:
-    """Label the whole of each recording by the name of its file.
+    """Return one interval per recording, all of it, labelled by its file name.
 
     Raises:
         ConfigError: a name contains no label.
@@ -140,8 +140,8 @@ def find_labelled(
         report: is called with a recording and the position up to which it has been read, s.
 
     Raises:
-        ConfigError: a file cannot be read or is given twice, or channels that cannot be learnt
-            from.
+        ConfigError: a file cannot be read or is given twice, or nothing can be learnt from its
+            channels.
         RecordingError: a file is damaged.
         SpecMismatch: recordings of different arrays, or of another array than the pattern's.
     """
@@ -208,7 +208,7 @@ def find_labelled(
 def _report_progress(
     source: Iterable[Chunk], begin_ns: int, report: Callable[[float], None]
 ) -> Iterator[Chunk]:
-    """Yield the chunks, and report the position in the stream, s since its beginning."""
+    """Yield the chunks, and report the time since the stream's beginning, s."""
     reported = begin_ns
     for chunk in source:
         if chunk.t_ns[-1] - reported >= TELL_NS:

@@ -6,7 +6,7 @@
 
 Times are seconds since the recording's first sample, file names are relative to the CSV. The column
 ``object`` (which of the mugs it was) may be left out, and ``recording`` if there is only one.
-A program that labels while a robot touches appends line by line; each line is written at once.
+A program that labels during recording appends line by line; each line is written at once.
 """
 
 import csv
@@ -38,9 +38,9 @@ class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         start_s, end_s: Seconds since the recording's first sample; the end is not included.
-        object: The name of the individual object; empty: not labelled.
-        recording: The file name in the table of labels; empty: the only recording.
-        where: File and line, for messages; empty: not read from a file.
+        object: The name of the individual object; empty if not labelled.
+        recording: The file name in the table of labels; empty for the only recording.
+        where: File and line, for messages; empty if not read from a file.
     """
 
     label: str
@@ -57,10 +57,10 @@ class LabelledInterval(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[LabelledInterval]]:
-    """Read the intervals of a file, by recording; also those of recordings not asked for.
+    """Read all intervals of a file of labels; return them by recording.
 
     Args:
-        recordings: the recordings asked for; their paths become keys as they are given here.
+        recordings: recordings whose paths, as given here, are keys, even without intervals.
 
     Raises:
         ConfigError: the file cannot be read, or a line is wrong; names file, line and column, and
@@ -140,7 +140,7 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
 
 
 def check_appendable(path: Path) -> None:
-    """Refuse a file to which `append_label` cannot append because of other columns."""
+    """Raise a ConfigError if a file's columns are not those of `append_label`."""
     with open_regular(path) as file:
         columns = _split(file.readline(LONGEST_LINE))
     if columns != COLUMNS:
@@ -171,7 +171,7 @@ def drop_torn_label(path: Path) -> bool:
 
 
 def lines_of(path: Path) -> list[str]:
-    """Return a file's lines with line breaks, counted as by `read_labels`, even if undecodable."""
+    """Return a file's lines with line breaks, split as by `read_labels`; all bytes are kept."""
     return path.read_bytes().decode(errors="surrogateescape").splitlines(keepends=True)
 
 
@@ -208,13 +208,13 @@ def relabel_line(line: str, old: str, new: str) -> str:
 
 
 def _split(line: bytes) -> tuple[str, ...]:
-    """Split a line, which may be incomplete, into its cells."""
+    """Split a line of CSV, maybe incomplete, into its cells."""
     text = line[:LONGEST_LINE].decode("utf-8-sig", errors="replace")
     return tuple(cell.strip() for cell in next(csv.reader([text]), []))
 
 
 def check_name(name: str, empty: bool = False) -> str:
-    """Return why a text cannot name a label or an object; "" if it can.
+    """Return why a text cannot name a label or object; empty if it can.
 
     Args:
         empty: whether the name may be empty.
@@ -233,7 +233,7 @@ def check_name(name: str, empty: bool = False) -> str:
 
 
 def label_of_file(path: Path) -> str:
-    """Read the label in a recording's name: `mug` of ``mug.mcap``, ``mug-3.mcap``, ``mug_3``.
+    """Return the label in a recording's name: `mug` of ``mug.mcap``, ``mug-3.mcap``, ``mug_3``.
 
     Raises:
         ConfigError: the name contains no label.

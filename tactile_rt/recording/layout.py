@@ -16,7 +16,7 @@ from tactile_rt.drivers.codec import CanFrame
 SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
 DECISIONS, EVENTS = "decisions", "events"  # the daemon's messages
 
-Packet = bytes | Sequence[CanFrame] | None  # None: the line was opened here
+Packet = bytes | Sequence[CanFrame] | None  # None marks where the line was opened
 
 _CDR = b"\x00\x01\x00\x00"  # little-endian, no options
 _FRAME = struct.Struct("<I???xI")  # followed by its data, padded to 4 bytes
@@ -56,13 +56,13 @@ def samples_in(data: bytes) -> int:
 
 
 def last_ns(data: bytes) -> int:
-    """Return the host time of the last sample of a message, ns."""
+    """Return the host time of the last sample in a message, ns."""
     (t_ns,) = struct.unpack_from("<q", data, 12 + 16 * samples_in(data))
     return int(t_ns)
 
 
 def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
-    """Decode the chunk of a message, of an array of shape (element, channel)."""
+    """Decode a message to a chunk of an array of shape (element, channel)."""
     elements, channels = shape
     n = samples_in(data)
     values_at = 4 + 16 + 16 * n + 12
@@ -105,7 +105,7 @@ def encode_packet(packet: Packet, wire: str) -> bytes:
 
 
 def is_samples(data: bytes, shape: tuple[int, int]) -> bool:
-    """Return whether data, by length and beginning, can be samples of shape (element, channel)."""
+    """Return whether length and beginning of data fit samples of shape (element, channel)."""
     if len(data) < 8 or data[:4] != _CDR:
         return False
     n, (elements, channels) = samples_in(data), shape
@@ -113,7 +113,7 @@ def is_samples(data: bytes, shape: tuple[int, int]) -> bool:
 
 
 def decode_packet(data: bytes, wire: str) -> Packet:
-    """Decode the raw packet of a message; raise ValueError if it is damaged."""
+    """Decode a message to a raw packet; raise ValueError if it is damaged."""
     if len(data) < 12 or data[:4] != _CDR:
         raise ValueError(f"{len(data)} bytes are not a packet")
     opened, n = struct.unpack_from("<?3xI", data, 4)

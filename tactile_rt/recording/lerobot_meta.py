@@ -36,11 +36,11 @@ class CameraFilm:
 
     @property
     def key(self) -> str:
-        """Name of the film's feature."""
+        """Name of the film's feature in the dataset."""
         return f"observation.images.{self.name}"
 
     def feature(self, fps: int) -> dict[str, Any]:
-        """Describe the film for ``info.json``."""
+        """Return the film's entry for ``info.json``."""
         height, width = self.size
         return {
             "dtype": "video",
@@ -83,10 +83,10 @@ def film_of(text: str) -> CameraFilm:
 
 
 def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
-    """Write the newest frame at the time of each row, or else the first frame.
+    """Write a video of the newest frame at each row's time, or else the first.
 
     Returns:
-        The statistics of colours, from 0 to 1, of regularly sampled frames, as LeRobot has them.
+        The statistics of colours, from 0 to 1, of regularly sampled frames, by LeRobot's names.
 
     Raises:
         ConfigError: The film cannot be decoded.
@@ -122,7 +122,7 @@ def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str,
 
 
 def _decode_frames(av: Any, film: CameraFilm, rows: int, fps: int) -> Iterator[Any]:
-    """Yield a decoded frame for each row."""
+    """Yield, for each row, the frame to show at its time."""
     with av.open(str(film.path)) as file:
         # Times are read first: writing a frame changes its time.
         decoded = ((frame.time or 0.0, frame) for frame in file.decode(video=0))
@@ -145,7 +145,7 @@ def _import_av() -> Any:
 
 
 def describe_feature(kind: str, *shape: int, names: Any = None) -> dict[str, Any]:
-    """Describe a column of the rows for ``info.json``."""
+    """Return the entry of a column of the rows for ``info.json``."""
     return {"dtype": kind, "shape": list(shape), "names": names}
 
 
@@ -171,7 +171,7 @@ def import_pyarrow() -> tuple[Any, Any]:
 
 @dataclass
 class Episode:
-    """Episode of the dataset: one recording."""
+    """Episode of the dataset, made of one recording, with its rows and statistics."""
 
     index: int
     rows: int
@@ -182,7 +182,7 @@ class Episode:
     statistics: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
 
     def columns(self, frame: NDArray[np.int64], fps: int) -> dict[str, NDArray[Any]]:
-        """Return all columns except the samples for some rows of the episode.
+        """Return the columns, except samples, of some rows of the episode.
 
         Args:
             frame: (row,) Numbers of the rows within the episode.
@@ -197,9 +197,9 @@ class Episode:
 
 
 class Statistics:
-    """Running statistics of a feature, by which policies scale their inputs.
+    """Running statistics of a feature, with which policies scale their inputs.
 
-    Quantiles are of regularly sampled rows, at most `MOST_KEPT`; all else is of all rows.
+    Quantiles are of at most `MOST_KEPT` regularly sampled rows; all else is of all rows.
     """
 
     def __init__(self) -> None:
@@ -215,8 +215,8 @@ class Statistics:
         """Add some rows to the statistics.
 
         Args:
-            values: (n, ...) Numbers.
-            valid: (n, ...) Mask of those that count, with the leading axes of `values`.
+            values: (n, ...) Values of the rows.
+            valid: (n, ...) Mask of the values that count, with the leading axes of `values`.
         """
         good = np.isfinite(values)
         if valid is not None:
@@ -238,7 +238,7 @@ class Statistics:
         """Return the statistics by LeRobot's names; 0 where no value was valid.
 
         Args:
-            repeat: Number of copies along a new first axis; 0: no such axis.
+            repeat: Number of copies along a new first axis; 0 for no such axis.
         """
         n = np.maximum(self._n, 1)
         mean = self._sum / n
@@ -263,7 +263,7 @@ def write_meta(
     tasks: Mapping[str, int],
     films: Sequence[CameraFilm],
 ) -> None:
-    """Write ``meta/``, except for our own files in it."""
+    """Write the folder ``meta/`` of a dataset, except ``meta/tactile_rt``."""
     pa, pq = import_pyarrow()
     info = {
         "codebase_version": CODEBASE,
@@ -334,7 +334,7 @@ def _merge_statistics(episodes: Sequence[Episode]) -> dict[str, Any]:
 
 
 def _make_task_table(pa: Any, tasks: Mapping[str, int]) -> Any:
-    """Make the table of tasks as pandas would, with the tasks as index. LeRobot expects that."""
+    """Make the table of tasks in pandas' form, with tasks as index, for LeRobot."""
     index = "__index_level_0__"
     text = {"pandas_type": "unicode", "numpy_type": "object"}
     about = {

@@ -25,13 +25,13 @@ T = TypeVar("T")
 
 
 class Recording:
-    """Description and contents of a recording, read from its file.
+    """Reader of a recording: its description, samples, packets, decisions and events.
 
         recording = Recording("run.mcap")
         for chunk in recording: ...
 
-    Every iteration opens the file, and reads it from its beginning. If the file is damaged, all
-    that comes before the damage is delivered first.
+    Every iteration opens the file and reads it from its beginning. If the file is damaged, all
+    data before the damage is delivered first.
 
     Raises:
         ConfigError: no such file exists, or the extra is not installed.
@@ -58,7 +58,7 @@ class Recording:
         return self._decode(layout.SAMPLES, lambda raw: layout.decode_samples(raw.data, shape))
 
     def packets(self) -> Iterator[tuple[layout.Packet, int]]:
-        """Yield raw packets (None: the line was opened) with their arrival, host time in ns."""
+        """Yield (packet, host time of arrival in ns); None marks an opened line."""
         wire = self.description.wire
         decode = layout.decode_packet
         return self._decode(layout.WIRE, lambda raw: (decode(raw.data, wire), raw.t_ns))
@@ -79,14 +79,14 @@ class Recording:
         return self._decode(layout.EVENTS, _parse_json)
 
     def skips(self, model: str) -> list[dict[str, Any]]:
-        """Return the stretches that a model skipped because it was behind.
+        """Return the stretches of samples that a model skipped because it was too slow.
 
         The fields are described in docs/reference/messages.md.
         """
         return [e for e in self.events() if e.get("type") == "skip" and e.get("model") == model]
 
     def raw(self, *topics: str) -> Generator[layout.Raw, None, None]:
-        """Yield the messages of some channels, undecoded; without any, only check the file."""
+        """Yield undecoded messages of these channels; without channels, only check the file."""
         from mcap.records import Channel, Message
 
         path = self.path
@@ -167,7 +167,7 @@ def _open_finished(path: Path) -> Iterator[BinaryIO]:
 
 
 def is_finished(path: Path) -> bool:
-    """Return whether a file ends as a finished recording; nothing else is checked."""
+    """Return whether a file has the end of a finished recording; check nothing else."""
     try:
         with open_regular(path) as file:
             return _has_end(file)
@@ -183,6 +183,6 @@ def _has_end(file: BinaryIO) -> bool:
 
 
 def _explain_damage(path: Path) -> AbstractContextManager[None]:
-    """Turn any error of the MCAP library on damage into one that names the file."""
+    """Return a context that turns errors into a RecordingError that names the file."""
     hint = "); `tactile-rt recover` keeps what is whole"
     return explain_errors(RecordingError, f"{path} is damaged (", hint)

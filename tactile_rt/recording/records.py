@@ -62,7 +62,7 @@ def read_whole_records(file: BinaryIO) -> "Iterator[Record]":
 
 
 class _LimitExceeded(ValueError):
-    """The file exceeds a limit of recordings; unlike damage, nothing is salvaged from it."""
+    """Error: the file exceeds a limit of recordings, so nothing is salvaged from it."""
 
 
 class _Reader:
@@ -95,9 +95,9 @@ class _Reader:
     def whole_records(self) -> "Iterator[Record]":
         """Yield the records at the beginning of the file, then those of every intact chunk.
 
-        After a power cut any of the pages that were not synced may be left, the others are zeros.
-        So a record's length does not lead to the next record: chunks are searched for by their
-        mark, and confirmed by their checksums.
+        After a power cut, unsynced pages may be on the medium or be zeros. So a record's length
+        does not lead to the next record: chunks are searched for by their mark, and confirmed by
+        their checksums.
         """
         try:
             self._check_magic()
@@ -109,12 +109,12 @@ class _Reader:
             pass
         at = 0
         while (found := self._find(MARK, at)) >= 0:
-            at, data = self._chunk_around(found)
+            at, data = self._read_chunk_at(found)
             if data is not None:
                 yield from self._split_chunk(data)
 
-    def _chunk_around(self, mark: int) -> tuple[int, bytes | None]:
-        """Return the position to search next, and the intact chunk's data at this mark."""
+    def _read_chunk_at(self, mark: int) -> tuple[int, bytes | None]:
+        """Return (where to search next, data of the chunk with this mark, None if damaged)."""
         begin = mark - MARK_AT
         head = self._peek(begin, MARK_AT + len(MARK) + 8) if begin >= 0 else b""
         if len(head) < MARK_AT + len(MARK) + 8:
@@ -144,7 +144,7 @@ class _Reader:
         return self._at, data
 
     def _find(self, mark: bytes, at: int) -> int:
-        """Return the next position of these bytes from `at` on; -1: none."""
+        """Return the next position of these bytes from `at` on; -1 if not found."""
         while at < self._size:
             if (found := self._peek(at, PIECE).find(mark)) >= 0:
                 return at + found
@@ -152,7 +152,7 @@ class _Reader:
         return -1
 
     def _peek(self, at: int, size: int) -> bytes:
-        """Return up to `size` bytes at a position; none where the medium cannot be read."""
+        """Return up to `size` bytes at a position; empty if the medium cannot be read."""
         try:
             self._file.seek(at)
             return self._file.read(size)
@@ -164,7 +164,7 @@ class _Reader:
             raise ValueError("it is no MCAP file")
 
     def _next_frame(self) -> tuple[int, int] | None:
-        """Return opcode and length of the next record; None at the end of the file."""
+        """Read opcode and length of the next record; return None at the file's end."""
         if self._at == self._size:
             return None
         self._crc_before = self._crc
@@ -184,7 +184,7 @@ class _Reader:
         return data
 
     def _read_single(self, opcode: int, length: int) -> "Iterator[Record]":
-        """Yield a record outside chunks if recordings use its kind; skip it otherwise."""
+        """Yield the next record, outside chunks, if recordings use its kind; else skip it."""
         if opcode == MESSAGE and length <= MOST_UNPACKED:
             yield self._parse_message(self._read(length))
             return
@@ -266,7 +266,7 @@ class _Reader:
 
 
 def _decompress(compression: str, packed: memoryview, size: int) -> Any:
-    """Decompress data to at most `size` + 1 bytes, whatever size the data itself declares."""
+    """Decompress data to at most `size` + 1 bytes, regardless of its declared size."""
     if not compression:
         return bytes(packed)
     if compression == "zstd":

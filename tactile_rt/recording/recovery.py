@@ -24,7 +24,7 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
     """Copy all intact parts of a recording into a new one; keep the old one.
 
     Args:
-        path: of a recording that was cut short (a killed process, a full disk) or damaged.
+        path: recording that was cut short (a killed process, a full disk) or damaged.
         output: the file to write; None: ``NAME.recovered.mcap`` in the same folder.
 
     Returns:

@@ -56,7 +56,7 @@ class ReplayOptions:
 
 
 def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
-    """Prepare to open a recording, or one object of a sweep set, as a stream.
+    """Prepare a recording, or one object of a sweep set, for opening as a source.
 
     Raises:
         ConfigError: no such file, a wrong option, or the extra is not installed.
@@ -73,7 +73,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         spec = replace(manifest.spec, rate_hz=NS_PER_S / manifest.period_ns)
 
         def sweep(_: SourceStats) -> Timed:
-            return _sweep_chunks(path, manifest, sweeps)
+            return _read_sweeps(path, manifest, sweeps)
 
         return Prepared(spec, partial(ReplaySource, spec, sweep, sweeps.speed, loop=sweeps.loop))
     fields = dict(fields)
@@ -109,7 +109,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         return _Decoder(str(path), new_codec(), recording.packets(), about.clock)
 
     def open_decoded() -> Source:
-        first = [decode()]  # it knows the array; each further pass is decoded anew
+        first = [decode()]  # it has the array's spec; each further pass is decoded anew
         return ReplaySource(
             first[0].spec, lambda stats: (first.pop() if first else decode()).chunks(stats),
             options.speed, loop=options.loop,
@@ -123,7 +123,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
 
 
 def _check_file(path: Path) -> None:
-    """Refuse a path that is not a file in the form of MCAP or npz."""
+    """Raise an error unless a path is a file in MCAP or npz form."""
     if not os.path.isfile(path):
         raise ConfigError(f"no file {path}")
     try:
@@ -150,8 +150,8 @@ class ReplaySource(Source):
     nothing.
 
     Args:
-        timed: makes the chunks and their due times, ns; it counts lost samples in its argument.
-        speed: multiple of the recorded pace; 0: each chunk at once.
+        timed: yields (due time in ns, chunk); it counts lost samples in its argument.
+        speed: multiple of the recorded pace; 0 to deliver each chunk at once.
         loop: whether to begin again at the end, with numbers and times that continue.
     """
 
@@ -182,7 +182,7 @@ class ReplaySource(Source):
                     self.close()
                     break
             due, chunk = self._next
-            wait = self._wait_s(due)
+            wait = self._find_wait_s(due)
             if wait <= 0:
                 self._next = None
                 self.stats.delivered += len(chunk)
@@ -216,7 +216,7 @@ class ReplaySource(Source):
             if shift is None:
                 return  # the stream is empty
 
-    def _wait_s(self, due: int) -> float:
+    def _find_wait_s(self, due: int) -> float:
         if not self._speed:
             return 0.0
         now = time.monotonic_ns()
@@ -238,7 +238,7 @@ def _read_chunks(recording: Recording, stats: SourceStats) -> Timed:
 
 
 class _Decoder:
-    """Recorded packets, decoded by a codec and stamped as `DeviceSource` does it live.
+    """Decoder of recorded packets; it time-stamps samples as `DeviceSource` does live.
 
     Raises:
         RecordingError: the codec finds no description of the array in the packets.
@@ -263,7 +263,7 @@ class _Decoder:
         self.spec = codec.spec
 
     def chunks(self, stats: SourceStats) -> Timed:
-        """Yield (arrival of the packet that completes a chunk in ns, chunk)."""
+        """Yield (arrival in ns of the packet that completes the chunk, chunk)."""
         codec = self._codec
         stamper = Stamper(codec, self.spec, stats, steady=self._clock != "log")
         if self._clock == "device" and codec.tick_ns is not None:
@@ -283,7 +283,7 @@ class _Decoder:
     def _decode(self, packet: Packet, t_ns: int) -> list[tuple[Samples | None, int]]:
         if packet is None:
             self._codec.forget()
-            self._codec.commands(Command.START)  # some codecs remember what they asked for
+            self._codec.commands(Command.START)  # some codecs store what they have requested
             return [(None, t_ns)]
         samples = self._codec.feed(packet, t_ns)
         return [] if samples is None else [(samples, t_ns)]
@@ -293,10 +293,10 @@ class _Decoder:
 class SweepOptions:
     """Options of ``replay:`` of a sweep set's object."""
 
-    speed: float = 1.0  # pace as a multiple of real time; 0: as fast as it is read
+    speed: float = 1.0  # pace as a multiple of real time; 0 for as fast as it is read
     # whether the sweeps begin again at their end; sample numbers and times continue
     loop: bool = False
-    # number of the only sweep to stream, from 0; None: all, one after another
+    # number of the only sweep to stream, from 0; None to stream all, one after another
     sweep: int | None = None
     # rest before each sweep, s, in addition to the stored lead, so that the contact ends and a new
     # baseline is taken before the next sweep
@@ -307,8 +307,8 @@ class SweepOptions:
             raise ConfigError(f"rest_s must be 0 to 3600 s, not {self.rest_s:g}")
 
 
-def _sweep_chunks(path: Path, manifest: SweepManifest, options: SweepOptions) -> Timed:
-    """Check the sweeps of an object, and cut them into chunks."""
+def _read_sweeps(path: Path, manifest: SweepManifest, options: SweepOptions) -> Timed:
+    """Read and check the sweeps of an object; yield them in chunks."""
     values, _ = read_object(path.parent, path.stem)
     if values.ndim != 4 or values.shape[2:] != manifest.spec.shape or not values.shape[1]:
         raise RecordingError(

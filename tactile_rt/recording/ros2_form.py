@@ -24,7 +24,7 @@ TEXTS = (layout.HEALTH, layout.DECISIONS, layout.EVENTS)
 
 
 def name_channel(topic: str) -> str:
-    """Return the channel of a topic, such as ``samples``; any other topic unchanged."""
+    """Return the channel in a topic's name, such as ``samples``; else the topic itself."""
     parts = topic.split("/")
     if len(parts) == 4 and parts[:2] == ["", PREFIX]:
         return parts[3]
@@ -32,7 +32,7 @@ def name_channel(topic: str) -> str:
 
 
 def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes:
-    """Convert a message of `layout` to its form in the file."""
+    """Convert a message from the form of `layout` to that in the file."""
     if name == layout.SAMPLES:
         return messages.add_header(data, layout.last_ns(data) + utc_offset_ns, frame)
     if name == layout.DECISIONS:
@@ -41,7 +41,7 @@ def put_in_form(name: str, data: bytes, utc_offset_ns: int, frame: str) -> bytes
 
 
 def plain(name: str, data: bytes) -> bytes:
-    """Convert a message back from its form in the file: the inverse of `put_in_form`."""
+    """Convert a message from its form in the file to that of `layout`."""
     if name == layout.SAMPLES:
         return messages.strip_header(data)
     if name in TEXTS:

@@ -24,12 +24,12 @@ SUFFIX = ".mcap"
 
 @dataclass(frozen=True)
 class Rotation:
-    """Files of one recording, each named by the UTC time at which it was begun."""
+    """Series of files of one recording, each named by the UTC time of its beginning."""
 
     folder: Path
     stem: str
-    mb: float = 0.0  # size beyond which the next file begins, MB; 0: no limit
-    seconds: float = 0.0  # time after which the next file begins, s; 0: never
+    mb: float = 0.0  # size beyond which the next file begins, MB; 0 for no limit
+    seconds: float = 0.0  # time after which the next file begins, s; 0 for no limit
 
     def begin(self, source: Source, about: Description, **further: Any) -> RecordingWriter:
         """Begin the next file; never overwrite an existing one.
@@ -53,7 +53,7 @@ class Rotation:
         raise OSError(f"{self.folder}: a thousand files of this second")
 
     def is_due(self, writer: RecordingWriter) -> bool:
-        """Return whether the next file is due, by age and last flushed size of this."""
+        """Return whether the next file is due, by the present file's age and flushed size."""
         age_ns = time.monotonic_ns() - writer.begun_ns
         return bool(
             (self.mb and writer.stats.bytes > self.mb * MB)

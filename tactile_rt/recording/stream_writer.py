@@ -35,23 +35,23 @@ Entry = tuple[str, Any, int, int]  # topic, chunk or packet, host time in ns, by
 class StreamWriter:
     """Recorder of a source. Make it before the first read, and `push` every chunk that is read.
 
-    A separate thread writes at least every half second: after a kill of the process, `recover`
-    restores all but the last moment. Another thread syncs the file to the medium every second, for
-    a power cut. The queue for a slow disk is bounded: when it is full, the oldest data are dropped
-    and counted. Raw packets and health of a device are recorded automatically.
+    A separate thread writes at least every half second, so that `recover` restores all earlier
+    data after a kill. Another thread syncs the file to the medium every second, for a power cut.
+    The queue for a slow disk is bounded: when it is full, the oldest data are dropped and counted.
+    Raw packets and health of a device are recorded automatically.
 
     Args:
-        path: of the file, usually ``.mcap``.
+        path: path of the file, usually ``.mcap``.
         source: the recorded source; the caller closes it.
-        url: of the source, for the recording's description.
+        url: URL of the source, for the recording's description.
         session: further notes: who, where, why.
         force: whether to replace an existing file.
         flush_s: time between two writes to the file, s.
-        sync_s: time between two syncs to the medium, s; 0: only at the end.
-        queue_bytes: largest size of the data that wait for the disk.
-        rotate_mb: size after which a new file begins, MB; 0: never. The names of rotated files have
-            the time of their beginning: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
-        rotate_s: time after which a new file begins, s; 0: never.
+        sync_s: time between two syncs to the medium, s; 0 to sync only at the end.
+        queue_bytes: largest size of the data that wait for the disk, bytes.
+        rotate_mb: size after which a new file begins, MB; 0 for no limit. Rotated files have
+            the time of their beginning in the name: ``run-20261121T170512Z.mcap``.
+        rotate_s: time after which a new file begins, s; 0 for no limit.
 
     Attributes:
         path: The path of the file that is being written, or was written last.
@@ -103,7 +103,7 @@ class StreamWriter:
 
     @property
     def stats(self) -> WriterStats:
-        """Counts of what was recorded and dropped in all files; for any thread."""
+        """Counts of samples, packets and bytes recorded or dropped in all files; thread-safe."""
         (past, writer), dropped = self._now, self._queue.dropped
         done = writer.stats
         return WriterStats(
@@ -127,7 +127,7 @@ class StreamWriter:
         self._queue.put((SAMPLES, chunk, time.monotonic_ns() if own else int(chunk.t_ns[-1]), size))
 
     def flush(self) -> None:
-        """Wait until the operating system holds all pushed chunks, which then survive a kill.
+        """Wait until the operating system holds all pushed chunks, so they survive a kill.
 
         Raises:
             RecordingError: the file cannot be written any more.
@@ -258,7 +258,7 @@ class StreamWriter:
         return self._sync_s > 0 and time.monotonic() >= self._sync_at
 
     def _update_dropped(self) -> RecordingWriter:
-        """Return the open file, with the counts of what was dropped since it was begun."""
+        """Update the open file's counts of dropped data; return its writer."""
         (past, writer), dropped = self._now, self._queue.dropped
         writer.stats.dropped_samples = dropped[SAMPLES] - past.dropped_samples
         writer.stats.dropped_packets = dropped[WIRE] - past.dropped_packets
@@ -277,7 +277,7 @@ def _measure(entry: Entry) -> tuple[str, int, int]:
 
 @contextmanager
 def _explain_errors(path: Path) -> Iterator[None]:
-    """Turn an error on opening a file into a `ConfigError` of one line."""
+    """Turn an error on opening a file into a `ConfigError` with one line of text."""
     try:
         yield
     except FileExistsError:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class Extent(NamedTuple):
-    """Amount of a recording up to some moment."""
+    """Numbers of samples and packets in a recording up to some moment."""
 
     samples: int = 0
     packets: int = 0
@@ -19,7 +19,7 @@ class Extent(NamedTuple):
 
 
 class Syncer:
-    """Thread that runs sync jobs one after another, in the order of `add`."""
+    """Thread that runs queued sync jobs one after another."""
 
     def __init__(self) -> None:
         self._jobs: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
@@ -27,7 +27,7 @@ class Syncer:
         self._thread.start()
 
     def add(self, job: Callable[[], object]) -> None:
-        """Queue a job to run in the thread after all earlier ones. It must not raise."""
+        """Queue a job to run in the thread after all earlier jobs. It must not raise."""
         self._jobs.put(job)
 
     def close(self) -> None:

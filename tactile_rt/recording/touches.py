@@ -2,8 +2,8 @@
 
     chunks -> Resampler -> ContactDetector -> RecordedTouch: rest, then a window from the onset on
 
-Goal: a network that learns from a touch gets exactly the values that a running `Classifier` would
-have given it: the same resampled samples, the same onset, the same baseline.
+Goal: a network that learns from a touch gets exactly the values that it gets in a running
+`Classifier`: the same resampled samples, the same onset, the same baseline.
 
 Plan: the stream passes the classifier's own resampler and contact detector. An onset begins a
 touch, as long as an episode; no other touch begins meanwhile. The touch includes the rest before
@@ -41,7 +41,7 @@ class RecordedTouch:
     # (sample, element, channel) float32: `REST` samples of rest, then the window, SI; an element
     # that a classifier treats as untouched has its baseline throughout
     values: NDArray[np.float32]
-    flaw: str = ""  # reason why nothing can be learnt from the touch; empty: it is usable
+    flaw: str = ""  # reason why nothing can be learnt from the touch; empty if usable
 
 
 def find_touches(
@@ -97,7 +97,7 @@ class _Cutter:
                     self._touch = None
 
     def cut_short(self, why: str) -> Iterator[RecordedTouch]:
-        """Yield the touch in progress, if any, as a flawed touch whose window is incomplete."""
+        """End the touch in progress, if any; yield it as unusable for the reason `why`."""
         if self._touch is not None:
             nothing = np.empty((0, *self._touch.offset.shape), np.float32)
             yield RecordedTouch(self._touch.onset_ns, self._touch.onset_ns, nothing, why)

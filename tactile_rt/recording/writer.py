@@ -51,7 +51,7 @@ PART = ".mcap.part"  # ending of the name of a file without a complete descripti
 
 
 class McapFile:
-    """MCAP file with the channels of a recording; `RecordingWriter` adds name and health.
+    """Writer of an MCAP file with a recording's channels; `RecordingWriter` adds name and health.
 
     Args:
         file: the file to write; the caller closes it.
@@ -86,15 +86,15 @@ class McapFile:
         self.counts = dict.fromkeys(self._channels, 0)
 
     def add(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message encoded by `layout`, of this host time, ns."""
+        """Add a message that `layout` encoded, with its host time, ns."""
         spec, offset_ns = self.about.spec, self.about.utc_offset_ns
         if not self.counts[ARRAY]:
             self.put(ARRAY, messages.array_message(spec, self._array, t_ns + offset_ns), t_ns)
         self.put(name, put_in_form(name, data, offset_ns, spec.frame), t_ns)
 
     def put(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message that is encoded as in the file. Messages are numbered, so that a loss is
-        noticed."""
+        """Add a message that is already in its form in the file. Messages are numbered, so that
+        losses are noticed."""
         utc = max(0, t_ns + self.about.utc_offset_ns)
         count = self.counts[name]
         self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)
@@ -105,12 +105,12 @@ class McapFile:
         self._writer.add_metadata(name, seal(fields))
 
     def flush(self) -> int:
-        """Write buffered messages to the operating system; return the size of the file."""
+        """Write buffered messages to the operating system; return the size of the file, bytes."""
         self._writer.flush()
         return self._file.tell()
 
     def finish(self) -> int:
-        """Write the index and end of the file; return its size."""
+        """Write the index and end of the file; return its size, bytes."""
         self._writer.finish()
         self._file.flush()
         return self._file.tell()
@@ -118,7 +118,7 @@ class McapFile:
 
 @dataclass
 class WriterStats:
-    """Counts of what was recorded and dropped."""
+    """Counts of recorded and dropped samples, packets and bytes."""
 
     samples: int = 0
     packets: int = 0
@@ -128,14 +128,14 @@ class WriterStats:
 
 
 class RecordingWriter:
-    """Recording of a source, written by the calling thread.
+    """Writer of one file of a recording, in the calling thread.
 
     Args:
         source: the recorded source, for its health and losses; it is not read here.
         prelude: packets in which a device described itself, and their arrivals, ns, so that every
             file can be decoded by itself.
-        dropped: samples and packets that could not be recorded before.
-        syncer: syncs the file in its thread; None: the calling thread syncs.
+        dropped: numbers of samples and packets that were dropped before this file.
+        syncer: syncs the file in its thread; if None, the calling thread syncs.
 
     Raises:
         FileExistsError: the file exists already.
@@ -160,7 +160,7 @@ class RecordingWriter:
         self._written_state: tuple[Any, ...] = ()  # health and losses that were last written
         self.flushed = Extent()  # held by the operating system, so it survives a kill
         self._synced, self._newest_ns = Extent(), 0
-        self.unsynced_ns = 0  # host time since which data wait for a sync; 0: none wait
+        self.unsynced_ns = 0  # host time since which data wait for a sync; 0 if none wait
         self.failed: OSError | None = None  # error of a sync
         self.done = False  # whether the file is closed, and its last sync has ended
         self._syncer, self._waiting, self._name_synced = syncer, False, False
@@ -196,11 +196,11 @@ class RecordingWriter:
 
     @property
     def synced(self) -> Extent:
-        """Extent on the medium, which survives a power cut; for any thread."""
+        """Extent that is on the medium and survives a power cut; thread-safe."""
         return min(self._synced, self.flushed)
 
     def add(self, topic: str, data: bytes, t_ns: int) -> None:
-        """Add an encoded message of this host time, ns."""
+        """Add an encoded message with its host time, ns."""
         self._file.add(topic, data, t_ns)
         if topic == SAMPLES:
             self.stats.samples += samples_in(data)
@@ -209,7 +209,7 @@ class RecordingWriter:
             self.stats.packets += 1
 
     def tell(self, always: bool = False, closed: bool = False) -> None:
-        """Add the state of source and recorder if it has changed, or `always`."""
+        """Record the state of source and recorder if it has changed, or if `always`."""
         health, mine = self._device.health if self._device is not None else None, self.stats
         state = (_select_state(health), mine.dropped_samples, mine.dropped_packets)
         if state == self._written_state and not always:
@@ -229,7 +229,7 @@ class RecordingWriter:
         self._file.add(HEALTH, msgspec.json.encode(fields), now)
 
     def flush(self) -> int:
-        """Write all that was added to the operating system; return the size of the file."""
+        """Write all added messages to the operating system; return the size of the file, bytes."""
         self.tell()
         self.stats.bytes = self._file.flush()
         self._note_flushed()
@@ -243,7 +243,7 @@ class RecordingWriter:
             self._sync_soon()
 
     def disown(self, since: Extent) -> tuple[int, int]:
-        """Subtract from the counts all that was added after `since`, as writing failed. Return the
+        """Subtract from the counts all data added after `since`, since writing failed. Return the
         subtracted numbers of samples and packets."""
         stats = self.stats
         samples, packets = stats.samples - since.samples, stats.packets - since.packets
@@ -251,7 +251,7 @@ class RecordingWriter:
         return samples, packets
 
     def whereabouts(self) -> Literal["there", "moved", "deleted", "emptied"]:
-        """Check whether others have moved, deleted or emptied the file.
+        """Return ``there``, unless another program has moved, deleted or emptied the file.
 
         ``moved``: no file or another one has its name; ``emptied``: it is shorter than what was
         written, as after log rotation.
@@ -272,7 +272,7 @@ class RecordingWriter:
         return "there" if os.path.samestat(mine, named) else "moved"
 
     def close(self, finish: bool = True) -> None:
-        """Write the index and close the file, also if that fails: it can be recovered.
+        """Write the index and close the file, even if writing fails: it can be recovered.
 
         Args:
             finish: whether to write the index; False if writing has failed before.
@@ -336,7 +336,7 @@ class RecordingWriter:
 
 
 def _select_state(health: Health | None) -> tuple[Any, ...]:
-    """Select those parts of a device's health whose change is recorded at once."""
+    """Return the parts of a device's health whose changes are recorded at once."""
     if health is None:
         return ()
     return (
@@ -346,7 +346,7 @@ def _select_state(health: Health | None) -> tuple[Any, ...]:
 
 
 def check_not_recorded(path: Path) -> None:
-    """Refuse to replace a file that a `RecordingWriter` of any process has open.
+    """Raise a ConfigError if a `RecordingWriter` of any process has the file open.
 
     The writer holds a lock on the file itself, which ends with the writer in any case, and follows
     the file when it is moved.
@@ -373,14 +373,14 @@ def check_not_recorded(path: Path) -> None:
 
 
 def _hide_name(path: Path, force: bool) -> Path:
-    """Return the hidden name that a file has until its description is complete."""
+    """Return the hidden name for a file until its description is complete."""
     if not force and os.path.lexists(path):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     return path.with_name(f".{path.stem[:50]}.{secrets.token_hex(4)}{PART}")
 
 
 class _CountingFile(io.FileIO):
-    """New file that counts the bytes written to it, always at its end."""
+    """File, open for appending, that counts the bytes written to it."""
 
     written = 0
 
@@ -398,12 +398,12 @@ def _create(path: Path, special: bool) -> io.BufferedWriter:
 
 
 def _reveal(hidden: Path, path: Path, force: bool) -> None:
-    """Give the hidden file its name; replace an existing file only if forced."""
+    """Rename the hidden file to its final name; replace an existing file only if `force`."""
     if force:
         hidden.replace(path)
         return
     try:
-        path.hardlink_to(hidden)  # unlike renaming, fails if such a file exists by now
+        path.hardlink_to(hidden)  # unlike renaming, fails if such a file exists by then
     except FileExistsError:
         raise
     except OSError:  # a file system without links, as on a memory card

@@ -47,7 +47,7 @@ class Aft200Options:
 
 
 class Aft200(CodecOfParts):
-    """Codec of a frame of forces, then one of torques, three u16 big-endian each.
+    """Codec of the AFT200: a frame of forces, then one of torques, in big-endian u16.
 
     A sample without its torques, or without its forces, is invalid.
 

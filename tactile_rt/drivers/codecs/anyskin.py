@@ -1,7 +1,7 @@
 """AnySkin and ReSkin: magnetometers under a magnetised elastomer.
 
-A frame (``frames/anyskin.toml``) has no beginning, counter or check, and its line end also occurs
-inside the floats: the place of the frames is inferred from several at once (`endings`).
+A frame (``frames/anyskin.toml``) has no sync, counter or checksum, and its line end also occurs
+inside the floats, so the frames' place is inferred from several frames at once (`endings`).
 """
 
 import struct
@@ -46,7 +46,7 @@ class AnySkinOptions:
 
 
 class AnySkin(DescribedFrame):
-    """n MLX90393 magnetometers of an AnySkin or ReSkin board, or of eFlesh on one."""
+    """Codec of the n MLX90393 magnetometers of an AnySkin or ReSkin board, also under eFlesh."""
 
     Options = AnySkinOptions
     cannot_detect = (

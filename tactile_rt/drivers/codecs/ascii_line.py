@@ -2,8 +2,8 @@
 
 Numbers stand at their places in a line, between spaces, tabs, commas, semicolons and brackets; or
 after their names, in one line, in several, or in JSON. Lines end with a carriage return, a line
-feed or both. The first line after joining is not used, since it may lack its beginning (a file is
-read as if a line end came before it); banners and headers are recognised by their words.
+feed or both. The first line after connecting is not used, since its beginning may be cut off (a
+file is read as if a line end came first); banners and headers are recognised by their words.
 """
 
 import re
@@ -74,12 +74,12 @@ def _has_digit(word: str) -> bool:
 
 
 class AsciiLine(SerialCodec):
-    """Codec of printed lines: capacitive skins, lab whiskers, sketches for a serial plotter.
+    """Codec of boards that print numbers: capacitive skins, lab whiskers, Arduino sketches.
 
     Attributes:
         line_end: Line end to assume before the first line of a file.
         claims_rate: Whether the user has given the board's rate.
-        unfinished: Number of bytes received of an incomplete sample.
+        unfinished: Number of bytes received so far of an incomplete sample.
         passed: Number of lines of words between samples.
     """
 
@@ -241,7 +241,7 @@ class AsciiLine(SerialCodec):
             self._explain_line(text)
 
     def _add_row(self, row: list[float], t_ns: int) -> None:
-        """Add a row if its count is an integer and its time in range."""
+        """Add a row of numbers; if count or time is invalid, count it as damaged."""
         count = row[self._count] if self.count_bits is not None else 0.0
         ticks = row[self._time] / self._per_tick if self.tick_ns is not None else 0.0
         counts = abs(count) < EXACT and count.is_integer()
@@ -255,7 +255,7 @@ class AsciiLine(SerialCodec):
             self._count_damaged()
 
     def _parse_row(self, text: str) -> list[float] | None:
-        """Return the numbers of a sample by their places, or None."""
+        """Return the numbers of a line, one per column; None if it is no sample."""
         for words_are_names in (False, True):
             words = fields(text, words_are_names)
             if text.rstrip().endswith((",", ";")) and len(words) == self._width - 1:
@@ -267,7 +267,7 @@ class AsciiLine(SerialCodec):
         return None
 
     def _parse_words(self, words: list[str]) -> list[float] | None:
-        """Return the numbers of a sample's words, NaN for others; None if no sample."""
+        """Convert words to one number per column, NaN if missing; None if no sample."""
         if len(words) != self._width:
             return None
         row, measured, missing = [], 0, 0
@@ -282,8 +282,8 @@ class AsciiLine(SerialCodec):
         return row if 2 * missing <= measured else None
 
     def _collect_named(self, text: str, t_ns: int) -> None:
-        """Collect named numbers. A sample ends when all have come, when a name repeats, or at the
-        name of the first column, with which each sample begins."""
+        """Add a line's named numbers to the open sample. The sample ends when all have come, when a
+        name repeats, or at the name of the first column, with which each sample begins."""
         assert self._names is not None
         while rest := self._names.cut_glued(text):
             self.complaint = f"line {quote_line(text)} breaks off in a number, and another begins"
@@ -321,7 +321,7 @@ class AsciiLine(SerialCodec):
             self._count_damaged()
 
     def _explain_line(self, text: str) -> None:
-        """Count a line that is no sample as text or damage; explain it in `complaint`."""
+        """Count a line that is no sample as text or damaged; set `complaint` accordingly."""
         words = fields(text)
         numbers = [w for w in words if number(w) is not None and w.strip("-")]
         if words and (len(text) > SCRAP or self.complaint != NO_TEXT):

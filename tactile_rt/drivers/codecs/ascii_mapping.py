@@ -17,7 +17,7 @@ object, ``Raw.6=M0.bx`` the seventh number after a name.
 
 A word with a range stands for several columns (see `column_words`): ``T{0..15}.pressure``.
 
-SCALE is the value in UNIT of a one on the wire; samples are in SI. Without UNIT, SCALE is in SI.
+SCALE is the value, in UNIT, of a printed 1; samples are in SI. Without UNIT, SCALE is in SI.
 """
 
 import re
@@ -125,7 +125,7 @@ class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 @dataclass(frozen=True)
 class Column:
-    """One column; its measured value in SI is number x scale + offset.
+    """Column of printed numbers; its value in SI is number x scale + offset.
 
     Attributes:
         kind: Kind of the column: ``value``, ``count``, ``s`` (decimal time), ``iso`` (a date),
@@ -146,7 +146,7 @@ class Column:
 
     @classmethod
     def make_measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
-        """Return a column of measurements, whose numbers count `scale` units.
+        """Return a column of measurements, in which a printed 1 stands for `scale` units.
 
         The unit is one of `UNITS`; empty for the SI unit of a channel with a usual name.
         """
@@ -155,7 +155,7 @@ class Column:
 
 
 def read_mapping(path: str, kind: type[Table]) -> Table:
-    """Read a TOML mapping file as a `kind`; refuse another version."""
+    """Read a TOML mapping file into a `kind`; raise a ConfigError for another version."""
     nodes = read_toml(Path(path))
     mapping: Table = convert(nodes, kind)
     if mapping.version != VERSION:
@@ -200,13 +200,13 @@ def parse_column(word: str, where: str) -> Column:
 
 
 def parse_columns(words: Iterable[str], where: str) -> tuple[Column, ...]:
-    """Return the columns of a line from words; a word with a range gives several."""
+    """Return the columns that words describe; a word with a range describes several."""
     each = [word for text in words for word in expand_columns(text, where)]
     return tuple(parse_column(word, f"{where}[{i}]") for i, word in enumerate(each))
 
 
 def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> ArraySpec:
-    """Return the array of the columns, elements and channels in order of appearance.
+    """Return the array that columns describe; elements and channels in their first order.
 
     Raises:
         ConfigError: a column is missing, doubled or of another unit, or a pose has no element.
@@ -255,7 +255,7 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
 
 
 def order_columns(columns: Sequence[Column], spec: ArraySpec) -> list[int]:
-    """Return the index of the column of each element's channels, element by element."""
+    """Return the column index of each channel of each element, element by element."""
     at = {(c.element, c.channel): k for k, c in enumerate(columns)}
     return [at[e, c] for e in spec.elements for c in spec.channels]
 

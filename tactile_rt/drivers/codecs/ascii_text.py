@@ -48,7 +48,7 @@ def is_text(line: str) -> bool:
 
 
 def number(word: Any) -> float | None:
-    """Return a printed word as a number: NaN if in `MISSING`, None for other words."""
+    """Convert a printed word to a number, NaN for `MISSING`; None for other words."""
     if isinstance(word, int | float):
         return float(word) if abs(word) < 1e300 else NAN
     if not isinstance(word, str):
@@ -82,10 +82,10 @@ def fields(line: str, words_are_names: bool = False) -> list[str]:
 
 
 class Names:
-    """Finder of the numbers in a line of text by the names before them.
+    """Finder of numbers in a line of text, each by the name that precedes it.
 
     Args:
-        names: place of each number, by its name; ``a.b`` for a number in an object of JSON,
+        names: column of each number, by its name; ``a.b`` for a number in an object of JSON,
             ``a.2`` for the third number after a name.
     """
 
@@ -97,7 +97,7 @@ class Names:
         self._glued = re.compile(rf"(?<![\w.])({known}){_BETWEEN}(?>{NUMBER}){then}")
 
     def find(self, line: str) -> dict[int, float]:
-        """Return the numbers of a line by place; NaN if a name precedes no number."""
+        """Return the numbers of a line by column; NaN if a name precedes no number."""
         if line.lstrip()[:1] == "{":
             try:
                 decoded = msgspec.json.decode(line)
@@ -117,7 +117,7 @@ class Names:
         }
 
     def cut_glued(self, line: str) -> str:
-        """Return the text after a sample that breaks off; empty if none does."""
+        """Return the rest of a line after a sample that breaks off; else empty."""
         for found in self._glued.finditer(line):
             one, other = (self._patterns[self._names[name]] for name in found.groups())
             rest = line[found.end() :]
@@ -130,7 +130,7 @@ ABSENT: Final = object()
 
 
 def _get_value(value: Any, path: list[str]) -> Any:
-    """Return the value at a path of keys, which may contain dots, and places."""
+    """Return the value at a path of keys and indices in decoded JSON, or `ABSENT`."""
     if not path:
         return value
     if isinstance(value, list):
@@ -163,17 +163,17 @@ def _compile_name(name: str) -> re.Pattern[str]:
 
 
 def in_seconds(line: str, order: str = "") -> str:
-    """Convert dates and times of day to seconds since 1970 (UTC by default) or midnight.
+    """Replace dates by seconds since 1970 (UTC by default), times of day since midnight.
 
     Args:
-        order: of numbers as in 05/10/2024, ``mdy`` or ``dmy``; empty to infer it from one over 12.
+        order: order of 05/10/2024, ``mdy`` or ``dmy``; empty to infer it from a number over 12.
     """
     if ":" not in line:
         return line
     line = _HALF_DAY.sub(_count_hours, line) if "m" in line or "M" in line else line
     if "/" in line or "-" in line:
         line = _DAY.sub(lambda found: _put_year_first(found, order), line)
-    return _CLOCK.sub(_since_midnight, _DATE.sub(_since_1970, line))
+    return _CLOCK.sub(_convert_clock, _DATE.sub(_convert_date, line))
 
 
 def _count_hours(found: re.Match[str]) -> str:
@@ -188,7 +188,7 @@ def _put_year_first(found: re.Match[str], order: str) -> str:
     return f"{found[4]}-{month:02}-{day:02} " if order else found[0]
 
 
-def _since_1970(found: re.Match[str]) -> str:
+def _convert_date(found: re.Match[str]) -> str:
     *whole, part, zone = found.groups()
     date = whole[:3] if whole[0] else whole[5:2:-1]
     try:
@@ -203,7 +203,7 @@ def _since_1970(found: re.Match[str]) -> str:
     return f"{seconds}.{part or 0}"
 
 
-def _since_midnight(found: re.Match[str]) -> str:
+def _convert_clock(found: re.Match[str]) -> str:
     hours, minutes, seconds, part = found.groups()
     return f"{3600 * int(hours) + 60 * int(minutes) + int(seconds)}.{part or 0}"
 

@@ -5,10 +5,10 @@ then sends frames of 13 bytes without a pause: the strain gauges 0, 2, 4, 1, 3, 
 and the sum of those 12 bytes (low 7 bits) with the status in bit 7. Nothing marks the beginning of
 a frame. A jam of 14 zero bytes makes it a slave again.
 
-The beginning of frames is found by elimination: of the 13 places, only the right one passes the sum
-every time. A wrong one passes with a chance of 1/64 (the sum minus one byte, plus the sum, must be
-that byte: 2 sum = 2 byte modulo 128), independently each time that the sum changes, but always if
-it does not: 17 % of all constant frames have such a place (1 - (63/64)^12).
+The beginning of frames is found by elimination: of the 13 offsets, only the right one passes the
+sum every time. A wrong one passes with a chance of 1/64 (the sum minus one byte, plus the sum, must
+be that byte: 2 sum = 2 byte modulo 128), independently each time that the sum changes, but always
+if it does not: 17 % of all constant frames have such an offset (1 - (63/64)^12).
 
 Sources: ATI, Digital F/T sensor manual (RS-485 streaming); request, answer and registers as in
 public firmware for the sensor.
@@ -61,8 +61,8 @@ class Ati485Options:
 class Ati485(SerialCodec):
     """Codec of a six-axis sensor: forces (N) and moments (N m), or gauge counts.
 
-    Frames are delivered once their place is certain: at once after the answer to START, else some
-    frames later, when one place leads by 3 frames. Until then they wait (64 at most).
+    Frames are delivered once their offset is certain: at once after the answer to START, else some
+    frames later, when one offset leads by 3 frames. Until then up to 64 frames are buffered.
     """
 
     Options = Ati485Options
@@ -90,7 +90,7 @@ class Ati485(SerialCodec):
 
     def forget(self) -> None:
         self._data = bytearray()  # not yet decoded; if locked, it begins with a frame
-        self._was_locked = False  # whether it begins where frames began earlier
+        self._was_locked = False  # whether frames began at its offset before
         self._changes = 0  # frames whose sum differs from the previous one, since locked
         self._last = -1  # the last sum
         self._start_search()
@@ -99,10 +99,10 @@ class Ati485(SerialCodec):
 
     @property
     def lock_confidence(self) -> float:
-        """Certainty about the place of the frames, 0 to 1.
+        """Confidence in the offset at which frames begin, 0 to 1.
 
-        With k places that pass the sums, and n later frames whose sum changed and passed:
-        1 - (1 - 1/k) / 64^n; after the answer to START, k is 1. While no place is chosen: 1/k.
+        With k offsets that pass the checksums, and n later frames whose sum changed and passed:
+        1 - (1 - 1/k) / 64^n; after the answer to START, k is 1. While none is chosen: 1/k.
         """
         if self._locked:
             return 1 - (1 - 1 / self._rivals) / 64.0 ** min(self._changes, 100)
@@ -141,7 +141,7 @@ class Ati485(SerialCodec):
         )
 
     def _take_frames(self) -> NDArray[np.uint8]:
-        """Remove and return the (n, 13) frames before the first whose sum fails."""
+        """Remove and return the frames, (n, 13) bytes, before the first with a wrong checksum."""
         n = len(self._data) // SIZE
         frames = np.frombuffer(bytes(self._data[: n * SIZE]), np.uint8).reshape(n, SIZE)
         sums = frames[:, :-1].sum(axis=1, dtype=np.int64)
@@ -160,11 +160,11 @@ class Ati485(SerialCodec):
     def _start_search(self) -> None:
         self._locked = False
         self._at = 0  # bytes of data searched so far
-        self._runs = [0] * SIZE  # successive frames that pass, by place
+        self._runs = [0] * SIZE  # successive frames with a right checksum, by offset
         self._rivals = 1
 
     def _lock(self) -> bool:
-        """Search for the place of the frames; drop the bytes before; return success."""
+        """Find where frames begin, and drop the bytes before; return whether it was found."""
         data, runs = self._data, self._runs
         while self._at < len(data):
             self._at += 1

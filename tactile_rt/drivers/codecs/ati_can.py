@@ -68,10 +68,10 @@ class AtiCanOptions:
 
 
 class AtiCan(CanCodec):
-    """Codec of six strain gauges in two frames, with a matrix to forces and torques.
+    """Codec of six strain gauges in two frames; a matrix gives forces and torques.
 
-    The matrix, its counts per unit and its units are read from the board at the start; a sample
-    received before is not delivered. Two requests close together may be answered as
+    The matrix, its counts per unit and its units are read from the board at the start; samples
+    received before are dropped. Two requests close together may be answered as
     first, first, second, second frame: they are paired in order of arrival.
 
     Source: ATI 9610-05-1030 (CAN interface), by way of the public drivers ati_netcanoem_ft_driver
@@ -132,13 +132,13 @@ class AtiCan(CanCodec):
             code = identifier - self._base
             if extended or remote or not 0 <= code <= 15 or _is_request(code, data):
                 self.stats.skipped += 1
-            elif not self._take(batch, code, data):
+            elif not self._decode_reply(batch, code, data):
                 self.stats.corrupt += 1
             else:
                 self.stats.intact += 1
         return batch.take((1, 6), t_ns)
 
-    def _take(self, batch: SampleBatch, code: int, data: bytes) -> bool:
+    def _decode_reply(self, batch: SampleBatch, code: int, data: bytes) -> bool:
         """Decode a reply; return whether it is valid."""
         if code == GAUGES_A:
             if len(data) != FRAME_A.size:
@@ -269,5 +269,5 @@ class AtiCan(CanCodec):
 
 
 def _is_request(code: int, data: bytes) -> bool:
-    """Return whether a frame is a request, of another host: no reply is so short."""
+    """Return whether a frame is another host's request; these are shorter than replies."""
     return len(data) == (code == ROW_A) and code in (GAUGES_A, ROW_A, COUNTS, UNITS)

@@ -1,4 +1,4 @@
-"""Codec of any sensor with frames of one length on a serial line, described in a TOML file."""
+"""Codec of any serial sensor with frames of fixed length, described in a TOML file."""
 
 import textwrap
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class BinaryFrameOptions(FrameOptions):
 
 
 class DescribedFrame(SerialCodec):
-    """Codec of frames of one length, optionally with counter, clock, status and checksum.
+    """Codec of frames of fixed length, optionally with counter, clock, status and checksum.
 
     Args:
         rate_hz: rate at which the device sends or is polled, Hz; 0 for that of the description.
@@ -110,7 +110,7 @@ class DescribedFrame(SerialCodec):
 
     @property
     def lock_confidence(self) -> float:
-        """Certainty about the place of frames; 1 if they have a distinct sync or ending."""
+        """Confidence in where frames begin, 0 to 1; 1 with a distinct sync or ending."""
         return self._finder.confidence if isinstance(self._finder, StrideFinder) else 1.0
 
     @property
@@ -233,13 +233,13 @@ class BinaryFrame(DescribedFrame):
 
 
 def shipped_frame(name: str) -> FrameMapping:
-    """Read the description of a device's frame in `FRAMES`."""
+    """Read the shipped description of a device's frame from the folder `FRAMES`."""
     return read_mapping(str(FRAMES / f"{name}.toml"), FrameMapping)
 
 
 @cache
 def frame_codec(name: str) -> type[DescribedFrame]:
-    """Return the codec of a device that needs only its description in `FRAMES`."""
+    """Return a codec class made from the device's description in the folder `FRAMES`."""
 
     class Described(DescribedFrame):
         Options = FrameOptions

@@ -1,7 +1,7 @@
 """Bota Systems SensONE and Rokubi, generation 2, over RS-422 or USB.
 
-``frames/bota.toml`` has its frame and the sources; the float32 after the time is the temperature in
-degrees Celsius. Commands are ASCII without an ending; the device reads 64 bytes of them at once and
+``frames/bota.toml`` describes its frame and sources; the float32 after the time is the temperature
+in degrees Celsius. Commands are ASCII without an ending; the device reads 64 bytes at once and
 answers ``r,0,COMMAND,ERROR``.
 """
 

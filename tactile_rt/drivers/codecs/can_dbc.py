@@ -32,10 +32,10 @@ class CanDbcOptions:
 
 
 class CanDbc(CanCodec):
-    """Codec of samples in one message, several messages, or a multiplexed message.
+    """Codec of samples sent in one CAN message, several messages, or a multiplexed one.
 
-    A sample ends with its last frame, or when a frame of the next sample comes: one that is not
-    after the previous frame, or whose counter differs. Elements with a missing signal are invalid;
+    A sample ends with its last frame, or at the first frame of the next sample: a frame out of
+    order, or one whose counter differs. Elements with a missing signal are invalid;
     a sample without its counter, time or status is not delivered.
     """
 
@@ -162,7 +162,7 @@ class CanDbc(CanCodec):
 
 
 def _read_cell(cell: tuple[Signal, tuple[int, ...]], parts: list[bytes | None]) -> float | None:
-    """Return a signal's number from its first part that came; None if none did."""
+    """Return a signal's raw number from the first part that carries it; None without any."""
     signal, inside = cell
     for index in inside:
         data = parts[index]

@@ -2,7 +2,7 @@
 
 Names reveal most: ``Fx [N]``, ``wrench.force.x``, ``p0_x``, ``timestamp_ms``. A column without a
 name is classified by its numbers: steps of one are a count, rising numbers a time, all others
-measurements. No unit is invented: a number without a stated unit keeps its own (1).
+measurements. Units are never guessed: a number without a stated unit gets the unit 1.
 """
 
 import re
@@ -24,7 +24,7 @@ MOSTLY: Final = 0.8  # least share of alike lines, and of cells with numbers
 PER_SECOND: Final = (1, 1e3, 1e6, 1e9)  # s, ms, us, ns in a second; 2001 to 2065 are 1e9 to 3e9 s
 FASTEST_HZ: Final = 50_000  # highest rate of tactile readings
 DAYS: Final = (25_569, 80_000)  # of a spreadsheet: 1970 to 2119
-SELDOM: Final = 50  # rows at least between wraps or resets of a counter
+SELDOM: Final = 50  # least number of rows between wraps or resets of a counter
 Rows = Sequence[Sequence[float | None]]
 
 _UNITS_OF_TIME: Final = {  # by their names, with the word for the column
@@ -89,7 +89,7 @@ _HAS_NAMES: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
 def guess_columns(
     names: Sequence[str], rows: Rows, dated: Collection[int] = ()
 ) -> tuple[list[str], bool]:
-    """Return a word of `ascii_mapping` for each column, and whether any is a time.
+    """Guess each column's word, see `ascii_mapping`; return (words, whether any is a time).
 
     Args:
         rows: cells of some rows, None for a cell without a number.
@@ -115,14 +115,14 @@ def list_unread_units(names: Sequence[str], words: Sequence[str]) -> list[str]:
     alone = [
         n
         for n, w in zip(names, words, strict=False)
-        if w.endswith(":1") or (w.startswith("time") and w != "time:iso" and not _time_word(n))
+        if w.endswith(":1") or (w.startswith("time") and w != "time:iso" and not _find_time_word(n))
     ]
     units = [unit.strip() for name in alone for unit in _BRACKET.findall(name)]
     return [unit for unit in dict.fromkeys(units) if unit not in ("", "-", "1")]
 
 
 def guess_line_columns(data: bytes) -> list[str] | None:
-    """Guess the columns of a board's lines, by names if numbers have them; or None."""
+    """Guess the columns of a board's printed lines as words; return None if that fails."""
     first, *lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")
     label = _LABELLED.match(first)
     if label and any(line.startswith(label[1]) for line in lines):  # the first line is whole
@@ -136,17 +136,17 @@ def guess_line_columns(data: bytes) -> list[str] | None:
 
 
 def _guess_objects(lines: list[str]) -> list[str] | None:
-    """Guess the columns of lines of JSON, or return None."""
+    """Guess the columns of lines of JSON objects; return None if lines have another form."""
     objects = []
     for line in lines:
         with suppress(msgspec.DecodeError, UnicodeEncodeError):
             objects.append(msgspec.json.decode(line, type=dict[str, Any]))
-    each = [dict(_list_numbers(one, "")) for one in objects]
+    each = [dict(_list_numbers(decoded, "")) for decoded in objects]
     return _guess_named(each) if len(objects) >= MOSTLY * len(lines) else None
 
 
 def _guess_labelled(lines: list[str]) -> list[str] | None:
-    """Guess the columns of numbers after names, in one or several lines, or return None."""
+    """Guess the columns of numbers that follow names, in one or more lines; else None."""
     each: list[dict[str, float]] = []
     used = 0
     for line in lines:
@@ -165,11 +165,11 @@ def _guess_labelled(lines: list[str]) -> list[str] | None:
 
 
 def _guess_named(each: list[dict[str, float]]) -> list[str] | None:
-    often = Counter(name for one in each for name in one)
+    often = Counter(name for row in each for name in row)
     names = [name for name, n in often.items() if n >= MOSTLY * len(each)]
     if not names or len(each) < LEAST:
         return None
-    rows = [[one.get(name) for name in names] for one in each]
+    rows = [[row.get(name) for name in names] for row in each]
     words, _ = guess_columns(names, rows)
     columns = [f"{name}={w}" for name, w in zip(names, words, strict=True) if w != "-"]
     whole = sum(all(cell is not None for cell in row) for row in rows)
@@ -177,7 +177,7 @@ def _guess_named(each: list[dict[str, float]]) -> list[str] | None:
 
 
 def _guess_places(lines: list[str]) -> list[str] | None:
-    """Guess the columns of numbers at their places between separators, or return None."""
+    """Guess the columns of numbers between separators; return None for other lines."""
     cut = [fields(line) for line in lines]
     width, often = Counter(len(c) for c in cut).most_common(1)[0]
     if often < MOSTLY * len(lines):
@@ -214,11 +214,11 @@ def _has_measurement(words: Iterable[str]) -> bool:
 
 def _list_numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
     if isinstance(value, dict):
-        for key, one in value.items():
-            yield from _list_numbers(one, f"{at}.{key}" if at else str(key))
+        for key, item in value.items():
+            yield from _list_numbers(item, f"{at}.{key}" if at else str(key))
     elif isinstance(value, list):
-        for k, one in enumerate(value):
-            yield from _list_numbers(one, f"{at}.{k}")
+        for k, item in enumerate(value):
+            yield from _list_numbers(item, f"{at}.{k}")
     elif isinstance(value, int | float) and not isinstance(value, bool) and at:
         yield at, float(value)
 
@@ -227,7 +227,7 @@ def _list_numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
 
 
 def _read_column(rows: Rows, k: int) -> NDArray[np.float64] | None:
-    """Return a column with NaN for cells without a number; None if these are many."""
+    """Return column k with NaN for cells without a number; None if too many."""
     cells = [row[k] if k < len(row) else None for row in rows]
     filled = sum(c is not None for c in cells)
     if not cells or filled < MOSTLY * len(cells):
@@ -241,7 +241,7 @@ def _strip_units(name: str) -> str:
 
 
 def _is_count(name: str) -> bool:
-    """Return whether a column's name means a count; the N of ``Fx_N`` is a unit."""
+    """Return whether a column's name means a counter; the N of ``Fx_N`` is a unit."""
     return _COUNT.fullmatch(_TAIL_UNIT.sub("", _strip_units(name))) is not None
 
 
@@ -262,7 +262,7 @@ def _place_time(
         rising = (steps >= 0).all() and v[-1] > v[0]
         if k in known:
             if rising or (steps >= 0).mean() > MOSTLY or (steps < 0).all():  # or newest first
-                return k, _time_word(names[k]) or f"time:{_guess_time_unit(names[k], v)}"
+                return k, _find_time_word(names[k]) or f"time:{_guess_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
             # a measurement hardly ever rises as steadily, and none counts from 1970
             since_1970 = any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in PER_SECOND)
@@ -271,14 +271,14 @@ def _place_time(
     return None
 
 
-def _time_word(name: str) -> str:
-    """Return the word for a time by the unit in its name; empty without one."""
+def _find_time_word(name: str) -> str:
+    """Return a time column's word from the unit in its name; empty without a unit."""
     found = _TIME_UNIT.search(name.strip().lower().replace("μ", "µ"))
     return _UNITS_OF_TIME[found[1]] if found else ""
 
 
 def _guess_time_unit(name: str, v: NDArray[np.float64]) -> str:
-    """Guess the unit of a time by its name, magnitude (since 1970) or steps."""
+    """Guess a time column's unit from its name, magnitude (since 1970) or steps."""
     for word, unit in (("millis", "ms"), ("micros", "us")):
         if word in name.lower():
             return unit
@@ -307,7 +307,7 @@ def _place_count(
 
 
 def _name_words(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
-    """Return words ELEMENT.CHANNEL:UNIT from names, for the elements with all channels."""
+    """Return words ELEMENT.CHANNEL:UNIT by column, for the elements that have all channels."""
     parsed = {k: _parse_name(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}
     loads = any(unit for _, _, unit in known.values())
@@ -318,7 +318,7 @@ def _name_words(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]
         alone = all(p[0] == "S" and p[1] in ALONE for p in known.values())
         if alone and len(set(named.values())) == len(named):
             return {k: f"S.{channel}:{parsed[k][2] or '1'}" for k, channel in named.items()}
-    if 2 * len(known) < len(parsed) and not loads:  # the known ones are positions, not loads
+    if 2 * len(known) < len(parsed) and not loads:  # known channels are positions, not loads
         known = {k: (e, "value", u) for k, (e, c, u) in parsed.items() if not c}
     chosen = known or {k: (e, "value", u) for k, (e, _, u) in parsed.items()}
     groups: dict[str, dict[str, int]] = {}

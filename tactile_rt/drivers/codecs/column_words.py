@@ -48,7 +48,7 @@ def expand_columns(text: str, where: str = "columns") -> tuple[str, ...]:
 
 
 def compress_columns(words: Sequence[str]) -> str:
-    """Write words as a list for `expand_columns`, with ranges for words that count up."""
+    """Join words to one text for `expand_columns`; words that count up become ranges."""
     quoted = [_quote(word) for word in words]
     parts: list[str] = []
     at = 0
@@ -65,7 +65,7 @@ def compress_columns(words: Sequence[str]) -> str:
 
 
 def _split(text: str, where: str) -> Iterator[str]:
-    """Split at commas, except in quotes and in parentheses that contain a range."""
+    """Split a text at commas, except in quotes and in parentheses that contain a range."""
     item, quoted, depth = "", False, 0
     for at, c in enumerate(text):
         if c == '"':
@@ -95,7 +95,7 @@ def _quote(word: str) -> str:
 
 
 def _expand(word: str, k: int) -> str:
-    """Return the k-th of the words that a range stands for."""
+    """Replace each range in a word by its k-th number, counted from 0."""
 
     def number(found: re.Match[str]) -> str:
         first, last = int(found[1]), int(found[2])
@@ -106,7 +106,7 @@ def _expand(word: str, k: int) -> str:
 
 
 def _counts_up(first: str, other: str, n: int) -> bool:
-    """Return whether the other word's numbers are n more, or the same."""
+    """Return whether the other word differs only in numbers that are n larger."""
     steps = {
         int(b) - int(a)
         for a, b in zip(_NUMBER.findall(first), _NUMBER.findall(other), strict=False)
@@ -115,7 +115,7 @@ def _counts_up(first: str, other: str, n: int) -> bool:
 
 
 def _write_range(first: str, last: str, n: int) -> str:
-    """Write the first word with a range for each number that differs in the last."""
+    """Return the first word, with ranges for numbers that differ in the last word."""
     if n == 1:
         return first
     ends = iter(_NUMBER.findall(last))

@@ -33,7 +33,7 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Signal:
-    """Place and type of a number in a frame's data.
+    """Position and type of a number in the data of a CAN frame.
 
     Attributes:
         start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
@@ -76,7 +76,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class FramePart:
-    """A frame in every sample: a message with given values of its multiplexers.
+    """Part of a sample: a CAN message, selected by the values of its multiplexers.
 
     Attributes:
         length: Length of the message's data, bytes.
@@ -90,13 +90,13 @@ class FramePart:
     message: Any
 
     def matches(self, data: bytes) -> bool:
-        """Return whether the multiplexers in the data have the values of this part."""
+        """Return whether the multiplexers in a frame's data have the values of this part."""
         return all(signal.read(data) in values for signal, values in self.when)
 
 
 @dataclass(frozen=True)
 class DbcMapping:
-    """Layout of a sample.
+    """Layout of a sample in CAN frames, and the commands of its device.
 
     Attributes:
         parts: The frames of a sample, in the order in which the device sends them.
@@ -278,7 +278,7 @@ class _Reader:
         return self.messages[name]
 
     def _find_signal(self, where: str, name: str) -> tuple[Any, Signal]:
-        """Return cantools' signal and ours for a name ``Message.Signal``."""
+        """Find a signal by its name ``Message.Signal``; return it as cantools' object and ours."""
         owner, dot, signal_name = name.partition(".")
         if not dot:
             owners = [m.name for m in self.messages.values() for s in m.signals if s.name == name]

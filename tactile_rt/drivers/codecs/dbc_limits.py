@@ -24,7 +24,7 @@ _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
 
 def check_dbc(file: str, text: str) -> None:
-    """Raise a ConfigError if sizes exceed those of CAN frames or of any sensor."""
+    """Raise a ConfigError if sizes in a DBC file exceed those of CAN or sensors."""
     messages = signals = 0
     for found in _MESSAGE.finditer(text):
         messages += 1

@@ -1,8 +1,8 @@
 """Finders of frames that have a fixed ending, but no fixed beginning.
 
-`EndFinder` trusts each ending, such as six bytes that no measurement contains. A short ending, such
-as a line end, also occurs inside the numbers: `StrideFinder` infers from several frames at once
-where they end.
+`EndFinder` is for an ending that no measurement contains, such as six special bytes. A short
+ending, such as a line end, also occurs inside the numbers: `StrideFinder` infers from several
+frames at once where they end.
 
 Both take bytes cut anywhere and return the frames that they complete, the number of damaged ones
 before each, and the arrival time of each (ns).
@@ -26,10 +26,10 @@ Raw: TypeAlias = NDArray[np.uint8]
 
 
 class EndFinder:
-    """Finds frames of one length whose ending never occurs inside them.
+    """Finder of frames of fixed length whose ending never occurs inside them.
 
-    The bytes between two endings are a frame if they have the length. If they are longer by whole
-    frames, the endings between were damaged, and the last frame is intact.
+    The bytes between two endings are a frame if they have its length. If they have the length of
+    several frames, the endings between were damaged, and only the last frame is intact.
 
     Args:
         size: length of a frame with its ending, bytes.
@@ -48,7 +48,7 @@ class EndFinder:
         self._joined = False
 
     def find(self, packet: bytes, t_ns: int) -> Found:
-        """Return the frames that received bytes complete."""
+        """Return the frames that these bytes complete, their damage counts and arrivals."""
         self._data += packet
         frames: list[bytes] = []
         damaged: list[int] = []
@@ -69,7 +69,7 @@ class EndFinder:
         return frames, damaged, [t_ns] * len(frames)
 
     def _is_frame(self, segment: int) -> bool:
-        """Return whether this many bytes between two endings end with a frame."""
+        """Return whether a segment of this many bytes ends with an intact frame; count losses."""
         size, body = self._size, self._size - len(self._end)
         length = self._dropped + segment
         joined, self._joined, self._dropped = self._joined, True, 0
@@ -86,9 +86,9 @@ class EndFinder:
 
 
 class StrideFinder:
-    """Finds frames of one length whose ending may occur inside them, too.
+    """Finder of frames of fixed length whose ending may also occur inside them.
 
-    The ending must occur at every frame length, and the values between must be in the device's
+    The ending must recur at every frame length, and the values between must be in the device's
     range.
 
     Args:
@@ -105,7 +105,7 @@ class StrideFinder:
         self._end, self._size = np.frombuffer(end, np.uint8), size
         self._possible, self._stats = possible, stats
         self._data = bytearray()
-        self._rivals: list[int] = []  # other places at which every frame so far had an ending
+        self._rivals: list[int] = []  # other offsets at which every frame so far had an ending
         self._times: list[tuple[int, int]] = []  # (bytes received, arrival) of waiting packets
         self.forget()
 
@@ -114,17 +114,17 @@ class StrideFinder:
         self._data.clear()
         self._rivals.clear()
         self._times.clear()
-        self._locked = self._joined = False  # whether the place is known, and ever was
+        self._locked = self._joined = False  # whether frames' offset is known, and ever was
         self._taken = self._damaged = 0  # bytes consumed so far; damaged frames
         self._gap = 0  # bytes dropped since the last frame
 
     @property
     def confidence(self) -> float:
-        """Certainty about the place of the frames: 0 while unknown, else 1 / (possible places)."""
+        """Confidence in where frames begin: 0 while unknown, else 1 / (possible offsets)."""
         return 1.0 / (1 + len(self._rivals)) if self._locked else 0.0
 
     def find(self, packet: bytes, t_ns: int) -> Found:
-        """Return the frames that received bytes complete."""
+        """Return the frames that these bytes complete, their damage counts and arrivals."""
         self._data += packet
         self._times.append((self._taken + len(self._data), t_ns))
         frames: list[bytes] = []
@@ -140,14 +140,14 @@ class StrideFinder:
                 self._damaged = 0
             if not self._skip_one():
                 break
-        # frames waited while the place was unknown: each arrived with its last byte
+        # frames waited while their offset was unknown: each arrived with its last byte
         times = self._times
         arrived = [times[bisect_left(times, (end,))][1] for end in ends]
         del times[: bisect_left(times, (self._taken + 1,))]
         return frames, damaged, arrived
 
     def _lock(self) -> bool:
-        """Find where frames begin and drop the bytes before; return whether it is known."""
+        """Find where frames begin, and drop the bytes before; return whether it was found."""
         size, tail = self._size, len(self._end)
         while len(self._data) >= (FIRST + 1) * size - 1:
             data = np.frombuffer(bytes(self._data), np.uint8)
@@ -159,7 +159,7 @@ class StrideFinder:
             while len(fitting) > 1 and k < MOST:
                 k += 1
                 if len(data) < (k + 1) * size - 1:
-                    return False  # the next frame may exclude some of the places
+                    return False  # the next frame may exclude some of the offsets
                 fitting = [s for s in fitting if self._can_begin(data, s, k)] or fitting[:1]
             if not fitting:
                 self._drop(size)
@@ -181,13 +181,13 @@ class StrideFinder:
         return bool(self._have_ending(whole, 0).all() and self._possible(whole).all())
 
     def _have_ending(self, whole: Raw, at: int) -> NDArray[np.bool_]:
-        """Return (n,) whether each frame has an ending before byte `at`; 0: at its end."""
+        """Return whether each frame, (n,), has the ending before byte `at`; 0 means its end."""
         places = np.arange(at - len(self._end), at)
         found: NDArray[np.bool_] = (whole[:, places] == self._end).all(axis=1)
         return found
 
     def _take_frames(self) -> list[bytes]:
-        """Remove and return the whole frames before the first without its ending."""
+        """Remove and return the whole frames before the first that lacks its ending."""
         size = self._size
         n = len(self._data) // size
         whole = np.frombuffer(bytes(self._data[: n * size]), np.uint8).reshape(n, size)
@@ -202,11 +202,11 @@ class StrideFinder:
         return frames
 
     def _skip_one(self) -> bool:
-        """Skip a frame without its ending, or search again; return False to wait for bytes."""
+        """Skip a frame that lacks its ending, or restart the search; return False to wait."""
         size = self._size
         if len(self._data) < 2 * size:
             return False
-        # a single damaged ending does not make the place uncertain
+        # a single damaged ending does not make the offset uncertain
         following = np.frombuffer(bytes(self._data[size : 2 * size]), np.uint8)
         if not self._rivals and self._can_begin(following, 0, 1):
             self._drop(size)

@@ -1,4 +1,4 @@
-"""Layout of a binary frame, made from its checked mapping file, to read and write frames."""
+"""Layout of a binary frame, made from its mapping file, to read and write frames."""
 
 import binascii
 import re
@@ -34,7 +34,7 @@ Row: TypeAlias = NDArray[np.float64]
 
 
 class Numbers:
-    """Places of numbers of one type in a frame.
+    """Positions in a frame of numbers of one type, in evenly spaced groups.
 
     Args:
         groups, n: number of groups, and of adjacent numbers in each.
@@ -65,7 +65,7 @@ class Numbers:
 
     @property
     def covered(self) -> set[int]:
-        """Offsets of all bytes of the numbers."""
+        """Offsets of all bytes that the numbers occupy in the frame."""
         return {at + b for at in self._list_offsets() for b in range(self.width)}
 
     def _list_offsets(self) -> list[int]:
@@ -73,7 +73,7 @@ class Numbers:
         return [self.at + g * self.stride + k * self.width for g in range(groups) for k in range(n)]
 
     def read(self, frames: bytes, count: int, length: int) -> NDArray[Any]:
-        """Return (count, number) raw numbers of `count` frames of `length` bytes."""
+        """Read the raw numbers of `count` frames of `length` bytes into (count, number)."""
         shape, strides = (count, *self.shape), (length, self.stride, self.width)
         if not self._odd:
             found = np.ndarray(shape, self._dtype, frames, self.at, strides)
@@ -98,7 +98,7 @@ class Numbers:
 
 
 class Block:
-    """Measured numbers of a frame, with their scales and their places in a sample."""
+    """Measured numbers of a frame, with their scales and their indices in a sample."""
 
     def __init__(
         self, values: Values, numbers: Numbers, gain: Row, bias: Row, cells: list[int],
@@ -116,7 +116,7 @@ class Block:
         return can & _is_within(raw, values.possible)
 
     def judge(self, raw: Row, valid: NDArray[np.bool_]) -> None:
-        """Set `valid`, (n, element), to False where a number is no measurement."""
+        """Set `valid`, (n, element), to False where a raw number is out of range."""
         if not self._limited:
             return
         good = self.possible(raw) & _is_within(raw, self._values.valid)
@@ -124,7 +124,7 @@ class Block:
             valid[:, element] &= good[:, k]
 
     def write(self, frame: bytearray, sample: Row) -> None:
-        """Write the numbers that a device would send for a sample into its frame."""
+        """Convert a sample in SI units to raw numbers, and write them into its frame."""
         if not len(self.cells):
             return
         wire = (sample[self.cells] - self.bias) / self.gain
@@ -140,11 +140,11 @@ def _is_within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_
 
 
 class FrameLayout:
-    """A checked mapping, in the form that a codec uses.
+    """Checked layout of a frame, with which a codec reads and writes frames.
 
     Attributes:
         sync, ends: The bytes with which a frame begins and ends.
-        count, time, status: The place of each in a frame; None without it.
+        count, time, status: The position of each in a frame; None without it.
         check_at, check_first: Offsets of the checksum, and of the first byte that it covers.
     """
 
@@ -244,8 +244,8 @@ class FrameLayout:
         cell = {(e, c): i for i, (e, c) in enumerate(product(spec.elements, spec.channels))}
         blocks = []
         for k, (values, numbers, gain, bias, columns) in enumerate(found):
-            heard = UNHEARD not in values.channels
-            cells = [cell[c.element, c.channel] for c in columns] if heard else []
+            delivered = UNHEARD not in values.channels
+            cells = [cell[c.element, c.channel] for c in columns] if delivered else []
             for column in columns:
                 if column.element not in spec.elements:
                     raise ConfigError(
@@ -256,7 +256,7 @@ class FrameLayout:
         return spec, blocks
 
     def possible(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return (n,) whether the device can have sent each of (n, length) bytes."""
+        """Return whether the device can have sent each frame, (n,), of (n, length) bytes."""
         n, data = len(frames), frames.tobytes()
         can = np.array([frame.tobytes().endswith(self.ends) for frame in frames], np.bool_)
         with np.errstate(invalid="ignore"):  # treat a signalling NaN as any NaN
@@ -266,7 +266,7 @@ class FrameLayout:
         return can
 
     def intact(self, frame: bytes) -> bool:
-        """Return whether a frame with the right beginning has a right ending and checksum."""
+        """Return whether a frame that begins with the sync has a right ending and checksum."""
         self.begun += 1
         if not frame.endswith(self.ends):
             self.ended_otherwise += 1
@@ -276,7 +276,7 @@ class FrameLayout:
         return frame[self.check_at :][: self.check_width] == self._make_sum(frame)
 
     def seal(self, frame: bytearray) -> bytes:
-        """Return the frame with its checksum."""
+        """Write the checksum into a frame; return the frame as bytes."""
         if self.check_width:
             frame[self.check_at : self.check_at + self.check_width] = self._make_sum(bytes(frame))
         return bytes(frame)
@@ -303,7 +303,7 @@ def _name_elements(given: int | tuple[str | int, ...], where: str) -> tuple[str,
 
 
 def as_bytes(text: str, where: str) -> bytes:
-    """Return the bytes of a message, written in hexadecimal or as ``text:...``."""
+    """Convert a message, written in hexadecimal or as ``text:...``, to bytes."""
     if text.startswith("text:"):
         return text.removeprefix("text:").encode()
     return _parse_hex(text, where)

@@ -28,7 +28,7 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Checksum(_Table, frozen=True, kw_only=True):
-    """``[checksum]``: the checksum of a frame.
+    """Table ``[checksum]``: the checksum of a frame.
 
     Attributes:
         at: Offset of the checksum; -1 for the last bytes before `ends`.
@@ -43,7 +43,7 @@ class Checksum(_Table, frozen=True, kw_only=True):
 
 
 class Values(_Table, frozen=True, kw_only=True):
-    """``[[values]]``: adjacent numbers of one type, all channels of one element after another.
+    """Table ``[[values]]``: adjacent numbers of one type, element by element.
 
     Attributes:
         channels: Names of the channels; ``-`` for numbers that are not delivered, but checked
@@ -51,7 +51,7 @@ class Values(_Table, frozen=True, kw_only=True):
         elements: Names of the elements; an integer n for ``T0`` to ``Tn-1``, two for the rows
             (``A``, ``B``, ...) and columns (``A0``, ``A1``, ...) of a matrix.
         unit: Unit of `scale`; empty for the SI unit of channels with usual names.
-        scale: Value of a one in `unit`, for all channels or for each in turn.
+        scale: Value of a raw 1 in `unit`, for all channels or for each in turn.
         stride: Bytes from one element to the next, if other numbers lie between; 0 for none. (By
             channel: from one channel to the next.)
         possible: Least and largest raw number that the device can send; any other number is no
@@ -78,7 +78,7 @@ class Values(_Table, frozen=True, kw_only=True):
 
 
 class FrameCounter(_Table, frozen=True, kw_only=True):
-    """``[count]``: the sample counter, which wraps at its width.
+    """Table ``[count]``: the sample counter, which wraps at its width.
 
     Attributes:
         order: Byte order of the number; empty for that of the file.
@@ -90,7 +90,7 @@ class FrameCounter(_Table, frozen=True, kw_only=True):
 
 
 class FrameClock(FrameCounter, frozen=True, kw_only=True):
-    """``[time]``: the time of the sample by the device's clock.
+    """Table ``[time]``: the time of a sample by the device's clock.
 
     Attributes:
         tick_us: Length of a tick, us.
@@ -100,7 +100,7 @@ class FrameClock(FrameCounter, frozen=True, kw_only=True):
 
 
 class FrameStatus(FrameCounter, frozen=True, kw_only=True):
-    """``[status]``: the status bits of the device.
+    """Table ``[status]``: the status bits of the device.
 
     Attributes:
         bits: Meaning of each bit when set, by its number.
@@ -114,7 +114,7 @@ class FrameStatus(FrameCounter, frozen=True, kw_only=True):
 
 
 class Message(_Table, frozen=True, kw_only=True):
-    """``[[start]]``, ``[[stop]]``: the messages that the host sends, in order.
+    """Table ``[[start]]`` or ``[[stop]]``: a message that the host sends, in order.
 
     Attributes:
         send: Bytes to send, or ``text:...`` for characters; empty to wait only.
@@ -130,7 +130,7 @@ class Message(_Table, frozen=True, kw_only=True):
 
 
 class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The mapping file of a frame, key by key.
+    """Contents of a mapping file, which describes a frame.
 
     Attributes:
         length: Length of a frame, bytes.

@@ -2,20 +2,20 @@
 
 A wire delivers bytes cut anywhere, some of them damaged, some missing, some noise. Requirements:
 - whole frames, whatever the cuts: the result never depends on where a packet ends;
-- the number of damaged frames between two good ones, since a damaged sample and one that was never
-  sent are different losses (see `accounting`), and noise is neither;
+- the number of damaged frames between two good ones, since a damaged and an unsent sample are
+  different losses (see `accounting`), and noise is no loss;
 - bounded memory and no waiting for a length that is itself damaged.
 
 `ByteBuffer` is for a codec with its own search: it holds bytes and finds the next place where a
-frame may begin. `FrameFinder` does all of this for frames of one length. `Rounds` assembles samples
+frame may begin. `FrameFinder` does all this for frames of fixed length. `Rounds` assembles samples
 from the frames of a CAN bus (which checks them), each of which carries a part of a sample.
 
-Damage count of `FrameFinder`. It goes from one beginning to the next; if the frame there fails its
-check, it skips one byte only, so that a beginning inside a damaged frame costs nothing. The skipped
-bytes are a gap, and the length of the gap shows its losses: each frame length of bytes with nearly
-the right beginning was a damaged frame, and a shorter rest with the right beginning was a frame cut
+Damage count of `FrameFinder`. It goes from one sync to the next; if the frame there fails its
+check, it skips one byte only, so that a sync inside a damaged frame costs no later frame. The
+skipped bytes are a gap, whose length shows its losses: each frame length of bytes with nearly the
+right beginning was a damaged frame, and a shorter rest with the right beginning was a frame cut
 short; all other bytes were never part of a frame. The rest may have come first or last, so both are
-tried, and the one that explains more counts. Before the first good frame only whole lengths count,
+tried, and the larger count is used. Before the first good frame only whole lengths count,
 since a host joins a running stream within a frame. An answer or a boot message in a gap means that
 the device was interrupted: a frame cut short by it is no damage. A long gap is evaluated every 64
 lengths, so that noise cannot pile up.
@@ -39,7 +39,7 @@ T = TypeVar("T")
 _REVERSED: Final = bytes(int(f"{b:08b}"[::-1], 2) for b in range(256))
 
 
-def _modbus_table() -> tuple[int, ...]:
+def _make_modbus_table() -> tuple[int, ...]:
     table = []
     for b in range(256):
         for _ in range(8):
@@ -48,7 +48,7 @@ def _modbus_table() -> tuple[int, ...]:
     return tuple(table)
 
 
-_MODBUS: Final = _modbus_table()
+_MODBUS: Final = _make_modbus_table()
 
 
 def crc16_xmodem(data: bytes | bytearray | memoryview) -> int:
@@ -72,12 +72,12 @@ def crc16_modbus(data: bytes | bytearray | memoryview) -> int:
 
 
 def seal_modbus(message: bytes) -> bytes:
-    """Add the CRC of a Modbus message, low byte first."""
+    """Return a Modbus message with its CRC appended, low byte first."""
     return message + crc16_modbus(message).to_bytes(2, "little")
 
 
 def _find_partial(data: bytearray, sync: bytes, at: int = 0) -> int:
-    """Return how many last bytes, from `at` on, may be the beginning of `sync`."""
+    """Return how many bytes at the end of `data[at:]` may begin an incomplete `sync`."""
     for n in range(min(len(sync) - 1, len(data) - at), 0, -1):
         if data.endswith(sync[:n]):
             return n
@@ -85,13 +85,13 @@ def _find_partial(data: bytearray, sync: bytes, at: int = 0) -> int:
 
 
 class ByteBuffer:
-    """Received bytes that are not yet decoded."""
+    """Buffer of received bytes that are not yet decoded."""
 
     def __init__(self) -> None:
         self.data = bytearray()
 
     def skip_to(self, sync: bytes) -> int:
-        """Drop the bytes before the first `sync`, or its possible beginning; return how many."""
+        """Drop the bytes before the first, maybe incomplete, `sync`; return their number."""
         at = self.data.find(sync)
         if at < 0:
             at = len(self.data) - _find_partial(self.data, sync)
@@ -106,7 +106,7 @@ class ByteBuffer:
 
 
 class FrameFinder:
-    """Finds frames with a beginning, a length and a check; counts the damaged ones between.
+    """Finder of frames with a fixed beginning, length and check; it counts damaged frames.
 
     This module's docstring describes the count.
 
@@ -117,7 +117,7 @@ class FrameFinder:
         parts: Whether frames come in parts of which one can be missing (a CAN bus): such a frame is
             incomplete, not corrupt, zeros may fill its last part, and bytes between frames are not
             counted.
-        head: Usual beginning of a frame, if longer than `sync`, since a short one is no evidence.
+        head: Usual beginning of a frame, if longer than `sync`, since a short one proves little.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class FrameFinder:
         self._synchronised, self._damaged = False, 0
 
     def find(self, packet: bytes) -> tuple[list[bytes], list[int]]:
-        """Return the intact frames that received bytes complete, cut anywhere.
+        """Return the intact frames that these bytes complete; the bytes may be cut anywhere.
 
         Returns:
             The frames, and for each the number of damaged ones since the previous frame.
@@ -237,8 +237,8 @@ class FrameFinder:
 class Rounds(Generic[T]):
     """Assembler of samples from parts 0 to n - 1, sent in ascending order, repeatedly.
 
-    A round ends with part n - 1, or when a part comes that is not after the previous one. The loss
-    of a whole round, or of the adjacent halves of two rounds, cannot be detected.
+    A round is the parts of one sample. It ends with part n - 1, or when a part comes whose number
+    is not higher. The loss of a round, or of adjacent halves of two rounds, cannot be detected.
     """
 
     def __init__(self, parts: int) -> None:
@@ -246,7 +246,7 @@ class Rounds(Generic[T]):
         self.forget()
 
     def forget(self) -> None:
-        """Discard all state; the first round may lack its beginning without counting as lost."""
+        """Discard all state; a first round without its beginning will not count as lost."""
         self._parts: list[T | None] = [None] * self._n
         self._last = -1
         self._entered = False
@@ -272,7 +272,7 @@ class Rounds(Generic[T]):
         return ended
 
     def end(self) -> list[list[T | None]]:
-        """Return the unfinished round, if any, as ended."""
+        """End the unfinished round; return it in a list, empty without one."""
         return self._end_round() if self._last >= 0 else []
 
     def _end_round(self) -> list[list[T | None]]:
@@ -282,7 +282,7 @@ class Rounds(Generic[T]):
 
 
 class CodecOfParts(CanCodec):
-    """Codec of a CAN device whose frames carry parts of samples, see `Rounds`."""
+    """Base of codecs of CAN devices that send samples in several frames; see `Rounds`."""
 
     def __init__(self, spec: ArraySpec, parts: int) -> None:
         super().__init__(spec)
@@ -291,11 +291,11 @@ class CodecOfParts(CanCodec):
 
     @abstractmethod
     def _identify_part(self, identifier: int, data: bytes) -> tuple[int, int] | None:
-        """Return (part that a frame carries, its least length); None for other devices' frames."""
+        """Return (number of the part in a frame, least data length); None for other devices."""
 
     @abstractmethod
     def _add_sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
-        """Add the sample of a round to the batch."""
+        """Decode the parts of one sample, None if missing, and add it to the batch."""
 
     def forget(self) -> None:
         self._rounds.forget()

@@ -1,7 +1,7 @@
 """Robotiq FT 150 and FT 300 on RS-485 (or its USB adapter), streaming.
 
 The device is a Modbus RTU slave until its register 410 is set to 0x0200: then it ignores Modbus and
-streams the frame of ``frames/ft300.toml``, which has the sources. A run of 50 bytes FF jams the
+streams the frame of ``frames/ft300.toml``, which names the sources. A run of 50 bytes FF jams the
 line and makes it a slave again.
 """
 
@@ -73,7 +73,7 @@ class Ft300(DescribedFrame):
             self.streaming, self._host_bytes = False, self._host_bytes[jam + JAM :]
         answer, at = b"", 0
         while not self.streaming and at < len(self._host_bytes):
-            length = _request_length(self._host_bytes[at:], self._slave)
+            length = _find_request_length(self._host_bytes[at:], self._slave)
             request = self._host_bytes[at : at + length]
             if 0 < length <= len(request) and seal_modbus(request[:-2]) == request:
                 answer += seal_modbus(request[:1] + self._execute(request[1:-2]))
@@ -111,10 +111,10 @@ class Ft300(DescribedFrame):
         return words | dict(serial) | {OUTPUT: STREAM * self.streaming, YEAR: 2020}
 
 
-def _request_length(heard: bytes, slave: int) -> int:
-    """Return the length of a request; 0 if invalid, more than all bytes while unknown."""
-    if heard[0] != slave or (len(heard) > 1 and heard[1] not in REQUESTS):
+def _find_request_length(received: bytes, slave: int) -> int:
+    """Return a request's length, bytes; 0 if invalid, over `len(received)` while incomplete."""
+    if received[0] != slave or (len(received) > 1 and received[1] not in REQUESTS):
         return 0
-    if len(heard) < 2 or (heard[1] == WRITE and len(heard) < 7):
-        return len(heard) + 1
-    return 9 + heard[6] if heard[1] == WRITE else 8
+    if len(received) < 2 or (received[1] == WRITE and len(received) < 7):
+        return len(received) + 1
+    return 9 + received[6] if received[1] == WRITE else 8

@@ -1,6 +1,6 @@
 """Strain-gauge whiskers on HX711 converters, two bridges each, read by an Arduino.
 
-Frames (``frames/hx711_whisker.toml``) end with six bytes that occur in no possible reading.
+Frames (``frames/hx711_whisker.toml``) end with six bytes that no possible reading contains.
 """
 
 import math

@@ -49,7 +49,7 @@ class IcubSkinOptions:
         self.numbers()
 
     def numbers(self) -> tuple[int, ...]:
-        """Return the numbers of the triangles, ascending."""
+        """Return the numbers of the connected triangles, ascending."""
         found: set[int] = set()
         for item in self.triangles.split(","):
             first, dash, last = item.strip().partition("-")

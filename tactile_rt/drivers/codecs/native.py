@@ -4,8 +4,8 @@ It is specified in docs/reference/native-protocol.md.
 
 A frame is a header of 20 bytes with its own CRC-16/XMODEM, a payload, and a CRC-32 of both, all
 little-endian. The header's checksum protects the length, so a false synchronisation in damaged
-bytes costs no waiting. The last checksum covers the header, too, so that a header and the payload
-of another frame (if exactly a frame's length was lost in between) do not pass for a sample.
+bytes costs no waiting. The last checksum covers the header, too, so that a header with the payload
+of another frame (after a loss of exactly a frame's length) is not taken for a sample.
 """
 
 import struct
@@ -48,7 +48,7 @@ def frame(
     time_us: int = 0,
     shape: tuple[int, int] = (0, 0),
 ) -> bytes:
-    """Return a frame of the serial form."""
+    """Return a frame of the native protocol on a serial line, with its checksums."""
     head = HEADER.pack(
         SYNC, VERSION << 4 | kind, format, len(payload), status, seq & 0xFFFFFFFF,
         time_us & 0xFFFFFFFF, *shape, 0,
@@ -83,7 +83,7 @@ class NativeSerial(SerialCodec):
         self._flags, self._valid = b"", np.empty((0, 0), np.bool_)  # of the last packet
         self.streaming = False
         self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
-        self.may_whisk: Callable[[float, float, float], bool] = lambda *asked: True
+        self.may_whisk: Callable[[float, float, float], bool] = lambda *motion: True
 
     # the host's side
 
@@ -93,7 +93,7 @@ class NativeSerial(SerialCodec):
         return self._decode_any(packet, t_ns)
 
     def _decode_usual(self, packet: bytes, t_ns: int) -> Samples | None:
-        """Return the sample of one intact usual frame, else None: faster than `_decode_any`."""
+        """Decode a packet of one intact sample, faster than `_decode_any`; else return None."""
         head = HEADER.unpack_from(packet)
         sync, kind, form, length, status, count, ticks, elements, channels, check = head
         if (
@@ -121,7 +121,7 @@ class NativeSerial(SerialCodec):
         rows: list[tuple[int, ...]] = []
         parts: list[NDArray[Any]] = []
         flags = b""
-        for kind, head, payload in self._frames(packet):
+        for kind, head, payload in self._read_frames(packet):
             if kind == MessageType.SAMPLE:
                 if self.spec is None:
                     continue  # its shape is not known yet
@@ -132,7 +132,7 @@ class NativeSerial(SerialCodec):
                 bits = -(-shape[0] // 8)
                 part: NDArray[Any] = np.ndarray((1, *shape), _TYPES[head[2]], payload, bits)
                 if head[2] == common.FORMATS["int16"]:
-                    part = (part * np.array(self._description().scale)).astype(np.float32)
+                    part = (part * np.array(self._describe().scale)).astype(np.float32)
                 parts.append(part)
                 flags += payload[:bits]
                 rows.append((t_ns, self._damaged, head[5], head[6], head[4]))
@@ -167,7 +167,7 @@ class NativeSerial(SerialCodec):
         return (Step(frame(MessageType.STOP)),) if command == Command.STOP else ()
 
     def whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> Step[bytes]:
-        """Return the command that sets an active array's whisking."""
+        """Return the command to whisk, for active arrays, in Hz and rad."""
         return Step(
             frame(MessageType.WHISK, WHISKING.pack(frequency_hz, amplitude_rad, offset_rad))
         )
@@ -179,7 +179,7 @@ class NativeSerial(SerialCodec):
     # the device's side
 
     def encode(self, chunk: Chunk) -> list[bytes]:
-        described = self._description()
+        described = self._describe()
         shape = described.spec.shape
         width = _TYPES[self._format].itemsize
         if max(shape) > 255 or -(-shape[0] // 8) + shape[0] * shape[1] * width > LONGEST:
@@ -199,20 +199,20 @@ class NativeSerial(SerialCodec):
 
     def respond(self, packet: bytes) -> bytes:
         answer = b""
-        for kind, _, payload in self._frames(packet):
+        for kind, _, payload in self._read_frames(packet):
             error = 0
             if kind in MessageType.FROM_DEVICE:
                 continue  # an echo of our own; answering it would never end
             if kind == MessageType.DESCRIBE:
                 self._known_device = None  # its serial number may have changed
-                answer += frame(MessageType.DESCRIPTION, self._description().to_json())
+                answer += frame(MessageType.DESCRIPTION, self._describe().to_json())
                 continue
             if kind in (MessageType.START, MessageType.STOP):
                 self.streaming = kind == MessageType.START
             elif kind == MessageType.WHISK and len(payload) == WHISKING.size:
-                asked = WHISKING.unpack(payload)
-                if np.isfinite(asked).all() and self.may_whisk(*asked):
-                    self.whisking = asked
+                motion = WHISKING.unpack(payload)
+                if np.isfinite(motion).all() and self.may_whisk(*motion):
+                    self.whisking = motion
                 else:
                     error = common.IMPOSSIBLE
             else:
@@ -222,14 +222,14 @@ class NativeSerial(SerialCodec):
 
     # both
 
-    def _description(self) -> DeviceDescription:
+    def _describe(self) -> DeviceDescription:
         if self._known_device is None:
             assert self.spec is not None
             self._known_device = DeviceDescription.of(self.spec, self._options, self.serial_number)
         return self._known_device
 
     def _unpack_flags(self, flags: bytes, n: int) -> NDArray[np.bool_]:
-        """Return (n, element) validity from the bits of n samples, which hardly ever change."""
+        """Unpack validity, (n, element), from the bits of n samples; reuse the last result."""
         if flags != self._flags:
             assert self.spec is not None
             bits = np.frombuffer(flags, np.uint8).reshape(n, -1)
@@ -238,7 +238,7 @@ class NativeSerial(SerialCodec):
             self._flags, self._valid = flags, valid.view(np.bool_)
         return self._valid.copy()
 
-    def _frames(self, packet: bytes) -> Iterator[tuple[int, tuple[Any, ...], bytes]]:
+    def _read_frames(self, packet: bytes) -> Iterator[tuple[int, tuple[Any, ...], bytes]]:
         """Yield (type, header, payload) of the intact frames that this packet completes."""
         data = self._rest + packet if self._rest else packet
         at = 0  # first byte that is not yet decoded
@@ -279,7 +279,7 @@ class NativeSerial(SerialCodec):
         self._rest = data[at:]
 
     def _lose_sync(self, n: int) -> None:
-        """Skip n bytes; count one damaged frame for all bytes up to the next."""
+        """Skip n bytes; count a single damaged frame until the next good frame."""
         self.stats.skipped += n
         self._lost += n
         self.stats.corrupt += self._synchronised
@@ -288,7 +288,7 @@ class NativeSerial(SerialCodec):
     def _count_lost(self, length: int) -> None:
         """Estimate the damaged samples in the skipped bytes by their headers and their length.
 
-        A burst of noise between frames costs none, two successive damaged frames cost two.
+        A burst of noise between frames counts as none, two successive damaged frames as two.
         """
         self._damaged += max(self._framed, round(self._lost / length))
         self._lost = self._framed = 0

@@ -77,8 +77,8 @@ class NativeCan(CanCodec):
 
     A device queues its frames first-in-first-out, not by identifier. A sample ends when all parts
     have come, or else with the next sample's first frame; then the elements with a lost part are
-    invalid, and only CAN's checksum covers the others. A sample whose header, or all but its
-    header, was lost is not delivered: its number is missing.
+    invalid, and only CAN's checksum covers the others. A sample that lost its header, or all
+    frames but its header, is not delivered: its number is missing.
     """
 
     Options = NativeCanOptions
@@ -110,7 +110,7 @@ class NativeCan(CanCodec):
         self._description_parts = DescriptionParts()
         self.streaming = False
         self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
-        self.may_whisk: Callable[[float, float, float], bool] = lambda *asked: True
+        self.may_whisk: Callable[[float, float, float], bool] = lambda *motion: True
 
     def forget(self) -> None:
         self._assembler.forget()
@@ -121,7 +121,7 @@ class NativeCan(CanCodec):
     def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
         batch = SampleBatch()
         first, stats, sample = self._base, self.stats, self._assembler
-        described = self._description()
+        described = self._describe()
         for identifier, data, extended, _, remote in packet:
             which = identifier - first
             if extended or remote or not ACK <= which <= DESCRIPTION:
@@ -132,7 +132,7 @@ class NativeCan(CanCodec):
                 sample.header(batch, data, described)
             elif which == DESCRIPTION:
                 self._add_description(data)
-                described = self._description()
+                described = self._describe()
             elif data[:1] == bytes((MessageType.ACK,)):
                 stats.intact += 1
             else:
@@ -172,7 +172,7 @@ class NativeCan(CanCodec):
     def whisk(
         self, frequency_hz: float, amplitude_rad: float, offset_rad: float
     ) -> Step[Sequence[CanFrame]]:
-        """Return the command that sets an active array's whisking (to 65 Hz and 3.2 rad)."""
+        """Return the command to whisk, for active arrays, up to 65 Hz and 3.2 rad."""
         motion = np.array([frequency_hz * 1e3, amplitude_rad * 1e4, offset_rad * 1e4])
         counts = np.clip(np.rint(np.nan_to_num(motion)), (0, -32767, -32767), (65535, 32767, 32767))
         data = WHISKING.pack(MessageType.WHISK, *counts.astype(int).tolist())
@@ -181,7 +181,7 @@ class NativeCan(CanCodec):
     # the device's side
 
     def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
-        described = self._description()
+        described = self._describe()
         assert described is not None
         flags = (LONG if self._fd else 0) | FLOAT32 * (self._options.format == "float32")
         flags |= (~flags & 15) << 4
@@ -213,9 +213,9 @@ class NativeCan(CanCodec):
         return answer
 
     def _execute(self, kind: int, data: bytes, answer: list[CanFrame]) -> int:
-        """Execute a command, extend the answer, and return the error number for the ACK."""
+        """Execute a command, append to the answer, and return the error number for the ACK."""
         if kind == MessageType.DESCRIBE:
-            described = self._description()
+            described = self._describe()
             if described is None:
                 return common.IMPOSSIBLE
             size = 64 if self._fd else 8
@@ -225,10 +225,10 @@ class NativeCan(CanCodec):
             self.streaming = kind == MessageType.START
         elif kind == MessageType.WHISK and len(data) >= WHISKING.size:
             _, mhz, amplitude, offset = WHISKING.unpack_from(data)
-            asked = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
-            if not self.may_whisk(*asked):
+            motion = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
+            if not self.may_whisk(*motion):
                 return common.IMPOSSIBLE
-            self.whisking = asked
+            self.whisking = motion
         else:
             return common.UNKNOWN
         return 0
@@ -240,14 +240,14 @@ class NativeCan(CanCodec):
             data = data.ljust(next(n for n in LENGTHS if n >= len(data)), b"\0")
         return CanFrame(self._base + which, data, fd=self._fd)
 
-    def _description(self) -> DeviceDescription | None:
+    def _describe(self) -> DeviceDescription | None:
         if self._device_description is None and self.spec is not None:
             return DeviceDescription.of(self.spec, self._options, self.serial_number)
         return self._device_description
 
 
 def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
-    """Return the data of the frames after the header; None if they are too many."""
+    """Split a sample's payload and CRC into frame data; None if over 256 frames."""
     size = 62 if head[7] & LONG else 6
     body += crc16_xmodem(head + body).to_bytes(CHECK, "little")
     if len(body) > MOST_PARTS * size:
@@ -257,7 +257,7 @@ def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
 
 
 class SampleParts:
-    """Assembler of samples from headers and parts; it holds the newest sample only."""
+    """Assembler of samples from headers and parts; it buffers only the newest sample."""
 
     def __init__(self, stats: WireStats) -> None:
         self._stats = stats
@@ -267,7 +267,7 @@ class SampleParts:
     def forget(self) -> None:
         """Discard all state, as after a reconnection."""
         self.fresh = True  # no sample yet
-        self._low = -1  # low byte of the newest sample's sequence; -1: none yet
+        self._low = -1  # low byte of the newest sample's sequence; -1 before the first
         self._head: bytes | None = None  # header of the incomplete sample
         self._parts: list[bytes | None] = []
         self._missing = 0  # parts
@@ -279,7 +279,7 @@ class SampleParts:
         self._damaged += 1
 
     def header(self, batch: SampleBatch, data: bytes, described: DeviceDescription | None) -> None:
-        """Take a header, and close the sample before it."""
+        """Check a header frame, end the previous sample, and begin the next."""
         if len(data) != HEAD.size or data[7] not in FLAGS:
             self.refuse()
             return
@@ -300,7 +300,7 @@ class SampleParts:
         self._last = self._payload - self._size * (parts - 1)
 
     def part(self, batch: SampleBatch, data: bytes, described: DeviceDescription | None) -> None:
-        """Take a part, and deliver the sample that it completes."""
+        """Add a part frame to the open sample; add the sample to `batch` once complete."""
         if len(data) < 3:
             self.refuse()
             return
@@ -328,14 +328,14 @@ class SampleParts:
             self.refuse()
 
     def _begin_without_header(self, batch: SampleBatch, low: int) -> None:
-        """Close the open sample at a part of a sample whose header was lost."""
+        """End the open sample, since a part of a sample without its header has come."""
         self._close(batch)
         if self._low >= 0:  # else it began before the host joined
             self._stats.incomplete += 1
         self._low = low
 
     def _close(self, batch: SampleBatch) -> None:
-        """Deliver the open sample, complete or not."""
+        """Add the open sample to `batch`, complete or not, unless it fails its check."""
         head, self._head = self._head, None
         if head is None:
             return
@@ -379,7 +379,7 @@ class DescriptionParts:
 
     def __init__(self) -> None:
         self._text = bytearray()
-        self._next = -1  # index; -1: none before the first
+        self._next = -1  # index of the next part; -1 before the first
 
     def add(self, data: bytes) -> DeviceDescription | bool | None:
         """Add a part; return the description that it completes.
@@ -405,7 +405,7 @@ class DescriptionParts:
 
 
 def cut_description(kind: int, text: bytes, size: int) -> list[bytes]:
-    """Return the data of the frames that carry a description."""
+    """Split a description into the data of its frames, of up to `size` bytes."""
     whole = len(text).to_bytes(2, "little") + text + zlib.crc32(text).to_bytes(4, "little")
     starts = range(0, len(whole), size - PIECE.size)
     return [PIECE.pack(kind, i) + whole[at : at + size - PIECE.size] for i, at in enumerate(starts)]

@@ -1,4 +1,4 @@
-"""Common part of the native protocol on all wires, see docs/reference/native-protocol.md."""
+"""Part of the native protocol common to serial and CAN: docs/reference/native-protocol.md."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ HARMLESS: Final = frozenset((0, 2))  # no faults: a firm touch; losses that the 
 
 
 class MessageType:
-    """Types of frames."""
+    """Types of the native protocol's frames."""
 
     SAMPLE = 0
     DESCRIBE = 1  # host: request for a description
@@ -70,7 +70,7 @@ class DeviceDescription:
 
     Attributes:
         scale: SI units per count of int16, by channel.
-        serial_number: Number unique among devices of this kind; empty for none.
+        serial_number: Serial number, unique among devices of this kind; empty for none.
     """
 
     spec: ArraySpec
@@ -88,14 +88,14 @@ class DeviceDescription:
         return cls(spec, scale, serial_number)
 
     def to_json(self) -> bytes:
-        """Return the payload of a DESCRIPTION."""
+        """Return the description as JSON, the payload of a DESCRIPTION frame."""
         spec = msgspec.Raw(self.spec.to_json().encode())
         further = {"serial": self.serial_number} if self.serial_number else {}
         return msgspec.json.encode({"spec": spec, "scale": self.scale, **further})
 
     @classmethod
     def from_json(cls, text: bytes) -> "DeviceDescription | None":
-        """Read the payload of a DESCRIPTION; return None if it is invalid."""
+        """Parse the payload of a DESCRIPTION frame; return None if it is invalid."""
         try:
             fields = msgspec.json.decode(text, type=dict[str, msgspec.Raw])
             spec = ArraySpec.from_json(bytes(fields["spec"]).decode())
@@ -110,7 +110,7 @@ class DeviceDescription:
 def encode_samples(
     chunk: Chunk, described: DeviceDescription, form: str
 ) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (number, time in us, payload) of each sample: validity bits, then values."""
+    """Yield (number, time in us, payload) of each sample; payload: validity bits, values."""
     rows = zip(chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True)
     for seq, t_ns, values, valid in rows:
         if form == "float32":

@@ -91,7 +91,7 @@ class OptoForceOptions:
 
 
 class _Messages:
-    """Messages of the device, common to both wires."""
+    """Encoder and decoder of the device's messages, common to USB and CAN."""
 
     def __init__(self, options: OptoForceOptions, stats: WireStats, parts: bool) -> None:
         elements, channels = SHAPES[options.model]
@@ -116,7 +116,7 @@ class _Messages:
         self._host_bytes = b""
 
     def decode(self, found: list[bytes], damaged: list[int], t_ns: int) -> Samples | None:
-        """Convert the messages that the finder found to samples; None without messages."""
+        """Convert intact messages to samples; return None without messages."""
         if not found:
             return None
         messages = np.frombuffer(b"".join(found), self._layout)
@@ -143,7 +143,7 @@ class _Messages:
         return [_seal(message.tobytes()[:-2]) for message in messages]
 
     def respond(self, packet: bytes) -> tuple[bytes, int | None]:
-        """Return (answer, new streaming rate in Hz; 0 if it stops, None if unchanged)."""
+        """Return (answer to a host, new rate in Hz: 0 if stopped, None if unchanged)."""
         self._host_bytes += packet
         answer, rate, done = b"", None, 0
         for settings in SETTINGS.finditer(self._host_bytes):
@@ -304,14 +304,14 @@ def _is_intact(message: bytes) -> bool:
 
 
 def _configure(options: OptoForceOptions, stop: bool = False) -> bytes:
-    """Return the message that configures the device, or stops it."""
+    """Return the message that configures the device and starts it, or stops it."""
     speed = 0 if stop else SPEEDS[options.rate_hz]
     zero = ZERO if options.zero and not stop else 0
     return _seal(CONFIGURE + bytes((speed, FILTERS[options.filter_hz], zero)))
 
 
 def _find_valid(status: NDArray[np.int64], elements: int) -> NDArray[np.bool_]:
-    """Return (n, element) validity: False for the sensors that the status marks as faulty."""
+    """Return validity, (n, element): False for the sensors that the status marks as faulty."""
     sensor, several = status & 7, status >> SEVERAL & 1
     one = (several == 0) & (sensor >= 1) & (sensor <= elements)
     at_fault = ~one[:, None] | (np.arange(1, elements + 1) == sensor[:, None])

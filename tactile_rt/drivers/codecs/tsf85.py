@@ -72,11 +72,11 @@ class Tsf85Options:
 class Tsf85(SerialCodec):
     """Codec of the taxels' pressure counts, or of the fingers' motion.
 
-    Motion is dynamic counts, acceleration and angular velocity. The taxels' counts have no
+    Motion is counts of the dynamic taxel, acceleration and angular velocity. Counts have no
     published scale (unit 1). A sample is complete when all of its signals have come. The first
     sample after START shows their order; a signal out of that order belongs to the next sample: a
     packet was lost, and the fingers with a missing signal are invalid. If a host joins a running
-    stream, the order may begin elsewhere in the round, and a finger be one period late.
+    stream, samples may begin at another signal, and a finger be one period late.
     """
 
     Options = Tsf85Options
@@ -111,7 +111,7 @@ class Tsf85(SerialCodec):
         self._buffer.data.clear()
         self._synchronised = False
         self._set: dict[tuple[int, int], bytes] = {}  # signals of the incomplete sample
-        self._order: list[tuple[int, int]] = []  # of the signals in a sample; empty: unknown
+        self._order: list[tuple[int, int]] = []  # order of a sample's signals; empty if unknown
 
     # the host's side
 
@@ -120,11 +120,11 @@ class Tsf85(SerialCodec):
         for command, signals in self._read_packets(self._buffer, packet):
             if command in (READ, SEND, SEND_WHEN_NEW):
                 for signal, data in signals:
-                    self._take(batch, signal, data)
+                    self._add_signal(batch, signal, data)
         assert self.spec is not None
         return batch.take(self.spec.shape, t_ns)
 
-    def _take(self, batch: SampleBatch, signal: tuple[int, int], data: bytes) -> None:
+    def _add_signal(self, batch: SampleBatch, signal: tuple[int, int], data: bytes) -> None:
         if signal not in self._signals_needed:
             return
         if self._ends_sample(signal):
@@ -139,7 +139,7 @@ class Tsf85(SerialCodec):
             self._set.clear()
 
     def _ends_sample(self, signal: tuple[int, int]) -> bool:
-        """Return whether a signal belongs to the next sample, so that this one ends."""
+        """Return whether a signal belongs to the next sample and so ends the present one."""
         if not self._set or not self._order:
             return signal in self._set
         return self._order.index(signal) <= self._order.index(next(reversed(self._set)))
@@ -281,7 +281,7 @@ def _pack(kind: int, finger: int, data: bytes) -> bytes:
 
 
 def _split_signals(data: bytes) -> list[tuple[tuple[int, int], bytes]] | None:
-    """Return ((type, finger), values) of each signal; None if they do not fill the packet."""
+    """Split packet data into ((type, finger), values) of each signal; None if malformed."""
     found = []
     at = 0
     while at < len(data):

@@ -43,7 +43,7 @@ class XelaOptions:
 
 
 class Xela(CodecOfParts):
-    """uSkin uSPa44: one frame per taxel, with x, y, z as u16 big-endian.
+    """Codec of uSkin uSPa44: one frame per taxel, with x, y, z as big-endian u16.
 
     Byte 0 of a frame has an unknown meaning. Values are the device's counts: the newtons per count
     differ from patch to patch and belong in a calibration. Taxels without a frame are invalid. The

@@ -1,4 +1,4 @@
-"""An emulated device with its line: plug it in, open its URL, pull it out.
+"""Emulated devices with their lines: plug one in, open its URL, pull it out.
 
 with EmulatedSerial(source, "native") as device, open_source(device.url) as driver:
     chunk = driver.read(timeout=1.0)
@@ -22,11 +22,11 @@ from tactile_rt.drivers.emulation.endpoints import (
 from tactile_rt.drivers.emulation.faults import FaultSchedule
 from tactile_rt.drivers.opening import make_codec
 
-SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
+SPEEDS = ("baud", "bitrate")  # options for a line's speed; 0 for no limit
 
 
 class EmulatedDevice(Emulator):
-    """An emulated device on a real line; a context manager, plugged in while entered."""
+    """Emulated device on a real line; as a context manager, plugged in inside the block."""
 
     wire: ClassVar[str]
     paced: ClassVar[bool] = True  # whether its line has a speed in real time
@@ -50,7 +50,7 @@ class EmulatedDevice(Emulator):
 
     @property
     def port(self) -> str:
-        """Name that a program opens: a serial port's path, or INTERFACE:CHANNEL."""
+        """Name by which a program opens the line: a port's path, or INTERFACE:CHANNEL."""
         return self.address.partition(":")[2].removeprefix("//")
 
     @property
@@ -65,7 +65,7 @@ class EmulatedDevice(Emulator):
 def _make_codec_and_speed(
     wire: str, name: str, options: dict[str, str], speed: str
 ) -> tuple[Codec[Any], int | None]:
-    """Return (codec, the line's speed in bit/s, None if not an option)."""
+    """Return (codec, line speed in bit/s or None if not given) from a URL's options."""
     fields = dict(options)
     rate = None
     if speed in fields and speed not in codec_class(wire, name).Options.__dataclass_fields__:
@@ -77,7 +77,7 @@ def _make_codec_and_speed(
 
 
 class EmulatedSerial(EmulatedDevice):
-    """A device on a serial port: a pty, which any program can open. Unix only.
+    """Emulated device on a serial port: a pty, which any program can open. Unix only.
 
     In real time, sending takes as long as at the line's speed, a packet that does not fit is not
     sent, and a host with another baud rate receives nonsense. A device on USB has no such speed,
@@ -85,7 +85,7 @@ class EmulatedSerial(EmulatedDevice):
 
     Args:
         link: A symbolic link to the port, so that the port has the same name when it is plugged
-            in again; None: /dev/pts/N.
+            in again; None for only /dev/pts/N.
         pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read, over a line
             without a speed.
     """
@@ -112,14 +112,14 @@ class EmulatedSerial(EmulatedDevice):
 
 
 class EmulatedCan(EmulatedDevice):
-    """A device behind an slcan adapter on a pty, or on a bus of python-can.
+    """Emulated device behind an slcan adapter on a pty, or on a bus of python-can.
 
     In real time, frames behind an slcan adapter take as long as on a bus of the bit rate that the
     host chose; with an option ``bitrate=0`` they take no time.
 
     Args:
-        bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None: slcan.
-        fd: Whether to open that bus for CAN FD; None: by the codec's own option.
+        bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None for an slcan adapter.
+        fd: Whether to open that bus for CAN FD; None to follow the codec's option.
 
     The other arguments are those of `EmulatedSerial`.
     """

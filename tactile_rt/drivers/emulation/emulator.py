@@ -19,7 +19,7 @@ from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedul
 from tactile_rt.drivers.emulation.transmitter import EmulatedClock, RateConverter, Transmitter, fit
 
 PACES = ("realtime", "fast")
-SETTLE_S: Final = 0.2  # without unrequested samples: a host that opens a port discards old input
+SETTLE_S: Final = 0.2  # delay of unrequested samples: a host that opens a port discards old input
 SLICE_S: Final = 0.05  # longest time until a wait notices that the emulator is closed
 YIELD_S: Final = 1e-5  # so that a source that never waits does not delay the host's commands
 PIECE: Final = 16  # samples encoded at a time if not paced by the clock
@@ -27,7 +27,7 @@ AHEAD_BYTES: Final = 65_536  # longest queue when the host sets the pace
 
 
 class Emulator:
-    """A device whose measurements come from a source. A context manager; runs in two threads.
+    """Emulated device that sends a source's samples. A context manager; runs in two threads.
 
     The source is first read when a host is connected and, if the codec requires it, has requested
     samples. With a source that is not live and pace ``fast``, the emulator always waits for its
@@ -35,16 +35,16 @@ class Emulator:
     numbered. A polled device sends the newest sample. The caller closes the source.
 
     Args:
-        codec: The codec that the device speaks. Without a `spec` it takes that of the source; else
-            see `fit`. It also stores the hosts' commands.
-        faults: The schedule of faults, which is used up.
+        codec: The codec that the device speaks. If its `spec` is None, it is set to the source's;
+            else see `fit`. It also stores the hosts' commands.
+        faults: The schedule of faults, which cannot be reused.
         log: Whether to record the fate of each sample (17 bytes each); if not, only counts are
             kept.
         pace: ``realtime`` sends samples when they are due (a live source has its own pace);
             ``fast`` as soon as the host takes them. In real time a device sends at its own rate or
-            at the rate that the host has commanded, whatever the source's.
-        seconds: Length of the source's stream, if known, else when to stop; s of the source's
-            time. The schedule keeps the end quiet. Not needed for a source that is not live.
+            at the rate that a host has commanded, not the source's.
+        seconds: Time after which to stop, s of the source's time; None to stop at its end. No fault
+            happens just before the end, which for a live source must be given here.
         start_count: First value of the device's counter, e.g. just before it wraps.
         start_tick: First value of the device's clock, in ticks.
         drift_ppm: Excess speed of the device's clock, parts per million.
@@ -99,16 +99,16 @@ class Emulator:
         self._failure: BaseException | None = None
         self._threads: list[threading.Thread] = []
 
-    # for its owner
+    # public methods
 
     @property
     def address(self) -> str:
-        """Beginning of the URL that a host opens."""
+        """Part of the URL that a host opens, without its options."""
         return self.endpoint.address
 
     @property
     def done(self) -> bool:
-        """Whether the source has ended and all packets that can be sent are sent."""
+        """Whether the source has ended, and no packets are left to send."""
         return self._done and (not self.endpoint.backlog or not self.endpoint.heard)
 
     def start(self) -> None:
@@ -120,7 +120,7 @@ class Emulator:
             self._threads.append(thread)
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait until it is `done`; return whether it is.
+        """Wait until the emulator is `done`; return False after the timeout.
 
         Raises:
             TactileError: the source failed.
@@ -139,7 +139,7 @@ class Emulator:
         return True
 
     def close(self) -> None:
-        """Stop the threads and remove the device; it may be called twice."""
+        """Stop the threads and remove the device; safe to call twice."""
         with self._state:
             self._stopping = True
             self._state.notify_all()
@@ -166,8 +166,8 @@ class Emulator:
         """Plug the device in again, under the same link.
 
         Args:
-            restart: Whether the device had lost power: it then counts from 0, and is in its state
-                at power-on.
+            restart: Whether the device had lost power: its counter and clock then restart at 0, and
+                it is in its state at power-on.
         """
         with self._state:
             self.endpoint.plug()
@@ -222,7 +222,7 @@ class Emulator:
             self._state.notify_all()
 
     def _read_chunks(self) -> Iterator[Chunk]:
-        """Yield the source's chunks, late enough that the end is known in advance."""
+        """Yield the source's chunks, delayed so that the end is known before the last ones."""
         ahead: list[Chunk] = []
         while not self._stopping:
             self._pass_on_whisking()
@@ -253,7 +253,7 @@ class Emulator:
                 yield chunk
 
     def _send_when_due(self, chunk: Chunk) -> None:
-        """Send a chunk's samples as they fall due."""
+        """Send each of a chunk's samples when it is due."""
         at = 0
         while at < len(chunk) and not self._stopping:
             if self._host_paces:
@@ -273,7 +273,7 @@ class Emulator:
             at = min(stop, len(chunk))
 
     def _wait_until_due(self, chunk: Chunk, at: int) -> int:
-        """Wait until sample `at` is due; return the first one that is not."""
+        """Wait until sample `at` is due; return the first index not yet due."""
         assert self._first_ns is not None
         while True:
             now = time.monotonic_ns() - self._began_ns + self._first_ns
@@ -283,7 +283,7 @@ class Emulator:
             time.sleep(min(wait_s, SLICE_S))
 
     def _wait_for_host(self) -> bool:
-        """Wait until a host requests samples and has room; return False when closing."""
+        """Wait until a host requests samples and the queue has room; return False when closing."""
         with self._state:
             while not self._stopping:
                 measures = self.codec.measures and not self._host_paces
@@ -296,7 +296,7 @@ class Emulator:
                         if self.endpoint.backlog < AHEAD_BYTES:
                             return True
                         left = 0.001
-                elif self._sender.away:  # it is plugged in again only as samples pass
+                elif self._sender.away:  # only later samples plug the device in again
                     return True
                 self._state.wait(left)
         return False
@@ -307,7 +307,7 @@ class Emulator:
                 self._sender.send(piece)
             else:
                 self._newest = self.codec.newest = piece.select(slice(-1, None))
-                if self._sender.away:  # no host can poll; the passing of time plugs it in again
+                if self._sender.away:  # no host can poll; time must advance to plug it in again
                     self._sender.look(int(self._newest.t_ns[0]))
                 self._answer_polls(self._newest)
 

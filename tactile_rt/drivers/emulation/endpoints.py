@@ -1,6 +1,6 @@
-"""The device's end of a line, for an emulator: a pty, an slcan adapter on a pty, a CAN bus.
+"""Endpoints of emulated devices on a line: a pty, an slcan adapter on a pty, or a CAN bus.
 
-None of them ever waits for a reader: a packet that does not fit is refused as a whole.
+No endpoint waits for a reader: a packet that does not fit is refused as a whole.
 """
 
 import abc
@@ -26,10 +26,10 @@ BUS_ERROR = 0x80  # slcan's status flag
 
 
 class Endpoint(abc.ABC, Generic[Packet]):
-    """The device's end of a line.
+    """Device's end of a line, by which an emulated device sends and receives.
 
     Attributes:
-        address: Beginning of the URL that a host opens; known once plugged in.
+        address: URL that a host opens, without options; known once plugged in.
     """
 
     wire: ClassVar[str]
@@ -38,7 +38,7 @@ class Endpoint(abc.ABC, Generic[Packet]):
     @property
     @abc.abstractmethod
     def heard(self) -> bool:
-        """Whether a host listens."""
+        """Whether a host has opened the line."""
 
     @abc.abstractmethod
     def plug(self) -> None:
@@ -50,41 +50,41 @@ class Endpoint(abc.ABC, Generic[Packet]):
 
     @abc.abstractmethod
     def receive(self, timeout_s: float) -> Packet:
-        """Return a packet from the host, empty if none came in time; for one thread."""
+        """Return a packet from the host, empty after the timeout; for one thread only."""
 
     @abc.abstractmethod
     def send(self, packet: Packet, answer: bool = False) -> bool:
-        """Send a packet, or queue it; return False without a host or room.
+        """Send or queue a packet; return False if there is no host or no room.
 
         Args:
-            answer: Whether it answers a command: an answer always has room.
+            answer: Whether the packet answers a command: answers always have room.
         """
 
     @abc.abstractmethod
     def disturb(self, amount: int, draw: random.Random) -> None:
-        """Send this many random bytes, on CAN in frames with unknown identifiers."""
+        """Send random bytes, on CAN in frames with unknown identifiers."""
 
     def error(self, frames: int) -> None:
         """Send this many CAN error frames."""
 
     def gather(self, seconds: float) -> None:
-        """Set the interval at which an adapter passes on collected data, s; 0: at once."""
+        """Set the interval at which the adapter passes on data, s; 0 for no delay."""
 
     @property
     def backlog(self) -> int:
-        """Bytes accepted and not yet sent."""
+        """Number of bytes accepted and not yet sent."""
         return 0
 
     def wake(self) -> None:
-        """End a wait in `receive`."""
+        """Make a `receive` that waits in another thread return."""
 
     def close(self) -> None:
-        """Disconnect the device for good; it may be called twice."""
+        """Disconnect the device for good; safe to call twice."""
         self.pull()
 
 
 class _PtyEndpoint(Endpoint[Packet]):
-    """Common part of endpoints on a pty."""
+    """Base of endpoints on a pty."""
 
     def __init__(
         self, link: str | Path | None, fifo_bytes: int, wire: Wire | None = None, baud: int = 0
@@ -113,7 +113,7 @@ class _PtyEndpoint(Endpoint[Packet]):
 
 
 class SerialEndpoint(_PtyEndpoint[bytes]):
-    """A serial port: a pty.
+    """Endpoint on a serial port, which is a pty.
 
     Args:
         link: Another name of the port, in addition to /dev/pts/N.
@@ -149,7 +149,7 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
 
 
 class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
-    """A device on a CAN bus behind an slcan adapter on a pty.
+    """Endpoint on a CAN bus behind an slcan adapter on a pty.
 
     Args:
         bitrate: Speed of the bus, bit/s; a host that chooses another speed receives nothing. None
@@ -204,7 +204,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
 
 
 class BusEndpoint(Endpoint[Sequence[CanFrame]]):
-    """A device on a bus of python-can."""
+    """Endpoint on a bus of python-can."""
 
     wire = "can"
 

@@ -37,12 +37,12 @@ from tactile_rt.core.settings import convert, no_such, read_toml
 from tactile_rt.drivers.codec import Packet
 
 FOR_EVER = ("clock_drift", "gather")  # kinds that may last to the end
-QUIET_S = 0.5  # undisturbed at either end
-BESIDE_RESET_S = 0.05  # undisturbed on either side of a restart
+QUIET_S = 0.5  # s without faults at the beginning and end of a stream
+BESIDE_RESET_S = 0.05  # s without faults before and after a restart
 
 
 class Kind(NamedTuple):
-    """Parameters of a kind of fault: default amount, its unit, and whether it lasts."""
+    """Parameters of a kind of fault: default amount, its unit, whether it has a duration."""
 
     amount: float
     unit: str
@@ -68,16 +68,16 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Fault:
-    """One kind of fault, with its time.
+    """Fault of one kind, at one time or repeatedly at random.
 
     Attributes:
         kind: Name of a kind in `KINDS`. With ``stall`` nothing is sent for a while, then all at
             once; with ``sequence_reset`` the device's counter and clock start again, as after a
             restart.
-        rate: Mean number of faults per second, at random; 0 if `at_s` is given.
+        rate: Mean number of faults per second, at random times; 0 if `at_s` is given.
         at_s: Time of the single fault, in seconds of the stream; None if `rate` is given.
         duration_s: Length of the fault, s, for ``stall``, ``unplug``, ``clock_drift`` and
-            ``gather`` (for the last two, 0: to the end).
+            ``gather``; with 0, the last two go on to the end.
         amount: Size of the fault, in the unit given in `KINDS`; None for the default of its kind.
     """
 
@@ -116,12 +116,12 @@ class Fault:
 
     @property
     def size(self) -> float:
-        """`amount`, or the default of its kind."""
+        """Size of the fault: `amount`, or the default of its kind."""
         return KINDS[self.kind].amount if self.amount is None else self.amount
 
 
 class FaultSchedule:
-    """Schedule of faults by sample; the same seed and times give the same faults."""
+    """Schedule of faults by sample; the same seed and sample times give the same faults."""
 
     def __init__(self, faults: tuple[Fault, ...] | list[Fault], seed: int = 0) -> None:
         self.faults = tuple(faults)
@@ -139,12 +139,12 @@ class FaultSchedule:
     def at(self, t_s: float, quiet: bool = False) -> Fault | None:
         """Return the fault that hits the sample at this time, or None.
 
-        It must be called once per sample, in order of time. A lasting fault is returned for each
-        sample that it hits. Faults due at one sample hit successive samples. ``clock_drift`` is
-        returned once, when it begins.
+        Call it once per sample, in order of time. A lasting fault is returned for each sample that
+        it hits. Faults due at one sample hit successive samples. ``clock_drift`` is returned once,
+        when it begins.
 
         Args:
-            quiet: Whether the stream is about to end, so that no more faults happen.
+            quiet: Whether the stream is about to end; then None is returned.
         """
         if quiet or t_s < QUIET_S:
             return None
@@ -157,11 +157,11 @@ class FaultSchedule:
             if self._resets[0][0] > t_s or t_s < self._last_s + BESIDE_RESET_S:
                 return None  # a loss just before could not be distinguished from the restart
             self._reset_s = t_s
-            return self._take(self._resets)
+            return self._pop(self._resets)
         if t_s < self._reset_s + BESIDE_RESET_S or not self._due or self._due[0][0] > t_s:
             return None
         self._last_s = t_s
-        fault = self._take(self._due)
+        fault = self._pop(self._due)
         if fault.kind == "drop":
             self._now, self._left, self._until_s = fault, int(fault.size) - 1, t_s
         elif fault.kind in ("stall", "unplug"):
@@ -174,7 +174,7 @@ class FaultSchedule:
         due = self._resets if fault.kind == "sequence_reset" else self._due
         heapq.heappush(due, (after_s + wait, k))
 
-    def _take(self, due: list[tuple[float, int]]) -> Fault:
+    def _pop(self, due: list[tuple[float, int]]) -> Fault:
         when, k = heapq.heappop(due)
         if self.faults[k].rate:
             self._plan(k, when)
@@ -204,22 +204,22 @@ class DeviceLog:
 
     @property
     def sent(self) -> int:
-        """Number of samples that the device has numbered, whatever their fate."""
+        """Number of samples that the device has numbered, including lost ones."""
         return sum(self.counts.values())
 
     @property
     def seq(self) -> NDArray[np.int64]:
-        """The device's counter, (n,), not wrapped; it restarts with the device."""
+        """Device's counter at each sample, (n,), not wrapped; it restarts with the device."""
         return np.array(self._seq, np.int64)
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
-        """The device's clock, (n,), ns, not wrapped."""
+        """Device's clock at each sample, (n,), ns, not wrapped."""
         return np.array(self._t_ns, np.int64)
 
     @property
     def fate(self) -> NDArray[np.uint8]:
-        """The `Fate` of each sample, (n,)."""
+        """`Fate` of each sample, (n,)."""
         return np.array(self._fate, np.uint8)
 
     def add(self, seq: int, t_ns: int, fate: Fate) -> int:
@@ -232,7 +232,7 @@ class DeviceLog:
         return len(self._fate) - 1
 
     def change(self, at: int, old: Fate, new: Fate) -> None:
-        """Change the fate of a recorded sample that was held back."""
+        """Change the recorded fate of the sample with index `at`, which was held back."""
         self.counts[old] -= 1
         self.counts[new] += 1
         if self._records_each:
@@ -243,7 +243,7 @@ def damage_packet(packet: Packet, fault: Fault, draw: random.Random) -> tuple[Pa
     """Apply a bit flip or a truncation; return the damaged packet and its fate.
 
     CAN has a checksum of its own: a frame with a wrong bit does not arrive. At least one byte of a
-    packet remains; of frames, none may remain.
+    serial packet remains; a CAN packet may lose all its frames.
     """
     amount = int(fault.size)
     if fault.kind == "truncate":
@@ -266,7 +266,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_faults(path: Path | str) -> FaultSchedule:
-    """Read a schedule from a TOML file; see this module's docstring."""
+    """Read a schedule of faults from a TOML file; see this module's docstring."""
     path = Path(path)
     file: _File = convert(read_toml(path), _File)
     if not file.fault:

@@ -1,6 +1,6 @@
-"""A pseudo-terminal as a device's port: raw, named, never blocking, and it can be pulled out.
+"""Pseudo-terminal as a device's port: raw, named, never blocking; it can be unplugged.
 
-Data arrives at the host when a line of the device's speed would have carried it. Sources: the frame
+Data arrives at the host as late as over a line of the device's speed. Sources: the frame
 of a UART (a start bit, eight bits, the lowest first, an optional parity bit, a stop bit); ISO
 11898-1 for the bits of a CAN frame, without stuff bits, as in docs/reference/native-protocol.md.
 """
@@ -26,13 +26,13 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.drivers.codec import CanFrame
 
 STANDARD, EXTENDED = 47, 67  # bits of a frame without its data, with the gap to the next
-FD_SLOW, FD_SLOW_EXTENDED = 30, 49  # of CAN FD, at the speed of the arbitration
-FD_FAST, FD_FAST_LONG = 31, 36  # at that of the data: up to 16 bytes, and more
+FD_SLOW, FD_SLOW_EXTENDED = 30, 49  # bits of CAN FD at the arbitration speed
+FD_FAST, FD_FAST_LONG = 31, 36  # bits at the data speed: up to 16 bytes, and more
 LONG: Final = 16
 
 
 class Wire:
-    """Timing of a line that carries one packet after another.
+    """Timing of a line that transmits one packet after another.
 
     Attributes:
         gather_s: Time for which an adapter gathers input before it passes it on, s: 1 ms for USB,
@@ -56,7 +56,7 @@ class Wire:
 
 
 def bytes_s(n: int, baud: int, parity: str = "N") -> float:
-    """Return the time that bytes take on a serial line, s."""
+    """Return the time that n bytes take on a serial line, s."""
     return n * (10 if parity == "N" else 11) / baud
 
 
@@ -76,7 +76,7 @@ def frames_s(frames: Sequence[CanFrame], bitrate: int, data_bitrate: int | None 
 def misheard(data: bytes, spoken: int, heard: int) -> bytes:
     """Return the bytes that a receiver with a wrong baud rate decodes.
 
-    It samples the line in the middle of its own bits, from the edge of each start bit on.
+    The receiver samples the line in the middle of its own bits, after the edge of a start bit.
 
     Args:
         spoken: speed of the sender, bit/s.
@@ -108,18 +108,18 @@ TCGETS2, SPEED_AT = (
 
 
 class Pty:
-    """A pseudo-terminal, raw and without echo; `read` is for one thread, all else for any.
+    """Pseudo-terminal, raw and without echo; only `read` must stay in one thread.
 
-    Written data is queued up to a limit; `read` passes it on as the host reads. Data that the host
+    Written data is queued up to a limit; `read` also passes it on to the host. Data that the host
     has not read when it closes the port is lost, as with a real port.
 
     Args:
-        link: A symbolic link that comes and goes with the terminal; None for none.
+        link: A symbolic link, created and removed with the terminal; None for none.
         fifo_bytes: Capacity of the queue for a host that does not read, in addition to the kernel's
             18 kB; with a wire, for data that it has not yet carried.
-        wire: The line's timing; None: written data arrives at once.
-        baud: Speed at which bytes are sent, bit/s: a host with another speed receives nonsense; 0:
-            any host receives it.
+        wire: Timing of the line; None delivers written data at once.
+        baud: Speed at which bytes are sent, bit/s: a host with another speed receives nonsense; 0
+            for a line without a speed.
     """
 
     def __init__(
@@ -143,14 +143,14 @@ class Pty:
 
     @property
     def name(self) -> str:
-        """Path that a host opens: the link, or the terminal itself."""
+        """Path that a host opens: that of the link, or of the terminal itself."""
         return self.path if self.link is None else str(self.link.absolute())
 
     def plug(self) -> None:
         """Create the terminal and its link.
 
         Raises:
-            ConfigError: the link's name is taken, or it cannot be made.
+            ConfigError: the link's name is taken, or the link cannot be made.
         """
         with self.lock:
             if self._master >= 0:
@@ -189,7 +189,7 @@ class Pty:
             self.wake()
 
     def close(self) -> None:
-        """Remove the terminal for good; it may be called twice."""
+        """Remove the terminal for good; safe to call twice."""
         with self.lock:
             self.pull()
             for end in self._waking:
@@ -198,10 +198,10 @@ class Pty:
             self._waking = (-1, -1)
 
     def write(self, data: bytes, answer: bool = False, takes_s: float = 0.0) -> bool:
-        """Queue all bytes; without a host or room, queue none and return False.
+        """Queue data for the host; without a host or room, queue none and return False.
 
         Args:
-            takes_s: The time that they take on the wire, s.
+            takes_s: Time that the data takes on the wire, s.
         """
         with self.lock:
             room = self.fifo_bytes + (ANSWER_BYTES if answer else 0)
@@ -230,7 +230,7 @@ class Pty:
         self.queued += len(data)
 
     def gather(self, seconds: float) -> None:
-        """Delay written data to multiples of this time, s; 0: no delay."""
+        """Deliver written data only at multiples of this time, s; 0 delivers it at once."""
         with self.lock:
             if self._wire is None and seconds:
                 self._wire = Wire()
@@ -238,7 +238,7 @@ class Pty:
                 self._wire.gather_s = seconds
 
     def read(self, timeout_s: float) -> bytes:
-        """Return data from the host, empty after the timeout; pass queued data to the host."""
+        """Pass queued data to the host, and return data from it; empty after the timeout."""
         with self.lock:
             master, plugged, wake = self._master, self._plugged, self._waking[0]
             sleep_s = timeout_s if self.heard else min(timeout_s, LOOK_S)
@@ -269,7 +269,7 @@ class Pty:
             return self._exchange()
 
     def wake(self) -> None:
-        """End a wait in `read`."""
+        """Make a `read` that waits in another thread return."""
         with self.lock:
             if self._waking[1] >= 0:
                 try:
@@ -313,7 +313,7 @@ class Pty:
             return 0
 
     def _hang_up(self) -> None:
-        """Discard the data for a host that has closed the port."""
+        """Discard all unread data, since the host has closed the port."""
         self.heard = False
         self._fifo.clear()
         self.queued = 0

@@ -1,4 +1,4 @@
-"""Transmitter of an emulated device: fits, numbers, dates and encodes samples, with faults."""
+"""Transmitter of an emulated device: numbers, time-stamps and encodes samples, with faults."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +22,7 @@ SAME = 1e-3  # relative difference below which rates count as equal
 
 
 class Transmitter:
-    """Encodes and sends samples to an endpoint, with faults; one thread at a time.
+    """Encoder and sender of samples, with faults; for one thread at a time.
 
     Attributes:
         end_ns: Time at which the stream ends, on the source's clock, ns; no fault happens just
@@ -53,22 +53,22 @@ class Transmitter:
         self._clock.begin(t_ns)
 
     def finish(self) -> None:
-        """End the stream: plug in, and send the packets held back."""
+        """End the stream: plug the device in if away, and send the packets held back."""
         self._set_away(False)
         self._release()
 
     def restart(self, t_ns: int | None = None) -> None:
-        """Restart counter and clock at zero, the clock at this moment of the source's clock."""
+        """Reset the counter to zero, and the clock to zero at source time `t_ns`."""
         self._count = 0
         self._clock.restart(t_ns)
 
     def look(self, t_ns: int) -> None:
-        """Advance to a time without a sample, and apply the faults due then."""
+        """Advance to a source time without sending, and apply the faults due then."""
         hit = self._apply_fault(t_ns)
         self._set_away(hit is not None and hit.kind == "unplug")
 
     def send(self, piece: Chunk) -> None:
-        """Number, time, encode and send these samples."""
+        """Number, time-stamp, encode and send these samples."""
         n = len(piece)
         hits: list[Fault | None] = [None] * n
         if self._faults is None:
@@ -89,7 +89,7 @@ class Transmitter:
             self._emit(number, now, packet, hit)
 
     def _apply_fault(self, t_ns: int) -> Fault | None:
-        """Return the fault of this time, applied to clock, counter and adapter at once."""
+        """Return the fault at this time; apply it to clock, counter and adapter."""
         assert self._faults is not None
         elapsed_s = (t_ns - self._first_ns) / NS_PER_S
         quiet = t_ns > self.end_ns - QUIET_S * NS_PER_S
@@ -144,7 +144,7 @@ class Transmitter:
             self._log.add(seq, t_ns, self._send_packet(packet, Fate.SENT))
 
     def _set_away(self, away: bool) -> None:
-        """Pull the device out or plug it in, as scheduled."""
+        """Unplug the device or plug it in, unless it already is."""
         if away == self.away:
             return
         self.away = away
@@ -169,7 +169,7 @@ class Transmitter:
 
 
 class EmulatedClock:
-    """The device's clock, which converts source time to device time with drift and jumps.
+    """Emulated clock of a device: converts source time to device time, with drift and jumps.
 
     Args:
         start_ns: Device time of the first sample, ns.
@@ -188,33 +188,33 @@ class EmulatedClock:
         self._source_ns = t_ns
 
     def at(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return (n,) device times, ns, not wrapped."""
+        """Convert source times, (n,) ns, to device times, (n,) ns, not wrapped."""
         passed = t_ns - self._source_ns
         if self._ppm == 0.0:
             return self._device_ns + passed
         return self._device_ns + passed + np.round(passed * (self._ppm * 1e-6)).astype(np.int64)
 
     def look(self, t_ns: int) -> None:
-        """End a drift that is over."""
+        """End a temporary drift that is over at this source time."""
         if t_ns >= self._drift_ends:
             self._anchor(t_ns)
             self._ppm, self._drift_ends = self._base_ppm, np.inf
 
     def drift(self, t_ns: int, ppm: float, duration_s: float) -> None:
-        """Set the drift, ppm, from now on for this duration, s; 0: until the end."""
+        """Set the drift, ppm, from `t_ns` on for a duration, s; 0 for no end."""
         self._anchor(t_ns)
         self._ppm = ppm
         self._drift_ends = t_ns + duration_s * NS_PER_S if duration_s else np.inf
 
     def jump(self, t_ns: int, by_ns: int) -> None:
-        """Step the clock now, by a positive or negative time."""
+        """Step the clock at source time `t_ns`, forward or back by `by_ns`."""
         self._anchor(t_ns)
         self._device_ns += by_ns
         while self._device_ns < 0:
             self._device_ns += self._wrap_ns  # which is the same on the wire
 
     def restart(self, t_ns: int | None) -> None:
-        """Restart at zero at this source time; None: at the last known time."""
+        """Reset the clock to zero at this source time; if None, the last known."""
         if t_ns is not None:
             self._source_ns = t_ns
         self._device_ns = 0
@@ -225,7 +225,7 @@ class EmulatedClock:
 
 
 class RateConverter:
-    """Samples a source at the device's rate, with the newest sample at each moment.
+    """Converter of a source's rate to the device's: repeats or drops samples.
 
     Args:
         source_hz: rate of the source, Hz.
@@ -238,7 +238,7 @@ class RateConverter:
         self._last: Chunk | None = None
 
     def at_rate(self, chunk: Chunk) -> Chunk | None:
-        """Return a chunk at the device's rate; None if no sample is due in it."""
+        """Resample a chunk to the device's rate; return None if no sample is due."""
         spec = self._codec.spec
         assert spec is not None
         rate_hz = self._codec.commanded_hz or spec.rate_hz
@@ -272,9 +272,9 @@ class RateConverter:
 def fit(source: ArraySpec, device: ArraySpec) -> Callable[[Chunk], Chunk]:
     """Return a function that converts a source's chunks to a device's spec.
 
-    The device's elements are the first of the source, in order; further ones are invalid. Its
-    channels are those of the same name, or, if no name matches, those in the same place; others are
-    0. Values are not converted, whatever the unit.
+    The device's elements are the first elements of the source, in order; further ones are invalid.
+    Its channels are those of the same name, or, if no name matches, those of the same index;
+    others are 0. Units are not converted.
     """
     if source.shape == device.shape and source.channels == device.channels:
         return lambda chunk: chunk

@@ -60,19 +60,19 @@ _NO_NAME: Final = re.compile(r"[^A-Za-z0-9_-]+")
 
 @dataclass(frozen=True)
 class BagTopic:
-    """A topic of a bag."""
+    """Topic of a bag, with its message type and columns."""
 
     name: str
     type: str
     messages: int
-    # columns of a known type, in the words of ``--columns``; empty where only a user knows them
+    # columns of a known type, in the words of ``--columns``; empty if only the user knows them
     columns: str
     # columns of an unknown type for a user to check; empty if no message holds a number
     proposed: str = ""
 
 
 def bag_topics(path: Path) -> list[BagTopic]:
-    """List the topics of a bag that have messages."""
+    """Return the topics of a bag that have messages, sorted by name."""
     found = []
     with open_bag(path) as bag:
         for name, about in sorted(bag.reader.topics.items()):
@@ -96,10 +96,10 @@ def import_bag(
 
     Args:
         output: the recording to write, whole or not at all.
-        topic: its name; empty: the only one that can become a recording.
-        columns: the meaning of a message's fields, in words or as a TOML file; empty: the built-in
-            columns of the type.
-        rate_hz: rate of the samples, Hz; 0: by their times.
+        topic: name of the topic; if empty, the only topic that can become a recording.
+        columns: the meaning of a message's fields, in words or as a TOML file; if empty, the
+            built-in columns of the type.
+        rate_hz: rate of the samples, Hz; 0 to estimate it from their times.
 
     Raises:
         ConfigError: no such topic, invalid columns, or the extra is not installed.
@@ -121,8 +121,8 @@ def import_bag(
                 f"{paths[-1]}=S.value; its fields are {shown_names(paths)}"
             )
         columns_read = parse_columns(mapping_of(words, path.stem).columns, "--columns")
-        wanted = {c.label.strip().lower() for c in columns_read if c.label}
-        steps = [_split_path(p) if p.lower() in wanted or not wanted else None for p in paths]
+        labels = {c.label.strip().lower() for c in columns_read if c.label}
+        steps = [_split_path(p) if p.lower() in labels or not labels else None for p in paths]
         table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
         table.rows = _read_rows(table, bag, chosen.name, steps, channels)
         made = import_table(table, output, words, rate_hz)
@@ -131,7 +131,7 @@ def import_bag(
 
 
 def _count_messages(made: Import, topic: BagTopic) -> Import:
-    """Count the messages by the bag's index, also those that were not read."""
+    """Update an import's counts by the bag's index, which includes unread messages."""
     unread = topic.messages - made.intact - made.corrupt
     made.unit, made.total = "messages", max(topic.messages, made.intact + made.corrupt)
     made.passed_over = made.total - made.read
@@ -155,8 +155,8 @@ def _choose_topic(path: Path, topics: list[BagTopic], topic: str, columns: str) 
     raise ConfigError(f"{path} has the topics {listed}: {what}")
 
 
-def _known_columns(kind: str, message: Any) -> str:
-    """Return the columns of a known type; empty: only a user knows them."""
+def _find_columns(kind: str, message: Any) -> str:
+    """Return the columns of a known message type, in words; empty for other types."""
     if kind in KNOWN:
         frame = getattr(getattr(message, "header", None), "frame_id", "")
         return KNOWN[kind].format(_NO_NAME.sub("_", frame).strip("_") or "sensor")
@@ -171,7 +171,7 @@ def _known_columns(kind: str, message: Any) -> str:
 
 
 def _count_channels(message: Any) -> int:
-    """Count the channels of an array message by its layout; 0 if it is empty."""
+    """Return the number of channels of an array message by its layout; 0 if empty."""
     sizes, n = [d.size for d in message.layout.dim], len(message.data)
     fits = len(sizes) > 1 and int(np.prod(sizes)) == n
     return min(n, sizes[-1] if fits else 1)
@@ -180,7 +180,7 @@ def _count_channels(message: Any) -> int:
 def _describe(
     bag: OpenBag, name: str, kind: str, n: int, most: float = np.inf
 ) -> tuple[BagTopic, list[str], int]:
-    """Describe a topic; return the paths of its numbers and the channels of arrays, too."""
+    """Return (description, paths of numbers, number of an array's channels) of a topic."""
     if kind in KNOWN:  # all messages have one size
         whole = (message for _, _, message in bag.messages(name) if message is not None)
         found = list(islice(whole, 1))
@@ -194,7 +194,7 @@ def _describe(
         for steps in [_split_path(leaf)]
     }
     listed = sorted(paths, key=paths.__getitem__)
-    columns = _known_columns(kind, found[0]) if found else ""
+    columns = _find_columns(kind, found[0]) if found else ""
     few = not columns and len(listed) < MOST  # a message with more numbers is a picture
     proposed = "" if not few else propose_fields([p for p in listed if not p.startswith(BESIDE)])
     channels = _count_channels(found[0]) if found and NUMBERS.fullmatch(kind) else 0
@@ -227,7 +227,7 @@ def _read_rows(
     bag.back = 0
     for number, (t_ns, _, message) in enumerate(bag.messages(topic), 1):
         before = times[-1:]
-        times[:] = [_header_ns(message) or t_ns]
+        times[:] = [_read_header_ns(message) or t_ns]
         bag.back += before > times
         row, missing = _read_row(message, steps) if message is not None else ([], 0)
         if row and channels > 1 and _count_channels(message) not in (0, 1, channels):
@@ -243,10 +243,10 @@ def _read_rows(
 
 
 def _read_row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[Any], int]:
-    """Take the numbers of a message, NaN for one that it lacks, and count those.
+    """Return (numbers of a message, NaN if missing; count of missing numbers).
 
     Args:
-        steps: path of each number; None: the number is left out, as NaN.
+        steps: path of each number; None leaves the number out, as NaN.
     """
     row, missing = [], 0
     for path in steps:
@@ -260,14 +260,14 @@ def _read_row(message: Any, steps: list[list[int | str] | None]) -> tuple[list[A
     return row, missing
 
 
-def _header_ns(message: Any) -> int:
+def _read_header_ns(message: Any) -> int:
     """Return the time in a message's header, ns; 0 if missing or not set."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec) if stamp else 0
 
 
 def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
-    """Write our own samples from a bag as a recording, bit for bit."""
+    """Write samples of our own message type as a recording, bit for bit."""
     account = Import(notes=bag.notes)
     array = _find_array(bag, topic.name)
     chunks: list[Chunk] = []
@@ -285,7 +285,7 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
         with suppress(ValueError):
             chunk = decode_samples(messages.strip_header(raw), shape)
             if not chunks:
-                offset = (_header_ns(message) or t_ns) - int(chunk.t_ns[-1])
+                offset = (_read_header_ns(message) or t_ns) - int(chunk.t_ns[-1])
             if not chunks or chunk.values.shape[1:] == chunks[0].values.shape[1:]:
                 chunks.append(chunk)
     account.intact, account.corrupt = len(chunks), read - len(chunks)
@@ -303,7 +303,7 @@ def _import_own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Impo
 
 
 def _find_array(bag: OpenBag, samples: str) -> ArraySpec | None:
-    """Read the array of a topic of samples from the topic beside it; None: missing."""
+    """Read the array of a samples topic from the topic beside it; None if missing."""
     beside = f"{samples.rpartition('/')[0]}/{ARRAY}"
     if beside not in bag.reader.topics or bag.reader.topics[beside].msgtype != messages.ARRAY:
         return None
@@ -314,7 +314,7 @@ def _find_array(bag: OpenBag, samples: str) -> ArraySpec | None:
 
 
 def _make_array(name: str, chunk: Chunk) -> ArraySpec:
-    """Make the spec of an array of which only shape and rate are known."""
+    """Make the spec of an array from the shape and rate of its samples."""
     _, elements, channels = chunk.values.shape
     steps = np.diff(chunk.t_ns)
     rate = NS_PER_S / float(np.median(steps)) if len(steps) else 1.0

@@ -1,7 +1,7 @@
 """Files and folders of ROS bags, opened by the library rosbags, also if they are damaged.
 
 An MCAP file that has lost its end lacks the index, which every library reads first. Its records
-are still there one after the other, also those of a chunk that is cut short.
+can still be read one after another, also those of a chunk that is cut short.
 """
 
 import struct
@@ -28,7 +28,7 @@ TIMES_AND_SUM: Final = 8 + 8 + 8 + 4  # bytes of a chunk before the name of its 
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether this is a ROS bag, or an MCAP file."""
+    """Return whether a path is a ROS bag or an MCAP file."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     with open_regular(path) as file:
@@ -40,7 +40,7 @@ def is_bag(path: Path) -> bool:
 
 @dataclass
 class OpenBag:
-    """An open bag."""
+    """Open bag, which reads the messages of its topics."""
 
     reader: Any
     notes: list[str] = field(default_factory=list)
@@ -117,7 +117,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
 
 
 def _mend_bag(path: Path, new: Path) -> int:
-    """Copy the intact records without an index; return the number of messages."""
+    """Copy a bag's intact records to a file without index; return the number of messages."""
     n = 0
     with open_regular(path) as file, new.open("wb") as made:
         made.write(file.read(len(MAGIC)))
@@ -143,7 +143,7 @@ def _split_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
 
 
 def _unpack_chunk(data: bytes) -> bytes:
-    """Unpack the data of a chunk, as far as they are present."""
+    """Unpack the data of a chunk; if it is cut short, as much as possible."""
     (n,) = struct.unpack_from("<I", data, TIMES_AND_SUM)
     begin = TIMES_AND_SUM + 4 + n
     kind, packed = data[TIMES_AND_SUM + 4 : begin], data[begin + 8 :]

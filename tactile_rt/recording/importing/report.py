@@ -25,7 +25,7 @@ SHOWN: Final = 8  # most channels in the text
 
 @dataclass
 class Import:
-    """Contents of an imported file: what was read, lost and left out, and the samples."""
+    """Result of an import: counts of data read, lost and left out, and of samples."""
 
     samples: int = 0
     intact: int = 0
@@ -39,11 +39,11 @@ class Import:
     total: int = 0
     read: int = 0
     passed_over: int = 0
-    out_of_order: int | None = None  # number of times that go back; None: not counted
+    out_of_order: int | None = None  # number of times that go back; None if not counted
     first: str = ""
     last: str = ""
-    found_hz: float | None = None  # rate by the times of the file; None: it has no times
-    # rate by the codec or the user; None: only the times give a rate
+    found_hz: float | None = None  # rate by the times in the file; None if it has no times
+    # rate by the codec or the user; None if only the times give a rate
     said_hz: float | None = None
     first_missing: int | None = None  # number of the sample before the first missing one
     invalid: int = 0  # number of samples with an invalid element
@@ -53,7 +53,7 @@ class Import:
 
 
 def measure_samples(account: Import, path: Path) -> None:
-    """Fill in the number, times, gaps and ranges of the samples of a recording."""
+    """Read a recording; fill in number, times, gaps and ranges of its samples."""
     stored = Recording(path)
     spec, offset, chunks = stored.spec, stored.description.utc_offset_ns, iter(stored)
     low = high = np.full(spec.shape, np.nan, np.float32)
@@ -81,7 +81,7 @@ def measure_samples(account: Import, path: Path) -> None:
 
 
 def show_time(t_ns: int) -> str:
-    """Write a time (ns) as UTC if it counts from 1970, else in seconds."""
+    """Format a time, ns, as UTC if it counts from 1970, else in seconds."""
     if t_ns < UTC_FROM_NS:
         return f"{round(t_ns / NS_PER_S, 6):.12g} s"
     return datetime.fromtimestamp(t_ns // NS_PER_S, UTC).strftime("%Y-%m-%d %H:%M:%S") + (
@@ -90,7 +90,7 @@ def show_time(t_ns: int) -> str:
 
 
 def report_lines(report: Import) -> list[str]:
-    """Write a report as lines of text: counts, times, and the range of each channel."""
+    """Return a report as lines of text: counts, times, and the range of each channel."""
     hz = [
         f"{rate:.6g} Hz {what}"
         for rate, what in ((report.found_hz, "by its times"), (report.said_hz, "said"))
@@ -125,7 +125,7 @@ def clock_of(first_ns: int) -> int:
 def write_chunks(
     output: Path, about: Description, chunk: Chunk, account: Import, what: str
 ) -> Import:
-    """Write a recording of these samples, cut as a live source would.
+    """Write samples as a recording, in chunks as long as those of a live source.
 
     Args:
         output: the file to write, whole or not at all.

@@ -59,22 +59,22 @@ SHOWN: Final = 600  # characters of names in a message
 
 @dataclass
 class Table:
-    """Table whose rows are read one after the other."""
+    """Table of text or numbers, whose rows are read one after another."""
 
     path: Path
     names: tuple[str, ...]
-    # rows, each with as many cells as there are columns: texts or numbers
+    # rows, each with one cell per column: texts or numbers
     rows: Iterable[Sequence[Any]]
     # times of the rows read so far, ns, if the table has times beside its columns; else None
     times_ns: list[int] | None = None
     # sentences on what could not be read; complete once all rows were read
     notes: list[str] = field(default_factory=list)
     line: int = 0  # number of the text line that was read last
-    width: int = 0  # number of cells of every complete row; 0: any number
+    width: int = 0  # number of cells of every complete row; 0 for any number
 
 
 def shown_names(names: Sequence[str]) -> str:
-    """List the names of columns for a message, shortened."""
+    """Return a shortened list of column names, for a message."""
     text = compress_columns([f'"{n}"' if "," in n else n for n in names])
     return text if len(text) <= SHOWN else f"{text[:SHOWN]} ..."
 
@@ -89,7 +89,7 @@ def mapping_of(columns: str, name: str) -> LineMapping:
 def place_columns(
     columns: Sequence[Column], names: Sequence[str], where: str
 ) -> tuple[list[int], list[str]]:
-    """Find the cell of each column in a row. Return a note on unused cells, too.
+    """Return the cell index of each column in a row, and notes on unused cells.
 
     Raises:
         ConfigError: no column has that name or place.
@@ -114,12 +114,12 @@ def place_columns(
 
 
 def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0) -> Import:
-    """Write rows of numbers as a recording.
+    """Convert a table of numbers to a recording.
 
     Args:
         output: the recording to write, whole or not at all.
         columns: the meaning of the columns: words, or the path of a TOML file.
-        rate_hz: rate of the samples, Hz; 0: by their times.
+        rate_hz: rate of the samples, Hz; 0 to estimate it from their times.
 
     Raises:
         ConfigError: the columns are invalid, or neither times nor a rate are given.
@@ -191,7 +191,7 @@ def read_samples(
 
 @dataclass
 class ReadRows:
-    """Contents of the rows of a table."""
+    """Values, times and counts read from the rows of a table."""
 
     values: NDArray[np.float32]
     times: NDArray[np.int64] | None
@@ -318,7 +318,7 @@ def _number_rows(
 def _sort_rows(
     times: NDArray[np.int64], account: Import
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort rows by time. Return their order, and times that go back only at a new stretch."""
+    """Sort rows by time; return (order, times, which decrease only between stretches)."""
     order, steps = np.arange(len(times)), np.diff(times)
     back = np.flatnonzero(steps < 0)
     if not len(back):
@@ -360,7 +360,7 @@ def _sort_rows(
 
 
 def _find_outliers(times: Sequence[int]) -> list[int]:
-    """Return the fewest places whose removal leaves no step back; of several, the last."""
+    """Return the fewest indices to remove so that times never decrease; prefer later ones."""
     ends: list[int] = []
     last: list[int] = []
     after = [-1] * len(times)

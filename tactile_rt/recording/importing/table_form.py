@@ -84,7 +84,7 @@ def csv_form(
 
     Args:
         path: the file; gzip is unpacked.
-        delimiter: separator of cells: a character, tab or space; empty: it is detected.
+        delimiter: separator of cells: a character, tab or space; empty to detect it.
 
     Raises:
         RecordingError: the lines are no table of numbers.
@@ -121,7 +121,7 @@ def csv_form(
 
 
 def _check_cells(path: Path, head: list[str]) -> None:
-    """Raise ConfigError where most cells are numbers with units: 0.10N,10.00mN."""
+    """Raise ConfigError if most cells are numbers with units: 0.10N,10.00mN."""
     cells = [c.strip(' "') for x in head for c in re.split("[,;\t ]+", x.strip())]
     glued = [c for c in cells if (found := _GLUED.fullmatch(c)) and _UNIT.fullmatch(found[1])]
     if 2 * len(glued) > len(cells):
@@ -131,7 +131,7 @@ def _check_cells(path: Path, head: list[str]) -> None:
 
 
 def _compare_header(path: Path, above: list[str], form: CsvForm) -> CsvForm:
-    """Split a header by another delimiter than the rows. Note too few or too many names.
+    """Split a header by its own delimiter; return the form with names or a note.
 
     Raises:
         ConfigError: the decimal mark may be the delimiter, too.
@@ -149,7 +149,7 @@ def _compare_header(path: Path, above: list[str], form: CsvForm) -> CsvForm:
 
 
 def _check_layout(path: Path, head: list[str], form: CsvForm) -> None:
-    """Raise ConfigError where each row is a channel, or belongs to one sensor of several."""
+    """Raise ConfigError if each row is a channel, or belongs to one of several sensors."""
     cells = (_split_cells(x, form.delimiter, form.comma) for x in head[form.first :])
     rows = [[c.strip(' "') for c in row] for row in cells if len(row) == form.width]
     names = list(dict.fromkeys(row[0] for row in rows if row[0][:1].isalpha()))
@@ -209,7 +209,7 @@ def _read_rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
 
 
 def _measure_end(cells: Sequence[str], width: int) -> tuple[int, int]:
-    """Count the digits of a row's last cell: (after its point, all without a point)."""
+    """Return (digits after the last cell's decimal point, its digits if it has none)."""
     whole, point, rest = cells[-1].strip().partition(".") if len(cells) == width else ("", "", "")
     return len(rest), 0 if point else len(whole)
 
@@ -230,7 +230,7 @@ def _join_lines(
     """Yield the text of each row, joined from ``lines`` lines, after the skipped ones.
 
     Args:
-        cut: gets the last line, if that has no line ending.
+        cut: list to which the last line is appended if it has no line ending.
     """
     begun: list[str] = []
     # all kinds of line endings count; a line without one may be cut
@@ -269,7 +269,7 @@ def _split_cells(line: str, delimiter: str, comma: bool) -> list[str]:
 
 
 def _split_list(cell: str) -> list[str]:
-    """Split a cell that is a list of numbers; any other cell stays one."""
+    """Split a cell that lists numbers into items; return any other cell as one."""
     plain = cell.strip().strip('"')
     return re.sub(r"[\[\](),;]", " ", plain).split() if _LIST.fullmatch(plain) else [cell]
 
@@ -286,14 +286,14 @@ def _is_number(cell: str) -> bool:
 
 
 def _has_decimal_commas(line: str) -> bool:
-    """Return whether a line is cut by spaces and has commas, all as decimal marks."""
+    """Return whether spaces separate a line's cells, and all commas are decimal marks."""
     words = line.split()
     cut = [w for w in words if "," in w]
     return len(words) > 1 and bool(cut) and all(map(_COMMA.fullmatch, cut))
 
 
 def _fit_form(head: list[str], delimiter: str, comma: bool) -> list[tuple[float, CsvForm]]:
-    """Fit a form to the lines. Return its score and the form, or nothing if it does not fit."""
+    """Fit a form to the lines; return [(score, form)], empty if it does not fit."""
     rows = [
         (k, _split_cells(x, delimiter, comma))
         for k, x in enumerate(head)
@@ -349,7 +349,7 @@ def _fit_form(head: list[str], delimiter: str, comma: bool) -> list[tuple[float,
 
 
 def _count_items(line: str, delimiter: str, comma: bool) -> list[int]:
-    """Count the items of each cell of a line: a list has several. Empty: no cell is a list."""
+    """Count the items in each cell of a line; empty without lists."""
     if delimiter == " " or not _LIST.search(line):
         return []
     packed = _LIST.sub(lambda found: "~" * len(_split_list(found[0])), line)
@@ -359,8 +359,8 @@ def _count_items(line: str, delimiter: str, comma: bool) -> list[int]:
 def _find_names(
     above: list[str], delimiter: str, comma: bool, width: int, spans: list[int]
 ) -> tuple[tuple[str, ...], tuple[str, ...], int]:
-    """Find the names of the columns and the units below them (empty: none). Return the number of
-    the line below these, too."""
+    """Find the names of the columns and the units below them, empty if none. Also return the
+    number of the line below these."""
     units: tuple[str, ...] = ()
     end, next_above = 0, True
     for k, line in reversed(list(enumerate(above, start=1))):
@@ -395,7 +395,7 @@ def _find_names(
 
 
 def _make_distinct(names: list[str]) -> list[str]:
-    """Number the names that are empty or repeated by their place; keep the others."""
+    """Append the column's number to empty and repeated names; keep the others."""
     seen: set[str] = set()
     made = []
     for k, name in enumerate(names, start=1):

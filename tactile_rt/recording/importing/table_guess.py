@@ -31,18 +31,18 @@ ORDERS = {"": "year", "mdy": "month", "dmy": "day"}
 
 @dataclass(frozen=True)
 class ProposedColumns:
-    """Proposed columns of a file."""
+    """Proposed columns of a file, with an explanation for the user."""
 
     columns: str  # columns in words; empty where the file cannot be read with any that were found
     table: bool  # whether the file is to be read as a table; else as what a board prints
     timed: bool
     said: str
     samples: int = 0
-    rate_hz: float = 0.0  # rate by the header, Hz; 0: the header contains none
+    rate_hz: float = 0.0  # rate in the header, Hz; 0 if it has none
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
-    """Propose the columns of a board's printed lines; None where they hold no samples."""
+    """Propose the columns of a board's printed lines; None if they hold no samples."""
     data = b"\n" + data  # the data begin with a whole line
     guess = guess_line_columns(data) or guess_line_columns(data[len(data) // 2 :])
     if guess is None:
@@ -56,12 +56,12 @@ def propose_line_columns(data: bytes) -> ProposedColumns | None:
     whole, lines = codec.stats.intact, len(data.splitlines()) - 1
     if whole < max(LEAST, codec.stats.corrupt):
         return None
-    said = f"{whole} samples in the first {lines} lines"
-    return ProposedColumns(columns, False, "time" in columns, said, whole)
+    summary = f"{whole} samples in the first {lines} lines"
+    return ProposedColumns(columns, False, "time" in columns, summary, whole)
 
 
 def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
-    """Propose the columns of a text file; None where it has none."""
+    """Propose the columns of a text file; None if it has none."""
     try:
         form = csv_form(path)
     except RecordingError:
@@ -99,25 +99,25 @@ def _propose_table_columns(path: Path, form: CsvForm) -> ProposedColumns | None:
             if order := _find_order([f"{r[k].strip() or '-'} {r[min(clocks)]}" for r in rows]):
                 clocks[k], words[k] = order, "time:iso"
                 break
-    said = f"{path} is a table of {form.width} columns"
+    summary = f"{path} is a table of {form.width} columns"
     left = [n for n, word in zip(form.names, words, strict=False) if word == "-"]
-    said += f" (left out: {shown_names(left)})" if left else ""
-    said += f"; {form.note}" if form.note else ""
+    summary += f" (left out: {shown_names(left)})" if left else ""
+    summary += f"; {form.note}" if form.note else ""
     unread = list_unread_units(names, words)
-    said += f"; units that are not read: {shown_names(unread)}" if unread else ""
+    summary += f"; units that are not read: {shown_names(unread)}" if unread else ""
     if not any("." in word for word in words if not word.startswith("time")):
         none = f"no number of a measurement in {shown_names(left)}"
         return ProposedColumns("", True, timed, none) if left and timed else None
     for k, order in clocks.items():
         if words[k] == "time:iso" and order != "iso":
             words[k] = f"time:{order}"
-            said += f", {rows[0][k].strip()} with the {ORDERS[order]} first"
+            summary += f", {rows[0][k].strip()} with the {ORDERS[order]} first"
     for k in sorted(set(range(form.width)) - clocks.keys()):
         if rows and sum(bool(_CLOCK.search(row[k])) for row in rows) >= len(rows) * DATED:
-            said += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
+            summary += f"; {rows[0][k].strip()!r:.40} in column {k + 1} is no time that is read"
     if form.names:
         words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    found = ProposedColumns(compress_columns(words), True, timed, said, rate_hz=_find_rate(form))
+    found = ProposedColumns(compress_columns(words), True, timed, summary, rate_hz=_find_rate(form))
     return _try_import(path, form, found)
 
 
@@ -129,7 +129,7 @@ def _find_rate(form: CsvForm) -> float:
 
 
 def _find_order(cells: Sequence[str]) -> str:
-    """Return the order of the numbers of dates, ``iso``, ``mdy`` or ``dmy``; empty: no dates."""
+    """Return the order of numbers in dates, ``iso``, ``mdy`` or ``dmy``; empty without dates."""
     cells = [c.strip() for c in cells if c.strip()] or ["no date"]
     read = {
         o: sum(":" in c and number(in_seconds(c, o)) is not None for c in cells) for o in ORDERS
@@ -140,7 +140,7 @@ def _find_order(cells: Sequence[str]) -> str:
 
 
 def _try_import(path: Path, form: CsvForm, proposed: ProposedColumns) -> ProposedColumns:
-    """Return the proposal, without its columns if the first rows cannot be read with them."""
+    """Try a proposal on the first rows; return it, without columns if that fails."""
     table = read_table(path, form)
     table.rows = islice(table.rows, LOOKED_AT)
     try:
@@ -153,7 +153,7 @@ def _try_import(path: Path, form: CsvForm, proposed: ProposedColumns) -> Propose
 
 
 def propose_fields(paths: Sequence[str]) -> str:
-    """Propose columns for the largest array of a message, or for its fields.
+    """Propose columns for the largest array in a message, or for its fields, in words.
 
     Args:
         paths: Path of each number, as ``sensors.0.values.3``.

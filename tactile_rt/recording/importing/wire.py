@@ -1,8 +1,8 @@
 """Import of a log of a serial line or CAN bus: a codec decodes it; the packets are stored, too.
 
 Packets with a time of arrival are decoded as in live use. If the log has no times, the device's own
-clock dates the samples. A device without a clock is assumed to have sent at its nominal rate;
-samples that were lost, by its counter or its damaged frames, take up their time, too.
+clock dates the samples. A device without a clock is assumed to have sent at its nominal rate,
+including the samples that were lost according to its counter or damaged frames.
 """
 
 from collections import deque
@@ -40,7 +40,7 @@ def import_wire(
     Args:
         output: the recording to write, whole or not at all.
         fields: ``codec`` and its options, as in a URL, also ``array``.
-        rate_hz: rate of the samples, Hz; 0: the codec's rate.
+        rate_hz: rate of the samples, Hz; 0 for the codec's rate.
 
     Raises:
         ConfigError: no such codec or option, or the log lacks the device's description of itself.
@@ -48,7 +48,7 @@ def import_wire(
     codec, about = _prepare(log, fields, rate_hz)
     log.names = getattr(codec, "names", {})
     if log.form == "raw":
-        log.piece = _sample_size(log, make_codec(log.wire, about.codec, _codec_options(fields)))
+        log.piece = _measure_sample(log, make_codec(log.wire, about.codec, _select_options(fields)))
     account, stats = Import(), SourceStats()
 
     def fill(file: BinaryIO) -> None:
@@ -120,8 +120,8 @@ def _fill_account(log: LineLog, decoded: "_DecodedLog", account: Import) -> None
 def _prepare(
     log: LineLog, fields: Mapping[str, str], rate_hz: float
 ) -> tuple[Codec[Any], Description]:
-    """Make the codec, and the recording's description as far as it is known without packets."""
-    own, name, array = _codec_options(fields), fields.get("codec", ""), fields.get("array", "")
+    """Return the codec, and the recording's description before any packet is decoded."""
+    own, name, array = _select_options(fields), fields.get("codec", ""), fields.get("array", "")
     if not name:
         raise ConfigError("--as needs codec=NAME, see `tactile-rt codecs`")
     if log.form == "raw" and ("can", name) in CODECS and ("serial", name) not in CODECS:
@@ -148,13 +148,13 @@ def _prepare(
     return codec, about
 
 
-def _codec_options(fields: Mapping[str, str]) -> dict[str, str]:
-    """Select the options of the codec."""
+def _select_options(fields: Mapping[str, str]) -> dict[str, str]:
+    """Return the fields that are options of the codec."""
     return {k: v for k, v in fields.items() if k not in ("codec", "array")}
 
 
-def _sample_size(log: LineLog, codec: Codec[Any]) -> int:
-    """Measure the bytes per sample: packets of this size give each sample its own time."""
+def _measure_sample(log: LineLog, codec: Codec[Any]) -> int:
+    """Measure the mean bytes per sample, so that packets of that size hold one sample."""
     size = frames = 0
     for packet, _ in log.packets():
         codec.feed(packet, 0)
@@ -176,7 +176,7 @@ class _DecodedLog:
             "frame" if log.wire == "can" else "byte" if log.form == "raw" else "packet"
         )
         self._count: int | None = None  # count of the newest sample
-        codec.commands(Command.START)  # some codecs remember what they asked for
+        codec.commands(Command.START)  # some codecs store what they have requested
         lines = log.form in ("raw", "terminal")  # forms that begin with a whole line
         packets = _cut_last(log.packets(), getattr(codec, "line_end", b"") if lines else b"")
         waiting: list[tuple[Any, int | None, Samples | None]] = []
@@ -214,7 +214,7 @@ class _DecodedLog:
 
     @property
     def clock_steps(self) -> int:
-        """Number of times that the device's own clock went back or began anew."""
+        """Number of times that the device's own clock went back or restarted."""
         clock = self._stamper.clock
         return clock.steps if isinstance(clock, DeviceTime) else 0
 
@@ -246,7 +246,7 @@ class _DecodedLog:
             yield packet, self._now, self._stamper.chunk(samples)
 
     def _count_periods(self, samples: Samples) -> int:
-        """Count the periods of these samples and of those lost before them."""
+        """Return the number of these samples and of those lost before them."""
         n = len(samples)
         bits, before = self._codec.count_bits, self._count
         if samples.count is None or bits is None:
@@ -261,7 +261,7 @@ class _DecodedLog:
 def _cut_last(
     packets: Iterator[tuple[Any, int | None]], lead: bytes
 ) -> Iterator[tuple[Any, int | None]]:
-    """Put `lead` before the first packet, and cut the last packets into single bytes."""
+    """Yield packets, with `lead` before the first, and the last cut into single bytes."""
     last: deque[tuple[Any, int | None]] = deque()
     for packet, t_ns in packets:
         last.append((lead + packet if lead else packet, t_ns))

@@ -34,7 +34,7 @@ LINE = "=" * 80
 
 
 class Field(NamedTuple):
-    """A field of a message."""
+    """Field of a message, with its type."""
 
     name: str
     kind: str  # type of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``
@@ -57,7 +57,7 @@ def fields_of(message: str) -> tuple[Field, ...]:
 
 @cache
 def schema_text(message: str) -> str:
-    """Return a definition with all others that it uses, in MCAP's form ``ros2msg``."""
+    """Return a message's definition, with those that it uses, in MCAP's form ``ros2msg``."""
     needed: list[str] = []
 
     def collect(name: str) -> None:
@@ -78,7 +78,7 @@ def dds_type(message: str) -> str:
 
 
 def token(text: str) -> str:
-    """Turn a text into one word of a topic. ROS 2 allows only letters, digits and ``_``."""
+    """Convert a text to one word of a topic. ROS 2 allows only letters, digits and ``_``."""
     word = re.sub(r"[^A-Za-z0-9_]", "_", text) or "_"
     return f"_{word}" if word[0].isdigit() else word
 
@@ -95,11 +95,11 @@ NS = 10**9
 
 
 def encode(message: str, values: Mapping[str, Any]) -> bytes:
-    """Encode a message.
+    """Encode a message in CDR.
 
     Args:
-        message: The name, such as ``tactile_rt_msgs/msg/Event``.
-        values: By name of field; a nested message is a mapping itself.
+        message: Name of its type, such as ``tactile_rt_msgs/msg/Event``.
+        values: Values by field name; a nested message is a mapping itself.
     """
     out = bytearray(CDR)
     _encode_fields(out, message, values)
@@ -107,7 +107,7 @@ def encode(message: str, values: Mapping[str, Any]) -> bytes:
 
 
 def decode(message: str, data: bytes) -> dict[str, Any]:
-    """Decode the values of a message by field. Raise ValueError if it is not of this type."""
+    """Decode a message to values by field. Raise ValueError if it is not of this type."""
     if data[:4] != CDR:
         raise ValueError(f"{data[:4]!r} begins no message in CDR")
     try:
@@ -127,7 +127,7 @@ def header(utc_ns: int, frame: str) -> bytes:
 
 
 def header_size(data: bytes) -> int:
-    """Return the number of bytes of a message that `header` wrote."""
+    """Return the number of bytes at the beginning of a message that `header` wrote."""
     if len(data) < 16:
         raise ValueError(f"{len(data)} bytes have no header")
     (length,) = struct.unpack_from("<I", data, 12)

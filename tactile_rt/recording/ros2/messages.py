@@ -22,7 +22,7 @@ UInt32 = Annotated[int, msgspec.Meta(ge=0, le=2**32 - 1)]
 
 
 class _Message(msgspec.Struct):
-    """Fields that are read from a JSON message; missing ones have these defaults."""
+    """Fields that are read from a JSON message; missing fields get these defaults."""
 
     type: str = "device"
     t_ns: Int64 = 0
@@ -65,7 +65,7 @@ class _Event(_Message):
 
 
 def decision_message(text: bytes) -> bytes:
-    """Encode a decision, a line of JSON. One that cannot be parsed gets default fields."""
+    """Encode a decision from a line of JSON; use default fields if it is malformed."""
     try:
         parsed = msgspec.json.decode(text, type=_Decision)
     except msgspec.MsgspecError:
@@ -91,7 +91,7 @@ def decision_message(text: bytes) -> bytes:
 
 
 def event_message(text: bytes) -> bytes:
-    """Encode an event or health, a line of JSON. One that cannot be parsed gets default fields."""
+    """Encode an event or health from JSON; use default fields if it is malformed."""
     try:
         parsed = msgspec.json.decode(text, type=_Event)
     except msgspec.MsgspecError:
@@ -113,7 +113,7 @@ def json_of(message: str, data: bytes) -> bytes:
 
 
 def array_message(spec: ArraySpec, source: str, utc_ns: int) -> bytes:
-    """Encode the description of an array."""
+    """Encode the spec of an array as a message."""
     rows, columns = zip(*spec.grid, strict=True)
     poses = [
         {"position": _vector(position), "orientation": {"w": w, "x": x, "y": y, "z": z}}
@@ -139,7 +139,7 @@ def add_header(samples: bytes, utc_ns: int, frame: str) -> bytes:
 
 
 def strip_header(data: bytes) -> bytes:
-    """Remove the header that `add_header` inserted; raise ValueError if none is there."""
+    """Remove the header that `add_header` inserted; raise ValueError if it is missing."""
     at = cdr.header_size(data)
     at += -at % 4
     many = data[at : at + 4]
@@ -153,10 +153,10 @@ def wrenches_of(spec: ArraySpec, values: NDArray[np.float32]) -> NDArray[np.floa
 
     Args:
         spec: The array; only an array of one element that measures fx, fy and fz in N has a wrench.
-        values: (n, 1, channel) of such an array.
+        values: (n, 1, channel) values of such an array, SI.
 
     Returns:
-        (n, 6) N and N m; where the element measures no torque, that of the force alone. None: the
+        (n, 6) N and N m; if the element measures no torque, that of the force alone. None if the
         array has no wrench.
     """
     units = dict(zip(spec.channels, spec.units, strict=True))
@@ -173,7 +173,7 @@ def wrenches_of(spec: ArraySpec, values: NDArray[np.float32]) -> NDArray[np.floa
 
 
 def wrench_message(wrench: Sequence[float], utc_ns: int, frame: str) -> bytes:
-    """Encode a row of `wrenches_of`, of this time, in the mount frame."""
+    """Encode a row of `wrenches_of` with its UTC time, ns, in the mount frame."""
     parts = {"force": _vector(wrench[:3]), "torque": _vector(wrench[3:])}
     return cdr.encode(WRENCH, {"header": _header(utc_ns, frame), "wrench": parts})
 
@@ -183,7 +183,7 @@ def _vector(numbers: Any) -> Mapping[str, float]:
 
 
 def array_of(data: bytes) -> ArraySpec:
-    """Decode a message of `array_message`; raise ValueError if it is none."""
+    """Decode a message of `array_message` to a spec; raise ValueError if it is none."""
     fields = cdr.decode(ARRAY, data)
     poses = fields["poses"]
     return ArraySpec(
