@@ -58,8 +58,8 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes:
         host: The address to listen on. Foxglove's protocol has no password.
         port: The TCP port to listen on; 0: a free one.
-        rate_hz: The largest number of pictures and values a second, Hz.
-        m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen by the largest force.
+        rate_hz: The highest rate of ``scene`` and ``values`` messages, Hz.
+        m_per_n: The length of the arrow of a force of 1 N, m; 0 adapts it to the largest force.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"
@@ -244,8 +244,8 @@ class FoxglovePublisher(Consumer):
 
 
 def schema_of(message: Message) -> dict[str, Any]:
-    """Return a message's JSON schema for Foxglove, which takes no references. That of a decision
-    has its labels, so that each probability can be chosen for a plot."""
+    """Return a message's JSON schema without references, as Foxglove needs it. The schema of a
+    decision lists its labels, so that each probability can be chosen for a plot."""
     schema = _infer_schema(msgspec.to_builtins(message))
     return {"title": f"tactile.{type(message).topic}", **schema}
 
@@ -260,7 +260,7 @@ def _infer_schema(value: Any) -> dict[str, Any]:
 
 
 def _group_values(spec: ArraySpec, values: list[list[float]], valid: list[bool]) -> dict[str, Any]:
-    """Return {channel: {element: value}}, with None where a value is not trustworthy."""
+    """Return a sample as {channel: {element: value}}, with None for invalid elements."""
     return {
         channel: {
             element: row[c] if ok else None

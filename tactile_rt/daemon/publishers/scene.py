@@ -35,11 +35,11 @@ FORCE = Color(r=0.95, g=0.5, b=0.1, a=1.0)
 
 
 class Scene:
-    """The pictures of one array.
+    """Builder of the 3-D scene updates of one array, in its mount frame.
 
     Args:
-        m_per_n: length of the arrow of 1 N, m; 0: so that the largest force of the last half
-            minute is as long as a third of the array.
+        m_per_n: Length of the arrow of 1 N, m; 0 scales the largest force of the last half minute
+            to a third of the array's extent.
     """
 
     def __init__(self, source: str, spec: ArraySpec, m_per_n: float) -> None:
@@ -53,7 +53,7 @@ class Scene:
         self._spacing = self._extent / max(1.0, len(self._at) ** 0.5)
 
     def bases(self, utc_ns: int) -> SceneUpdate:
-        """Draw the positions of the elements and their directions, the own x axes."""
+        """Draw the elements' positions as spheres and their own x axes as lines."""
         ends = self._at + 0.5 * self._spacing * self._turns[:, :, 0]
         size = 0.15 * self._spacing
         spheres = [
@@ -78,11 +78,11 @@ class Scene:
     def forces(
         self, values: NDArray[np.float32], valid: NDArray[np.bool_], utc_ns: int
     ) -> SceneUpdate | None:
-        """Draw an arrow per element with a trustworthy value; None without force channels.
+        """Draw the force of each valid element as an arrow; return None without force channels.
 
         Args:
-            values: (element, channel), forces in each element's own frame, N.
-            valid: (element,).
+            values: (element, channel) One sample, with forces in each element's own frame, N.
+            valid: (element,) Whether the values of the element are trustworthy.
         """
         if not self._columns:
             return None
@@ -102,7 +102,7 @@ class Scene:
         return SceneUpdate(entities=[entity])
 
     def gone(self, utc_ns: int) -> SceneUpdate:
-        """Remove the array and its forces from the scene."""
+        """Return the update that removes the array and its forces from the scene."""
         return SceneUpdate(
             deletions=[
                 SceneEntityDeletion(timestamp=_time(utc_ns), id=f"{self._source}/{what}")
@@ -129,7 +129,7 @@ class Scene:
 
 
 def force_columns(spec: ArraySpec) -> dict[int, int]:
-    """Return the channels of an array's forces in N, by axis (0: x)."""
+    """Return the channel number of each force in N, by its axis (0 is x)."""
     return {
         axis: spec.channels.index(name)
         for axis, name in enumerate(FORCES)
@@ -138,7 +138,7 @@ def force_columns(spec: ArraySpec) -> dict[int, int]:
 
 
 def turn_x_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute unit quaternions (n, 4), w first, from x to unit vectors (n, 3)."""
+    """Return unit quaternions (n, 4), w first, that rotate x to unit vectors (n, 3)."""
     x, y, z = directions.T
     # Half-way between the axis and the direction; for opposite ones, any half turn will do.
     found = np.stack([1 + x, np.zeros_like(x), -z, y], axis=1)

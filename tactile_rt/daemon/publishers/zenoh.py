@@ -53,7 +53,7 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ZenohPublisher(Sender):
-    """A Zenoh peer that puts messages; it listens only at the endpoints of `listen`."""
+    """A Zenoh peer that publishes messages; it listens only at the endpoints of `listen`."""
 
     Options = ZenohOptions
 
@@ -136,7 +136,7 @@ def _port_text(address: str) -> str:
 
 
 def _find_port(endpoint: str) -> int:
-    """Return an endpoint's TCP port; 0: none, or a free port that stays unknown."""
+    """Return an endpoint's TCP port, or 0 if it has none or any free one."""
     protocol, _, address = endpoint.partition("/")
     return int(_port_text(address)) if protocol in ("tcp", "tls", "ws") else 0
 
