@@ -41,7 +41,7 @@ class View(Protocol):
         """Post an event to the log and all other consumers."""
 
     def send(self, consumer: str, control: Control) -> bool:
-        """Send a control to another consumer, e.g. ``recorder``; return whether it was delivered."""
+        """Send a control to a consumer, such as ``recorder``; return whether it was delivered."""
 
     def utc_offset_ns(self) -> int:
         """Return UTC minus host monotonic time at this moment, ns."""
