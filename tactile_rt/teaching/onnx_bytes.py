@@ -1,6 +1,6 @@
 """ONNX files written byte by byte, since robots do not have the package `onnx`.
 
-Only the parts of ``onnx.proto`` (IR version 10) that a graph of a few operators needs. Numbers are
+It covers only what a graph of a few operators needs of ``onnx.proto`` (IR version 10). Numbers are
 protocol buffers' varints; a message within a message is its length and then its bytes.
 """
 
@@ -68,7 +68,7 @@ def _read_key(value: memoryview) -> str:
 
 
 def with_metadata(data: bytes, key: str, text: str) -> bytes:
-    """Replace one entry of a model file's metadata; the rest stays, byte for byte."""
+    """Return a model file's bytes with one metadata entry replaced, all else unchanged."""
     kept = (
         bytes(whole)
         for number, value, whole in split_fields(data)
@@ -79,39 +79,39 @@ def with_metadata(data: bytes, key: str, text: str) -> bytes:
 
 @dataclass
 class OnnxGraph:
-    """A graph that is built operator by operator, in the order in which they run."""
+    """A builder of an ONNX graph, operator by operator, in the order of execution."""
 
     parts: list[bytes] = field(default_factory=list)
     _names: int = 0
 
     def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:
-        """Store a tensor; return its name."""
+        """Add a constant tensor to the graph; return its name."""
         name = self._make_name("constant")
         self.parts.append(_bytes(5, _tensor(name, np.asarray(values, dtype))))
         return name
 
     def integers(self, *values: int) -> str:
-        """Store a list of integers, as operators take axes; return its name."""
+        """Add a constant list of integers, such as an operator's axes; return its name."""
         return self.constant(values, np.int64)
 
     def input(self, name: str, shape: Sequence[int | str]) -> str:
-        """Declare an input; a size given as a name is free."""
+        """Declare an input of the graph; return its name. A size given as text is variable."""
         self.parts.append(_bytes(11, _value(name, shape, np.float32)))
         return name
 
     def output(self, name: str, value: str, shape: Sequence[int | str]) -> None:
-        """Declare a value as an output with a name."""
+        """Declare the value named `value` as the graph's output `name`."""
         self._node("Identity", [value], [name], {})
         self.parts.append(_bytes(12, _value(name, shape, np.float32)))
 
     def __call__(self, operator: str, *inputs: str, **attributes: Any) -> str:
-        """Apply an ONNX operator with one output; return the output's name."""
+        """Add an ONNX operator with one output to the graph; return the output's name."""
         name = self._make_name(operator)
         self._node(operator, inputs, [name], attributes)
         return name
 
     def serialise(self, name: str, metadata: Mapping[str, str]) -> bytes:
-        """Return the bytes of the file."""
+        """Return the bytes of an ONNX file with this graph and metadata."""
         graph = b"".join(self.parts) + _bytes(2, name)
         pairs = (_bytes(14, _bytes(1, key) + _bytes(2, text)) for key, text in metadata.items())
         opset = _bytes(8, _bytes(1, "") + _number(2, OPSET))
