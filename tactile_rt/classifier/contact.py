@@ -173,7 +173,7 @@ class ContactDetector:
             ):
                 self._restart_baseline(Drift())
             elif self._slope.add(self._now, sample, valid, self._pooled):
-                if self._slope.leads_to(self._middle(), self._level, self._pooled):
+                if self._slope.leads_to(self._find_middle(), self._level, self._pooled):
                     self._restart_baseline(self._slope)
         elif not above.any():
             self._add_quiet(sample, valid)
@@ -198,10 +198,10 @@ class ContactDetector:
 
     def _follow_drift(self) -> None:
         """Extrapolate the baseline along its drift to the present sample."""
-        ahead = min(self._now - self._middle(), self._drift.span)
+        ahead = min(self._now - self._find_middle(), self._drift.span)
         self.offset = (self._level + ahead * self._drift.slope).astype(np.float32)
 
-    def _middle(self) -> float:
+    def _find_middle(self) -> float:
         """Return the mean sample number of the baseline."""
         return float(np.mean([at for at, _, _ in self._baseline]))
 

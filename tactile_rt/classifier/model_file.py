@@ -190,15 +190,15 @@ def check_graph(
     elements, channels = card.array.shape
     sample = (card.substeps, elements, channels)
     expected: dict[str, tuple[tuple[Any, ...], str]] = {
-        "samples": ((card.steps, *sample) if window else sample, _onnx_type("float32")),
-        "offset": ((elements, channels), _onnx_type("float32")),
-        "sigma": ((elements, channels), _onnx_type("float32")),
-        **{s.name: (s.shape, _onnx_type(s.dtype)) for s in card.state},
+        "samples": ((card.steps, *sample) if window else sample, _make_onnx_type("float32")),
+        "offset": ((elements, channels), _make_onnx_type("float32")),
+        "sigma": ((elements, channels), _make_onnx_type("float32")),
+        **{s.name: (s.shape, _make_onnx_type(s.dtype)) for s in card.state},
     }
     if window and "samples" in inputs:
         steps = (without_batch["samples"][0] or (0,))[0]
         if not isinstance(steps, int):  # the graph takes any number of steps
-            expected["samples"] = ((steps, *sample), _onnx_type("float32"))
+            expected["samples"] = ((steps, *sample), _make_onnx_type("float32"))
     wrong = {k for k in without_batch | expected if without_batch.get(k) != expected.get(k)}
     wrong |= {name for name, (shape, _) in inputs.items() if not shape}  # not even a batch
     if wrong:
@@ -216,7 +216,7 @@ def check_graph(
         # onnxruntime may not know every size before it runs.
         axes = zip(shape[1:], state.shape, strict=False)
         same = all(a == b or not isinstance(a, int) for a, b in axes)
-        if not same or len(shape) != 1 + len(state.shape) or kind != _onnx_type(state.dtype):
+        if not same or len(shape) != 1 + len(state.shape) or kind != _make_onnx_type(state.dtype):
             raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
 
 
@@ -264,7 +264,7 @@ def _shorten_reason(error: Exception) -> str:
     return text[:MESSAGE]
 
 
-def _onnx_type(dtype: str) -> str:
+def _make_onnx_type(dtype: str) -> str:
     name = {"float32": "float", "float64": "double"}.get(dtype, dtype)
     return f"tensor({name})"
 

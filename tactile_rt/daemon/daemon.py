@@ -314,7 +314,7 @@ class Daemon:
                 on_it = [p for _, p in self._models.copy().values() if p.config.source == name]
                 sensor = next((p.sensor for p in on_it if p.sensor is not None), None)
                 source.expect(sensor, max((p.changes for p in on_it), default=0.0))
-            for part in self._parts():
+            for part in self._list_parts():
                 part.watch()
             late_s = {name: source.late_s for name, source in self._sources.copy().items()}
             self._trends.look(time.monotonic(), read_resident_bytes() or 0, late_s)
@@ -381,7 +381,7 @@ class Daemon:
             why = f"it had no turn for {lasted_s:.1f} s: it was stopped, or the processor was taken"
             self.report("daemon", "starved", why, "warning")
 
-    def _parts(self) -> list[Part]:
+    def _list_parts(self) -> list[Part]:
         return [
             *self._sources.copy().values(),
             *(p for _, p in self._models.copy().values()),
@@ -391,7 +391,7 @@ class Daemon:
     def _has_started(self) -> bool:
         if time.monotonic_ns() - self._started_ns > STARTED_S * 1e9:
             return True
-        return all(p.state.state != "starting" or p.state.failures for p in self._parts())
+        return all(p.state.state != "starting" or p.state.failures for p in self._list_parts())
 
     def _report_degraded(self) -> None:
         lines = self.snapshot().degraded

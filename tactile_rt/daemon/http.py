@@ -227,7 +227,7 @@ class HttpServer:
             slowest = next(iter(self._tasks))
             self._tasks.pop(slowest).transport.abort()
             slowest.cancel()
-        task = self._loop.create_task(self._connection(reader, writer))
+        task = self._loop.create_task(self._serve_peer(reader, writer))
         self._tasks[task] = writer
         self._asking.add(task)
         task.add_done_callback(lambda task: self._tasks.pop(task, None))
@@ -238,7 +238,7 @@ class HttpServer:
     def _count_drop(self) -> None:
         self.dropped += 1
 
-    async def _connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_peer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             await self._exchange(reader, writer)
             writer.close()

@@ -137,13 +137,13 @@ def _list_tables(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labe
     yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
     yield SOON, [({"part": t.part, "what": t.what}, t) for t in s.soon]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
-    yield SOURCE, [({"source": _short_name(x)}, x) for x in s.sources]
-    yield MODEL, [({"model": _short_name(x), "source": x.source}, x) for x in s.models]
+    yield SOURCE, [({"source": _shorten_name(x)}, x) for x in s.sources]
+    yield MODEL, [({"model": _shorten_name(x), "source": x.source}, x) for x in s.models]
     yield CONSUMER, [({"consumer": x.part.name, "kind": x.kind}, x) for x in s.consumers]
     yield DISK, [({"source": n}, d) for c in s.consumers for n, d in c.on_disk.items()]
 
 
-def _short_name(thing: SourceState | ModelState) -> str:
+def _shorten_name(thing: SourceState | ModelState) -> str:
     return thing.part.name.partition(".")[2]
 
 

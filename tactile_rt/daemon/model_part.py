@@ -192,7 +192,7 @@ class ModelPart(Part):
     def _start_admission(self, config: ModelConfig, opened: Opened | None) -> Admission:
         known, trial = self._trial
         same = known == file_stamp(model_path(config)) and config.mode == self.config.mode
-        return Admission(config, self.limits, opened, self._age, trial if same else None)
+        return Admission(config, self.limits, opened, self._compute_age, trial if same else None)
 
     def _install(self, opened: Opened, admission: Admission) -> None:
         """Put an admitted model into use."""
@@ -347,7 +347,7 @@ class ModelPart(Part):
             classifier.skips.add(first, t_ns)
         return lost
 
-    def _age(self, t_ns: int) -> float:
+    def _compute_age(self, t_ns: int) -> float:
         """Return the age of a step, s, given the stream time of its newest sample."""
         end = t_ns + self._half_ns + self._ahead_ns
         return max(0, time.monotonic_ns() - end) / 1e9

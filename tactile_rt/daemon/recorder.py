@@ -161,9 +161,9 @@ class Recorder(Consumer):
 
     def on_disk(self) -> Mapping[str, OnDisk]:
         """Return the `OnDisk` of each source that was ever open; safe from any thread."""
-        return {name: self._on_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
+        return {name: self._find_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
 
-    def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
+    def _find_disk(self, name: str, ledger: Ledger) -> OnDisk:
         track, sync_s = self._tracks.get(name), self._config.sync_s
         slow_s = 2 * sync_s + SLOW_S if sync_s else 0.0
         if track is None:
@@ -180,12 +180,12 @@ class Recorder(Consumer):
             "mode": self._config.mode,
             "recording": recording,
             "files": self._files,
-            "megabytes": round(self._written_mb(), 1),
+            "megabytes": round(self._count_mb(), 1),
             "lost_samples": self._lost_samples,
             "newest": self._newest,
         }
 
-    def _written_mb(self) -> float:
+    def _count_mb(self) -> float:
         files = [track.file for track in list(self._tracks.values())]
         return (self._bytes + sum(f.stats.bytes for f in files if f is not None)) / MB
 
@@ -199,7 +199,7 @@ class Recorder(Consumer):
         if folder.why or not self._on:
             return folder.why
         for name, track in list(self._tracks.items()):
-            disk = self._on_disk(name, track.ledger)
+            disk = self._find_disk(name, track.ledger)
             if track.diagnostic and disk.meant_ns:
                 return track.diagnostic
         return ""
@@ -391,7 +391,7 @@ class Recorder(Consumer):
     def _maintain_files(self, sync: bool) -> None:
         """Flush, rotate and finish files as they are due, and check the disk."""
         self._folder.has_room()
-        self._soon = self._folder.foresee(self._written_mb())
+        self._soon = self._folder.foresee(self._count_mb())
         self._count_unsynced()
         now = time.monotonic_ns()
         closed = [

@@ -260,11 +260,11 @@ class LatencyMeter:
         if not ordered:
             return Latency(edges_s=EDGES_S, buckets=buckets)
         return Latency(
-            count, total, 1e3 * _rank(ordered, 0.5), 1e3 * _rank(ordered, 0.99), 1e3 * ordered[-1],
-            EDGES_S, buckets,
+            count, total, 1e3 * _find_quantile(ordered, 0.5), 1e3 * _find_quantile(ordered, 0.99),
+            1e3 * ordered[-1], EDGES_S, buckets,
         )  # fmt: skip
 
 
-def _rank(ordered: list[float], share: float) -> float:
+def _find_quantile(ordered: list[float], share: float) -> float:
     """Return the smallest of sorted values that a share (0 to 1) do not exceed."""
     return ordered[max(0, -(-len(ordered) * round(1000 * share) // 1000) - 1)]

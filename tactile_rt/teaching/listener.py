@@ -76,14 +76,14 @@ class Listener:
             if decision.step == 1:
                 self._steps = []
                 onset = decision.onset_ns
-                hasty = onset - self._released_before(onset) < self._hasty_ns
+                hasty = onset - self._find_release(onset) < self._hasty_ns
                 self.hasty, self._counts = self.hasty + hasty, not hasty
             self._steps.append(decision)
             if decision.final and self._counts:
                 self._received, self._strongest = 0, 0.0  # this touch was not missed
                 yield decision.onset_ns, decision.t_ns, self._describe(self._steps)
 
-    def _released_before(self, onset_ns: int) -> int:
+    def _find_release(self, onset_ns: int) -> int:
         """Return the stream time at which the contact before an onset ended."""
         changes = self.classifier.touches
         while changes and changes[0][0] < onset_ns:

@@ -61,7 +61,7 @@ class Teacher:
         if order == "undo":
             return self._undo()
         if order == "next":
-            return self._next()
+            return self._go_to_next()
         if order == "list":
             return "\n".join(self._describe_classes()) or "nothing is taught yet"
         if order.partition(" ")[0] in NAMING:
@@ -230,7 +230,7 @@ class Teacher:
         self.label, self.done = gone.label, False
         return f"touch {len(self.lesson.touches) + 1} ({gone.label}) is taken back\n{self.prompt()}"
 
-    def _next(self) -> str:
+    def _go_to_next(self) -> str:
         if not self.wanted:
             return self.prompt()
         at = self.wanted.index(self.label) + 1 if self.label in self.wanted else 0

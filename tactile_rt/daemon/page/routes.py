@@ -230,7 +230,7 @@ class PageRoutes:
         if path == "/live":
             only(request, "GET")
             source = parse_qs(request.query[:1024]).get("source", [""])[0]
-            return Response(200, self._live(source), "application/x-ndjson")
+            return Response(200, self._stream_lines(source), "application/x-ndjson")
         only(request, "POST")
         if self._control is None:
             raise Refused(403, "this page may only look: set control = true in [page]")
@@ -252,7 +252,7 @@ class PageRoutes:
             raise Refused(401, "the token is wrong")
         return Response(204, headers={"set-cookie": self._guard.set_cookie()})
 
-    async def _live(self, source: str) -> AsyncGenerator[bytes, None]:
+    async def _stream_lines(self, source: str) -> AsyncGenerator[bytes, None]:
         if len(self.clients) >= MAX_STREAMS:
             raise Refused(503, f"{MAX_STREAMS} browsers are looking already")
         client = PageClient(source)

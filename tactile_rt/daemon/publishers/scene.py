@@ -58,7 +58,7 @@ class Scene:
         size = 0.15 * self._spacing
         spheres = [
             SpherePrimitive(
-                pose=Pose(position=_vector(at), orientation=Quaternion(w=1.0)),
+                pose=Pose(position=_make_vector(at), orientation=Quaternion(w=1.0)),
                 size=Vector3(x=size, y=size, z=size), color=BASE,
             )
             for at in self._at.tolist()
@@ -69,7 +69,7 @@ class Scene:
             points=[Point3(x=x, y=y, z=z) for x, y, z in points],
         )  # fmt: skip
         entity = SceneEntity(
-            timestamp=_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/array",
+            timestamp=_make_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/array",
             lifetime=NEVER, spheres=spheres, lines=[lines],
             metadata=[KeyValuePair(key="array", value=self._spec.name)],
         )  # fmt: skip
@@ -95,7 +95,7 @@ class Scene:
         self._largest = max(FORGET * self._largest, float(size.max()))
         scale = self._m_per_n or (self._extent / 3 / self._largest if self._largest > 0 else 0.0)
         entity = SceneEntity(
-            timestamp=_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/forces",
+            timestamp=_make_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/forces",
             lifetime=Duration(sec=LIFETIME_S), arrows=list(self._draw_arrows(force, size, scale)),
             metadata=[KeyValuePair(key="m_per_N", value=f"{scale:.6g}")],
         )  # fmt: skip
@@ -105,7 +105,7 @@ class Scene:
         """Return the update that removes the array and its forces from the scene."""
         return SceneUpdate(
             deletions=[
-                SceneEntityDeletion(timestamp=_time(utc_ns), id=f"{self._source}/{what}")
+                SceneEntityDeletion(timestamp=_make_time(utc_ns), id=f"{self._source}/{what}")
                 for what in ("array", "forces")
             ]
         )
@@ -120,7 +120,7 @@ class Scene:
             length = scale * float(size[i])
             yield ArrowPrimitive(
                 pose=Pose(
-                    position=_vector(self._at[i].tolist()),
+                    position=_make_vector(self._at[i].tolist()),
                     orientation=Quaternion(x=x, y=y, z=z, w=w),
                 ),
                 shaft_length=0.75 * length, shaft_diameter=thick,
@@ -147,9 +147,9 @@ def turn_x_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     return unit
 
 
-def _vector(at: list[float]) -> Vector3:
+def _make_vector(at: list[float]) -> Vector3:
     return Vector3(x=at[0], y=at[1], z=at[2])
 
 
-def _time(utc_ns: int) -> Timestamp:
+def _make_time(utc_ns: int) -> Timestamp:
     return Timestamp(sec=utc_ns // 10**9, nsec=utc_ns % 10**9)
