@@ -446,7 +446,7 @@ class Classifier:
         )
 
     def _identify(self, onset_ns: int, t_ns: int, lane: int) -> dict[str, Any]:
-        """Identify the object at a touch's last step; return the decision's fields on it."""
+        """Identify the touched object at the last step; return its `Classification` fields."""
         if onset_ns - self._fused_ns > self._fuse_ns:
             self._embeddings.clear()
         self._embeddings.append(self._stepper.embedding[lane].copy())

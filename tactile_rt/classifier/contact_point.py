@@ -152,7 +152,7 @@ ESTIMATES = {"straight": straight, "resting": resting, "bent": bent}
 
 
 def _find_nearest(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats]:
-    """Return the least |M - r x F|^2 (n,) on segments, and its relative place."""
+    """Return the least |M - r x F|^2 (n,) on segments, and its relative position."""
     force, moment = loads[:, :3], loads[:, 3:]
     missing, gained = moment - np.cross(near, force), np.cross(far - near, force)
     squared = np.maximum((gained**2).sum(axis=1), np.finfo(float).tiny)

@@ -100,7 +100,7 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
 
 
 def fitting(rules: Sequence[PredictionSetRule], noise: float) -> PredictionSetRule | None:
-    """Return the rule whose noise limit just covers `noise` (1 is rated), or None."""
+    """Return the rule with the least noise limit not below `noise` (relative to rated noise)."""
     known = [r for r in rules if r.score == MASS_ABOVE and (r.noise is None or noise <= r.noise)]
     return min(known, key=lambda r: np.inf if r.noise is None else r.noise, default=None)
 
@@ -153,7 +153,7 @@ class EarlyExit:
         self._best, self._sure_for = -1, 0
 
     def begin(self) -> None:
-        """Begin an episode, with no step counted yet."""
+        """Begin an episode: forget the steps counted so far."""
         self._sure_for = 0
 
     def may_end(self, best: int, probability: float) -> bool:

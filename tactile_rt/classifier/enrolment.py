@@ -75,7 +75,7 @@ class EnrolledObject(msgspec.Struct, frozen=True):
 def identify(
     rule: IdentityRule, objects: Sequence[EnrolledObject], embeddings: Sequence[NDArray[Any]]
 ) -> tuple[str, float]:
-    """Identify the enrolled object that one or several touches of an object are of.
+    """Identify an enrolled object, or none, from one or more touches of one object.
 
     Args:
         embeddings: The embedding (unit,) of each touch at its last step, in any order.

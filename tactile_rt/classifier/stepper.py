@@ -21,7 +21,7 @@ WARM_UP = 4  # runs, two of each binding: the first runs allocate, and may even 
 
 
 class Tensor:
-    """A host array that onnxruntime uses directly on the CPU, or as a device's copy."""
+    """A host array that onnxruntime uses directly, or that is copied to its device."""
 
     def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
         self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)

@@ -87,7 +87,7 @@ def try_model(
     every: int = 0,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Trial:
-    """Load, warm up and run a model in a child process; return the costs.
+    """Load, warm up and run a model in a child process; return time and memory.
 
     Args:
         path: The ``.onnx`` file, of kind ``step``.

@@ -61,7 +61,7 @@ class Turns:
         return {name: (now - turned) / 1e9 for name, turned in self._turns.copy().items()}
 
     def watch(self, thread_id: int | None) -> float:
-        """Record and return the starvation of the watch since its latest pass, s, or 0."""
+        """Return how long the watch thread just got no processor time, s, or 0."""
         now = time.monotonic_ns()
         lasted_s = (now - self._turns.get("watch", now)) / 1e9
         self._read_waited_s(thread_id)  # count the waiting time from now on

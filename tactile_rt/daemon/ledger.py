@@ -10,7 +10,7 @@ Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
 
 
 class Ledger:
-    """Counts of a source's recorded and lost samples, updated by the recorder's thread alone."""
+    """Counts of a source's recorded and lost samples; only the recorder's thread updates them."""
 
     def __init__(self) -> None:
         self._now: tuple[Sums, tuple[RecordingWriter, ...]] = (0, 0, 0), ()  # finished; open files

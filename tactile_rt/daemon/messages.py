@@ -45,7 +45,7 @@ class _FromSource(_Message, frozen=True, kw_only=True):
 
 
 class ArrayMessage(_FromSource, frozen=True, tag="array", kw_only=True):
-    """Message of an opened source; `array` is its `ArraySpec`: elements, grid, poses, units."""
+    """Message that a source opened; `array` is its `ArraySpec`: elements, grid, poses, units."""
 
     topic: ClassVar[str] = "array"
     url: str
@@ -53,7 +53,7 @@ class ArrayMessage(_FromSource, frozen=True, tag="array", kw_only=True):
 
 
 class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
-    """Message of a model's decision after one step.
+    """Message with a model's decision after one step.
 
     Attributes:
         t_ns: The stream time of the last sample used, ns.
@@ -104,7 +104,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
 
 
 class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
-    """Message of the beginning (`touching`) or end of contact; `t_ns` is the stream's time."""
+    """Message that contact began (`touching`) or ended; `t_ns` is the stream's time."""
 
     topic: ClassVar[str] = "contact"
     model: str
@@ -112,9 +112,9 @@ class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
 
 
 class SkipMessage(_FromSource, frozen=True, tag="skip", kw_only=True):
-    """Message of a model that was behind its stream and skipped to the newest sample. It decides
+    """Message that a model was behind its stream and skipped to the newest sample. It decides
     nothing from `from_ns`, the stream time of the first skipped sample, to `until_ns`, that of the
-    first sample after it. Of the skipped samples, `lost` did not even reach its contact detector.
+    next sample after these. Of the skipped samples, `lost` did not even reach its contact detector.
     """
 
     topic: ClassVar[str] = "skip"
@@ -125,7 +125,7 @@ class SkipMessage(_FromSource, frozen=True, tag="skip", kw_only=True):
 
 
 class HealthMessage(_Message, frozen=True, tag="health", kw_only=True):
-    """Message of a part or a device that changed its state; see `items.Event`."""
+    """Message that a part or a device has changed its state; see `items.Event`."""
 
     topic: ClassVar[str] = "health"
     part: str
@@ -135,7 +135,7 @@ class HealthMessage(_Message, frozen=True, tag="health", kw_only=True):
 
 
 class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
-    """Message of a chunk of n samples; `t_ns` and `utc_ns` are of the last.
+    """Message with a chunk of n samples; `t_ns` and `utc_ns` are of the last.
 
     Attributes:
         elements, channels, units: The axes of `values`, and the SI unit of each channel.
@@ -154,7 +154,7 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
 
 
 class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
-    """Message of the state of all parts; see `states.Snapshot`."""
+    """Message with the state of all parts; see `states.Snapshot`."""
 
     topic: ClassVar[str] = "state"
     snapshot: Snapshot

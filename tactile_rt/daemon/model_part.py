@@ -59,7 +59,7 @@ class ModelPart(Part):
         self._deadline_ns = 0
         self._ahead_ns = 0  # host time less stream time
         self._last_ns: int | None = None  # stream time of the newest sample that was taken
-        self._dropped = self._hole = 0  # samples that the mailbox dropped: in all, since `_last_ns`
+        self._dropped = self._gap = 0  # samples that the mailbox dropped: in all, since `_last_ns`
         self._missed = 0  # events that the mailbox dropped
         self._sha256 = ""
         with suppress(ConfigError):  # loading reports it
@@ -243,7 +243,7 @@ class ModelPart(Part):
         self._report(self.name, "admitted", f"{new.words}{late}")
 
     def _can_take_over(self, new: Classifier, came: bool, waited: float) -> bool:
-        """Return whether a new model may take over: between touches, with a baseline, or late."""
+        """Return whether a new model may take over: with a baseline between touches, or overdue."""
         old = self._classifier
         if old is None:
             return True
@@ -263,7 +263,7 @@ class ModelPart(Part):
     def _handle(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
         dropped = self.box.dropped  # the oldest go first, so these came before all of `items`
-        self._hole, self._dropped = dropped["samples"] - self._dropped, dropped["samples"]
+        self._gap, self._dropped = dropped["samples"] - self._dropped, dropped["samples"]
         opened = self._hub.streams().get(self.config.source)
         if dropped["events"] > self._missed and opened is not None:
             items = [opened, *items]  # it may have been dropped
@@ -288,7 +288,7 @@ class ModelPart(Part):
         before = replace(classifier.stats)
         arrived, newest = run[-1].arrived_ns, int(chunk.t_ns[-1])
         self._ahead_ns = 0 if keeps_host_time(opened.stream) else arrived - newest
-        lost = self._skip_hole(classifier, int(chunk.t_ns[0]))
+        lost = self._skip_gap(classifier, int(chunk.t_ns[0]))
         offset = run[-1].utc_offset_ns
         frame = opened.spec.frame
         for decision in classifier.decide(chunk):
@@ -338,10 +338,10 @@ class ModelPart(Part):
                 Decision(config.source, config.name, frame, d, sample, made, offset, deadline_ns)
             )
 
-    def _skip_hole(self, classifier: Classifier, t_ns: int) -> int:
+    def _skip_gap(self, classifier: Classifier, t_ns: int) -> int:
         """Skip a gap before the sample at `t_ns`; return how many samples the mailbox dropped. No
         network receives a stream with a gap."""
-        lost, self._hole = self._hole, 0
+        lost, self._gap = self._gap, 0
         if lost:
             first = t_ns - BEGINNING_NS if self._last_ns is None else self._last_ns + 1
             classifier.skips.add(first, t_ns)

@@ -95,7 +95,7 @@ class RecordingsFolder:
         return not why
 
     def foresee(self, written_mb: float) -> str:
-        """Describe within how many hours the disk will be full; empty beyond a day.
+        """Describe within how many hours the disk will be full; empty if over a day.
 
         Args:
             written_mb: The total that has been written so far, MB.

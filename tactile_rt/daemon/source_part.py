@@ -181,7 +181,7 @@ class SourcePart(Part):
 
     @property
     def silent_s(self) -> float:
-        """Time since the part began its current work, s; 0 while it waits or `_away`."""
+        """Time since the part began its work, s; 0 while it waits or is `_away`."""
         return 0.0 if self._away else super().silent_s
 
     def expect(self, sensor: SensorSpec | None, changes: float) -> None:
@@ -197,8 +197,8 @@ class SourcePart(Part):
         super().stop()
 
     def join(self, until: float) -> bool:
-        """Wait for the part to end, but only briefly while it waits for its device. Nothing is lost
-        then, and its thread ends by itself once the device's time to answer is over."""
+        """Wait for the part to end, briefly if its device is away; return whether done. While
+        the device is away, nothing is lost; the thread ends after the device's time to answer."""
         if super().join(min(until, self._stopped_s + AWAY_S) if self._stopped_s else until):
             return True
         if self._away:

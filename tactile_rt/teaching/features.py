@@ -147,7 +147,7 @@ class FeatureNetwork:
         }  # fmt: skip
 
     def _add_signals(self, g: OnnxGraph, load: str, noise: str) -> tuple[str, str]:
-        """Add a unit's signals (batch, sub-step, signal) and peak; return both values' names."""
+        """Add a unit's signals (batch, sub-step, signal) and peak to `g`; return both names."""
         summed = g("ReduceSum", load, g.integers(2), keepdims=0)  # (batch, sub-step, channel)
         level = g("Sqrt", g("ReduceSum", g("Mul", noise, noise), g.integers(2), keepdims=0))
         faint = g("Mul", g("ReduceMax", level, g.integers(1), keepdims=1), g.constant(FAINT))

@@ -67,7 +67,7 @@ class TouchClasses:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Leave-one-out results: every touch is judged by what is learnt from the others."""
+    """Leave-one-out results: each touch is classified by what is learnt from the others."""
 
     distances: Floats  # (touch, step, class) squared distances from the classes of the others
     right: NDArray[np.bool_]  # (touch,) whether the nearest class at the last step was its own
@@ -126,7 +126,7 @@ def count_refused(
 
 
 def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeaveOneOut:
-    """Judge every touch by what is learnt from the other touches.
+    """Classify each touch by what is learnt from the other touches.
 
     Of more than ten touches of a class, a tenth is left out at a time. A class needs two or more.
     """

@@ -228,7 +228,7 @@ class Lesson:
         return tuple(name for name in self.labels if self.count(name) >= FEWEST)
 
     def leave_one_out(self) -> "LessonProgress":
-        """Judge every touch at its last step by the other touches; return the results.
+        """Classify each touch at its last step by the other touches; return the results.
 
         With a single class no touch can be wrong, so none is counted as right.
         """

@@ -74,7 +74,7 @@ class FewShot:
         return np.stack([step.embedding for step in steps if step.embedding is not None])
 
     def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
-        """Judge every touch at its last step by what is learnt from the others."""
+        """Classify each touch at its last step by what is learnt from the others."""
         return head.leave_one_out(features[:, -1:], labels, self.network.kinds)
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
@@ -143,7 +143,7 @@ class Enrolment:
         return embedding[None]
 
     def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
-        """Judge every touch (touch, 1, unit) by objects enrolled with the other touches."""
+        """Identify each touch (touch, 1, unit) among objects enrolled with the other touches."""
         rule = self.card.identity
         assert rule is not None
         touches = enrolment.project(rule, features[:, -1])

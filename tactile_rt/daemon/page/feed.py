@@ -71,7 +71,7 @@ class Feed:
         self._decisions: deque[bytes] = deque(maxlen=KEPT_DECISIONS)
 
     def take(self, items: list[Item], watched: Collection[str]) -> list[Line]:
-        """Return the lines to send now for items; samples of unwatched sources are ignored."""
+        """Encode items; return the lines to send now, without samples of unwatched sources."""
         lines: list[Line] = []
         for item in items:
             if isinstance(item, SourceChunk):

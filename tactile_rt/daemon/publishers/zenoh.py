@@ -136,7 +136,7 @@ def _split_port(address: str) -> str:
 
 
 def _find_port(endpoint: str) -> int:
-    """Return an endpoint's TCP port, or 0 if it has none or any free one."""
+    """Return an endpoint's TCP port, or 0 without TCP or a fixed port."""
     protocol, _, address = endpoint.partition("/")
     return int(_split_port(address)) if protocol in ("tcp", "tls", "ws") else 0
 
