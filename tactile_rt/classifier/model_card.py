@@ -44,7 +44,7 @@ Kind = Literal["step", "window"]
 class StateTensor(msgspec.Struct, frozen=True):
     """One recurrent state: its name, shape without the batch axis, and element type.
 
-    With `in_place`, a step writes only some of its rows, so `<name>_next` may share its memory.
+    With `in_place`, a step writes only some rows, so `<name>_next` may share the state's memory.
     """
 
     name: str

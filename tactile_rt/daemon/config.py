@@ -35,8 +35,8 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
         array: A file that describes the source's array, as `tactile-rt describe` writes it, or an
             ``.onnx`` model made for that array; empty if the URL determines the array.
         stuck_at_s: Time without a change of any value that counts as a stuck-at fault, s. With 0 it
-            is derived from the noise, if the model, the tare or the stream determines that; if not,
-            no time does, as a coarse sensor at rest does not change either.
+            is derived from the noise, if the model, the tare or the stream determines the noise; if
+            not, there is no limit, as a coarse sensor at rest does not change either.
     """
 
     name: Name

@@ -29,7 +29,7 @@ class RateMeter:
         self.hz = self.typical_hz = 0.0  # over all stretches, and their median; 0: unknown
 
     def add(self, count: int, t_ns: int) -> None:
-        """Update the rates with the total count of measurements at a time."""
+        """Update the rates with the total count of measurements and the time of the count."""
         marks = self._marks
         if marks and t_ns - marks[-1][0] < self._stretch_ns:
             return

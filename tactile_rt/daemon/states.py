@@ -98,23 +98,23 @@ class SourceState:
     device: Health | None = None  # None: no device, or not open
     stats: SourceStats = field(default_factory=SourceStats)  # over all times that it was opened
     samples: int = 0
-    newest_ns: int = 0  # of the newest sample; its arrival if the device's own clock is kept
+    newest_ns: int = 0  # when the newest sample was taken; its arrival if times are the device's
     read_ns: int = 0  # when the newest sample was read
     flowing_ns: int = 0  # since when samples have come without a pause
     live: bool = False  # samples come even if nothing reads them, so that they can be too old
     losses: Losses = field(default_factory=Losses)  # corrupt, missing or dropped
     repeats: Losses = field(default_factory=Losses)  # samples that came again
-    restarts: Losses = field(default_factory=Losses)  # of the device's counter, its line in place
+    restarts: Losses = field(default_factory=Losses)  # of the device's counter, while connected
     clock_off: bool = False  # the device's clock runs at another speed than the host's
     bad_samples: int = 0  # of one element, NaN or absurdly large, though not marked invalid
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # time without a change of any value, though noise should change some
     stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
-    zeros: bool = False  # no other values have come
+    zeros: bool = False  # all values so far are 0
     another: str = ""  # how the array differs from the one that the source began with
     # rate of measurements within the newest second, lost or not; 0: unknown
     measured_hz: float = 0.0
-    slow: bool = False  # it is, most of the time, less than nine tenths of `rate_hz`
+    slow: bool = False  # `measured_hz` is mostly less than nine tenths of `rate_hz`
 
 
 @dataclass(frozen=True)

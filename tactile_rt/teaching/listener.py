@@ -11,7 +11,7 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
 HASTY_NS = 200_000_000  # after the end of a contact, within which another belongs to that touch
-FELT = 6.0  # times the noise, in two consecutive samples, is felt
+FELT = 6.0  # times the noise: a reading as large in two consecutive samples counts as a touch
 LONG_AGO_NS = 2**62
 # Parts of a rest, and by how many times the noise within them their means differ at most.
 REST_PARTS, MOVED = 8, 10.0

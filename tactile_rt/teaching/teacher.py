@@ -27,12 +27,12 @@ class Teacher:
     wanted: list[str]
     each: int
     label: str = ""  # name of what is touched now; empty: not named yet
-    done: bool = False  # whether the user has ended it, or all wanted touches are there
+    done: bool = False  # whether the user has ended the lesson, or all wanted touches were made
     ended: str = ""  # how the lesson ended; empty: it goes on
     said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether the lesson ends after a list of classes
-    _ends_s: float | None = None  # time at which there is enough of anything else
+    _ends_s: float | None = None  # when the time for touches of anything else is over
 
     def __post_init__(self) -> None:
         for name in self.wanted:
@@ -80,7 +80,7 @@ class Teacher:
         return self.prompt()
 
     def watch(self, now_s: float | None) -> None:
-        """Set `done` if the time for touches of anything else is over, or samples end."""
+        """Set `done` if touches of anything else had enough time, or samples end (None)."""
         if self.label != ANYTHING_ELSE or not self._planned:
             self._ends_s = None
         elif now_s is None:
