@@ -11,14 +11,14 @@ from tactile_rt.core.stream import SPEC_VERSION, ArraySpec
 
 
 def read_array(path: Path) -> ArraySpec:
-    """Read the array that a file describes.
+    """Read the description of an array from a file.
 
     Args:
-        path: the JSON of an `ArraySpec`; or an ``.onnx`` model, for the array it was made for.
+        path: The JSON form of an `ArraySpec`, or an ``.onnx`` model made for the array.
 
     Raises:
-        ConfigError: the file cannot be read, or does not describe an array.
-        ModelError: the model cannot be read.
+        ConfigError: The file cannot be read, or does not describe an array.
+        ModelError: The model cannot be read.
     """
     if path.suffix == ".onnx":
         # Imported here, since a stream without a model needs no onnxruntime.

@@ -23,13 +23,13 @@ Floats = NDArray[np.float32]
 
 
 class Drift:
-    """The drift of quiet samples: lines fitted to the means of their latest blocks.
+    """An estimator of linear drift, fitted to block means of the latest quiet samples.
 
     Attributes:
         found: Whether any channel drifts.
         straight: Whether all channels lie on lines, apart from noise.
-        slope: (element, channel) SI per sample; 0 where it may be noise.
-        span: The number of samples over which it was observed.
+        slope: (element, channel) The drift, SI per sample; 0 where it may be noise.
+        span: The number of samples over which the drift was observed.
     """
 
     def __init__(self) -> None:
@@ -39,10 +39,10 @@ class Drift:
         self._blocks: deque[tuple[float, NDArray[np.float64]]] = deque(maxlen=MOST_BLOCKS)
 
     def add(self, at: int, sample: NDArray[Any], valid: NDArray[np.bool_], sigma: Floats) -> bool:
-        """Take a sample, whose number is `at`; return True if it completes a block.
+        """Add the sample with number `at`; return whether it completes a block.
 
         Args:
-            sigma: (element, channel) the noise per sample, SI.
+            sigma: (element, channel) The noise per sample, SI.
         """
         self._block.append((at, sample, valid))
         if len(self._block) < BLOCK_SAMPLES:
@@ -82,7 +82,7 @@ class Drift:
 
 
 class RestLevels:
-    """The levels to which a signal keeps returning within a contact.
+    """A detector of levels to which a signal keeps returning within a contact.
 
     Attributes:
         block: The samples of the current stretch, with their validity.
@@ -96,13 +96,13 @@ class RestLevels:
     def confirm_rest(
         self, sample: Floats, known: NDArray[np.bool_], sigma: Floats, quiet: int
     ) -> bool:
-        """Take one sample; return True if it confirms a level of rest.
+        """Add one sample; return whether it confirms that the signal is at rest.
 
         Args:
-            sample: (element, channel) SI.
-            known: (element,) elements to trust.
-            sigma: (element, channel) the noise per sample, SI.
-            quiet: number of samples that were quiet on the present baseline.
+            sample: (element, channel) The values, SI.
+            known: (element,) Whether the element is trusted.
+            sigma: (element, channel) The noise per sample, SI.
+            quiet: The number of samples that were quiet on the present baseline.
         """
         if len(self.block) == STRETCH_SAMPLES:
             self.block = []
@@ -125,7 +125,7 @@ class RestLevels:
         return self._current.returns >= RETURNS and self._current.samples > quiet
 
     def _find_trusted(self) -> NDArray[np.bool_]:
-        """Return which elements (element,) are trusted in the whole stretch."""
+        """Return whether each element is trusted in the whole stretch, (element,)."""
         trusted: NDArray[np.bool_] = np.logical_and.reduce([known for _, known in self.block])
         return trusted
 
@@ -141,7 +141,7 @@ class _Level:
     samples: int = 0
 
     def near(self, median: Floats, sigma: Floats) -> bool:
-        """Return whether the median of another stretch is the same, within noise."""
+        """Return whether another stretch's median (element, channel) is the same within noise."""
         # The variance of a median is pi / 2 times that of a mean, and two medians are compared.
         z2 = np.square((median - self.median) / sigma).sum(axis=1) * STRETCH_SAMPLES / np.pi
         return not (z2 > SAME_Z2).any()

@@ -1,4 +1,4 @@
-"""The classifier: push chunks, get decisions. ONNX Runtime and numpy only.
+"""The classifier, from chunks of samples to decisions; it needs only ONNX Runtime and numpy.
 
     Chunk -> Resampler -> ContactDetector -> model step (explicit state) -> Classification
 
@@ -64,13 +64,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Classification:
-    """A decision during an episode.
+    """A model's decision after a step of an episode.
 
     Attributes:
         onset_ns: The stream time at which contact began, ns.
         t_ns: The stream time of the last resampled sample used, ns.
-        step: The number of steps that the decision rests on, counted from 1, without earlier steps
-            of a longer contact.
+        step: The number of steps that the decision is based on, from 1; earlier steps of a longer
+            contact do not count.
         final: Whether this decision is the last one of its window; an episode that a silence of
             the stream cuts short has no final decision.
         label: The decision: the name of the most probable class, which is a shape where the model
@@ -78,7 +78,7 @@ class Classification:
             the model knows, or what is wrong with the loads, see `ModelCard.refusals`.
         labels: (class,) The names of all classes and then of the refusals, in the order of
             `probabilities`.
-        probabilities: (class,) The posterior probability of each of them, float32.
+        probabilities: (class,) The posterior probability of each label, float32.
         latency_s: The time that the model's step took, s.
         prediction_set: The classes that are still possible, the most probable first, by the model's
             rule for the measured noise; empty without such a rule, and in mode ``sliding`` for
@@ -88,17 +88,17 @@ class Classification:
         late: Whether the decision missed its deadline, see `decision_rules.Deadline`.
         embedding: (unit,) The input of the network's last layer in the step, or, for a model that
             was trained to tell objects apart, a vector of length 1 that is alike for touches of one
-            object, float32; None unless the classifier was asked for it.
+            object, float32; None unless the classifier's option `embedding` is set.
         names: The kinds of the label's class that are still possible, the most probable first:
             box, crate; empty if the class has no kinds, or no rule as for `prediction_set`.
         names_coverage: The share of touches of that class whose true kind is among the names of
             every step; None without names.
         object: The enrolled object, or "none of these"; empty if none is enrolled, before a touch's
             last step, and if `sure` ends it early, since the thresholds are those of the last step.
-        object_margin: The score of the likeliest object less its threshold; below 0 the object is
+        object_margin: The score of the likeliest object minus its threshold; below 0 the object is
             none of these; None without objects.
-        object_touches: The number of touches that `object` rests on, more than 1 where they are
-            fused; 0 without objects.
+        object_touches: The number of touches from which `object` was identified, more than 1 where
+            touches are fused; 0 without objects.
     """
 
     onset_ns: int
@@ -121,11 +121,11 @@ class Classification:
 
     @property
     def probability(self) -> float:
-        """The posterior probability of the decision."""
+        """The posterior probability of `label`."""
         return float(self.probabilities[self.labels.index(self.label)])
 
     def top(self, k: int = 5) -> list[tuple[str, float]]:
-        """The k most probable labels with their probabilities."""
+        """Return the k most probable labels with their probabilities, in descending order."""
         order = np.argsort(-self.probabilities, kind="stable")[:k]
         return [(self.labels[i], float(self.probabilities[i])) for i in order]
 
@@ -154,16 +154,16 @@ class ClassifierStats:
 
 
 class Classifier:
-    """A model file, run on a stream. One thread at a time may use it.
+    """A model that classifies a stream of samples. One thread at a time may use it.
 
     The stream may have another rate, and its elements another order, than the model's array.
 
     Args:
-        model: path of the ``.onnx`` file.
+        model: The path of the ``.onnx`` file.
         mode: ``episode`` or ``sliding``.
         every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
             runs in ceil(steps / every) lanes, and takes up to that many times longer.
-        sure: probability of the best class at which an episode ends early, None: never. It trades
+        sure: probability of the best class that ends an episode early, None for never. It trades
             accuracy for time, see `tactile_rt.classifier.decision_rules`. For ``episode`` only.
         in_a_row: consecutive steps in which the same class must be that probable.
         deadline_s: backlog of work, and age of the newest sample, beyond which a step is late, s;
@@ -171,13 +171,13 @@ class Classifier:
         late: how to treat a late decision, see `tactile_rt.classifier.decision_rules.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
         embedding: whether each decision carries a copy of the step's embedding.
-        age: returns the present age, s, of the sample of a stream time (ns); for live streams.
+        age: returns the present age, s, of the sample at a stream time (ns); for live streams.
         catch_up: what to do when a live stream's decisions would be older than `behind_s`: skip to
             the ``newest`` sample, or take ``all`` steps.
-        behind_s: the greatest age of a step's newest sample at its decision, s; None: three steps,
-            or 0.15 s if that is more.
+        behind_s: the greatest age of a step's newest sample at its decision, s; None for three
+            steps, or 0.15 s if that is more.
         fuse_s: a touch that begins within this time after the last decision on an object counts as
-            the same thing and is identified together with it, s; 0: each touch alone.
+            a touch of the same object and is identified together with it, s; 0 for each alone.
 
     Attributes:
         detector: The contact detector, which holds the stream's contact state and baseline.
@@ -188,7 +188,7 @@ class Classifier:
         implausible: True if the newest episode has implausible loads, see `ClassifierStats`.
         undecided: True if the newest answer was not finite, and so gave no decision.
         stats: The counters of steps, late steps and bad samples.
-        providers: Names of the execution providers in use, as onnxruntime has them.
+        providers: The names of the execution providers in use, as onnxruntime spells them.
 
     Raises:
         ModelError: the file cannot be used.
@@ -276,7 +276,7 @@ class Classifier:
         return self.card.substeps * self.card.period_ns / 1e6
 
     def go_on_from(self, other: "Classifier") -> bool:
-        """Take over another classifier's stream position and baseline; return False if unable.
+        """Adopt another classifier's stream position and baseline; return whether that is possible.
 
         Both need the same period and floor, and no episode may be under way."""
         if self.card.period_ns != other.card.period_ns or self.card.floor != other.card.floor:
@@ -287,7 +287,7 @@ class Classifier:
         return True
 
     def forget(self) -> None:
-        """Return to the initial state, so that the baseline is measured anew."""
+        """Reset the classifier to its initial state, so that it estimates the baseline anew."""
         self._renew_detector()
         self._resampler = Resampler(self.card.period_ns, self._rate_hz)
         self._onset_ns, self._next_seq = None, 0
@@ -298,13 +298,13 @@ class Classifier:
         self.detector = ContactDetector((shape[0], shape[1]), floor)
 
     def push(self, chunk: Chunk) -> list[Classification]:
-        """Take samples as the array delivers them; return the decisions that they complete."""
+        """Feed a chunk of samples; return the decisions that these complete."""
         return list(self.decide(chunk))
 
     def decide(self, chunk: Chunk) -> Iterator[Classification]:
-        """Take samples as `push`, but yield each decision as soon as it is made.
+        """Feed a chunk of samples; yield each decision as soon as it is made.
 
-        The iterator must be exhausted: it takes the samples as it advances."""
+        Exhaust the iterator: it processes the samples only as it advances."""
         # NaN, infinite and absurdly large values are no measurements.
         chunk, bad = without_bad_samples(chunk)
         self.stats.bad_samples += bad
@@ -366,7 +366,7 @@ class Classifier:
         return self._advance(t_ns, self._onset_ns)
 
     def _skip(self) -> None:
-        """Skip the sample and end the episode."""
+        """End the episode, and count a skipped stretch if it begins with this sample."""
         self.stats.skips += not self._skipping
         self._skipping, self._onset_ns = True, None
 
@@ -386,7 +386,7 @@ class Classifier:
         self._name_rules = {k: fitting(rules, noise) for k, rules in self.card.names.items()}
 
     def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
-        """Run a step on the gathered samples; return its decision, if any."""
+        """Run a step on the gathered samples; return its decision, or None."""
         began = time.perf_counter()
         lane = self._lanes.beginning(self._step)
         if lane is not None:
@@ -446,7 +446,7 @@ class Classifier:
         )
 
     def _identify(self, onset_ns: int, t_ns: int, lane: int) -> dict[str, Any]:
-        """Return a decision's fields on enrolled objects, at the end of a touch."""
+        """Identify the touched object at the last step; return its `Classification` fields."""
         if onset_ns - self._fused_ns > self._fuse_ns:
             self._embeddings.clear()
         self._embeddings.append(self._stepper.embedding[lane].copy())
@@ -472,12 +472,12 @@ class Classifier:
 
 
 def fuse(posteriors: Sequence[Floats]) -> Floats:
-    """Combine posteriors (class,) of independent sweeps of one object: their normalised product.
+    """Return the normalised product of posteriors (class,) of independent sweeps of one object.
 
     Assumes equal priors, as the training sets have.
 
     Raises:
-        ValueError: no posteriors.
+        ValueError: There are no posteriors.
     """
     evidence = np.log(np.clip(np.stack(posteriors), 1e-12, None)).sum(axis=0)
     fused = np.exp(evidence - evidence.max())
@@ -486,7 +486,7 @@ def fuse(posteriors: Sequence[Floats]) -> Floats:
 
 
 def without_bad_samples(chunk: Chunk) -> tuple[Chunk, int]:
-    """Mark elements invalid whose values are NaN, infinite or absurdly large.
+    """Mark elements of a chunk invalid whose values are NaN, infinite or absurdly large.
 
     Returns:
         The chunk itself if all values are good, else a copy with those elements marked and zero;

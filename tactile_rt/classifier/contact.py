@@ -34,7 +34,7 @@ Floats = NDArray[np.float32]
 
 
 def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Compute the thresholds of the EWMA charts, (chart, element) sigma^2.
+    """Return the onset thresholds (chart, element) of the EWMA charts, in sigma^2.
 
     An element's baseline is the mean of its n = `quiet` (element,) samples, which adds a variance
     of 1 / n. Its sigma is estimated with n - 1 degrees of freedom, which raises the mean square by
@@ -53,7 +53,7 @@ class ContactDetector:
     mean of (x - offset) over the last samples, and v the variance of m in units of sigma^2: that
     of an exponentially weighted mean of rate r, r / (2 - r), and that of the baseline. While
     nothing is touched it is chi-square distributed with as many degrees of freedom as channels. An
-    EWMA chart whose length suits the size of a step finds it in white noise nearly as soon as
+    EWMA chart whose length suits the size of a step detects it in white noise nearly as soon as
     any test can (Roberts 1959, Technometrics 1:239; for several channels together: Lowry et al.
     1992, Technometrics 34:46, eq. 2.2 and 2.3). Touches are of every size, so three charts run
     side by side: the sample itself, and means over about 7 and about 19 samples.
@@ -65,19 +65,19 @@ class ContactDetector:
 
     Args:
         shape: (element, channel).
-        floor: (channel,) smallest sigma assumed, SI.
+        floor: (channel,) The smallest sigma that is assumed, SI.
 
-    A baseline measured during a touch, as when an array is plugged in again in the middle of one,
-    would make a contact without end. So the detector looks for still stretches of 20 samples within
-    a contact. Once the signal has returned to the level of one of them three times, and was there
-    for longer than it was quiet on the baseline, that level becomes the baseline.
+    A baseline measured during a touch, as when an array is plugged in again while it is touched,
+    would cause a contact without end. So the detector looks for still stretches of 20 samples
+    within a contact. Once the signal has returned three times to the level of such a stretch, and
+    stayed longer than it was quiet on the baseline, that level becomes the baseline.
 
     Where quiet samples drift along a line, as while a sensor warms up, the baseline follows it,
     also within a contact, for as long as the drift was observed before. If the newest samples of a
     contact lie on a line that leads back to the baseline, it was drift and no contact.
 
-    An invalid element counts neither as touched nor as at rest: its baseline rests on its own
-    valid samples, and the element is ignored until it has enough of them.
+    An invalid element counts neither as touched nor as at rest: its baseline is computed from its
+    own valid samples, and the element is ignored until it has enough of them.
 
     Attributes:
         ready: Whether enough quiet samples have been seen for a baseline; no contact is reported
@@ -86,7 +86,7 @@ class ContactDetector:
             their drift, SI.
         sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
             below `floor`.
-        has_baseline: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
+        has_baseline: (element,) Whether `offset` and `sigma` are from enough samples, bool.
         doubted: The number of samples before the latest onset that the baseline leaves out, as
             they may already belong to the touch.
     """
@@ -124,7 +124,7 @@ class ContactDetector:
 
     @property
     def moves(self) -> bool:
-        """True if the baseline's samples wander, as in a touch but not in noise."""
+        """True if the baseline's samples wander as in a touch, more than white noise does."""
         samples = np.array([sample for _, sample, _ in self._baseline])
         steps = np.square(np.diff(samples, axis=0)).mean(axis=0) / 2  # of white noise, the variance
         known = self._count == len(samples)
@@ -133,15 +133,15 @@ class ContactDetector:
 
     @property
     def drift(self) -> NDArray[np.float64]:
-        """(element, channel) Drift of the baseline, SI per sample; 0 where none is certain."""
+        """Drift of the baseline (element, channel), SI per sample; 0 where none is certain."""
         return np.broadcast_to(self._drift.slope, self.offset.shape)
 
     def update(self, sample: Floats, valid: NDArray[np.bool_]) -> bool:
-        """Take one sample; return True when contact begins with it.
+        """Update with one sample; return whether contact begins with it.
 
         Args:
-            sample: (element, channel) SI.
-            valid: (element,) elements to trust.
+            sample: (element, channel) The values, SI.
+            valid: (element,) Whether the element is trusted.
         """
         self._now += 1
         if self._drift.found:
@@ -173,7 +173,7 @@ class ContactDetector:
             ):
                 self._restart_baseline(Drift())
             elif self._slope.add(self._now, sample, valid, self._pooled):
-                if self._slope.leads_to(self._middle(), self._level, self._pooled):
+                if self._slope.leads_to(self._find_middle(), self._level, self._pooled):
                     self._restart_baseline(self._slope)
         elif not above.any():
             self._add_quiet(sample, valid)
@@ -181,7 +181,7 @@ class ContactDetector:
         return begins
 
     def _compute_excess(self, sample: Floats, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Compute the largest statistic (element,), each in units of its threshold."""
+        """Update the charts; return each element's largest ratio of statistic to threshold."""
         trusted = (valid & self.has_baseline)[:, None]
         z = np.where(trusted, sample - self.offset, np.float32(0)) / self._pooled
         self._ewma += RATES[:, None, None] * (np.minimum(np.maximum(z, -LIMIT), LIMIT) - self._ewma)
@@ -197,16 +197,16 @@ class ContactDetector:
         self._pending.append((self._now, quiet, valid.copy()))
 
     def _follow_drift(self) -> None:
-        """Move the baseline along the drift, from its middle to now."""
-        ahead = min(self._now - self._middle(), self._drift.span)
+        """Extrapolate the baseline along its drift to the present sample."""
+        ahead = min(self._now - self._find_middle(), self._drift.span)
         self.offset = (self._level + ahead * self._drift.slope).astype(np.float32)
 
-    def _middle(self) -> float:
-        """Return the number of the sample in the middle of the baseline."""
+    def _find_middle(self) -> float:
+        """Return the mean sample number of the baseline."""
         return float(np.mean([at for at, _, _ in self._baseline]))
 
     def _restart_baseline(self, drift: "Drift") -> None:
-        """Restart the baseline from the latest samples, which turned out to be rest."""
+        """End the contact, and restart the baseline from the latest samples, which are rest."""
         self.contact = False
         self._above = np.zeros_like(self._above)
         self._suspicious_for = np.zeros_like(self._suspicious_for)

@@ -41,7 +41,7 @@ class WhiskerShapes:
         young_modulus: (element,) Young's modulus of the whisker's material, Pa.
 
     Raises:
-        ConfigError: not one value of each for every whisker, or a value that is not finite.
+        ConfigError: A field does not have one finite value for each whisker.
     """
 
     length: Floats
@@ -73,11 +73,11 @@ class WhiskerShapes:
 
 
 def straight(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
-    """Estimate the distance (n,) from the base, m, for a straight whisker, within its length.
+    """Estimate the contact's distance (n,) from a straight whisker's base, m, within its length.
 
     Args:
-        loads: (n, 6) force (N) and moment (N m) at the base in the whisker's frame.
-        element: (n,) index of the whisker.
+        loads: (n, 6) The force (N) and moment (N m) at the base, in the whisker's frame.
+        element: (n,) The index of the whisker.
     """
     force, moment = loads[:, 1:3], loads[:, 4:6]
     squared = (force**2).sum(axis=1)
@@ -89,10 +89,10 @@ def straight(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -
 
 
 def resting(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
-    """Estimate the arc length (n,) to the resting whisker's point nearest the force's line, m.
+    """Estimate the arc length (n,), m, where the resting whisker is nearest the force's line.
 
     Args:
-        loads, element, shapes: as for `straight`.
+        loads, element, shapes: See `straight`.
     """
     x = shapes.abscissae()
     nodes = np.stack([x, shapes.curvature[:, None] * x**2, np.zeros_like(x)], axis=2)
@@ -109,10 +109,10 @@ def resting(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) ->
 
 
 def bent(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
-    """Estimate the arc length (n,) at which the bent whisker meets the force's line, m.
+    """Estimate the arc length (n,), m, where the bent whisker meets the force's line.
 
     Args:
-        loads, element, shapes: as for `straight`; the loads also bend the whisker.
+        loads, element, shapes: See `straight`; the loads also bend the whisker.
     """
     x = shapes.abscissae()
     headings = np.arctan(2 * shapes.curvature[:, None] * x)
@@ -152,7 +152,7 @@ ESTIMATES = {"straight": straight, "resting": resting, "bent": bent}
 
 
 def _find_nearest(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats]:
-    """Find the least |M - r x F|^2 (n,) on segments, and where along them."""
+    """Return the least |M - r x F|^2 (n,) on segments, and its relative position."""
     force, moment = loads[:, :3], loads[:, 3:]
     missing, gained = moment - np.cross(near, force), np.cross(far - near, force)
     squared = np.maximum((gained**2).sum(axis=1), np.finfo(float).tiny)
@@ -161,7 +161,7 @@ def _find_nearest(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Flo
 
 
 def _make_rotations(turn: Floats) -> Floats:
-    """Compute (n, 3, 3) rotations by the vectors turn (n, 3), rad (Rodrigues)."""
+    """Return the matrices (n, 3, 3) of rotation vectors (n, 3), rad (Rodrigues)."""
     angle = np.linalg.norm(turn, axis=1)[:, None, None]
     x, y, z = turn.T
     none = np.zeros_like(x)

@@ -30,7 +30,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class OpenSetRule(msgspec.Struct, frozen=True):
-    """The open-set rule, by which an object is of no class that the model knows.
+    """A rule that decides when an object is of no class that the model knows.
 
     Attributes:
         score: The name of the score: `POSTERIOR`.
@@ -58,7 +58,7 @@ class OpenSetRule(msgspec.Struct, frozen=True):
 
 
 class PredictionSetRule(msgspec.Struct, frozen=True):
-    """The rule of a step's prediction set: the classes that the step leaves possible.
+    """A rule that selects a step's prediction set: the classes that remain possible.
 
     A class is in the set if its score in the step is at most the step's quantile.
 
@@ -70,7 +70,7 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
         objects: The number of objects that the quantiles were fitted on; the sweeps of an object
             count as one.
         noise: The largest noise for which the coverage holds, in multiples of the rated noise;
-            None: it holds for any noise.
+            None if it holds for any noise.
     """
 
     score: str
@@ -90,9 +90,9 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
         return ""
 
     def prediction_set(self, probabilities: NDArray[np.float32], step: int) -> list[int]:
-        """Form the prediction set of a step (from 1) as indices of `probabilities` (class,).
+        """Return the prediction set of a step as indices of `probabilities` (class,).
 
-        The most probable class is first, and always in the set.
+        Steps count from 1. The most probable class is first, and always in the set.
         """
         order = np.argsort(-probabilities, kind="stable")
         allowed = mass_above(probabilities)[order] <= self.quantiles[step - 1]
@@ -100,13 +100,13 @@ class PredictionSetRule(msgspec.Struct, frozen=True):
 
 
 def fitting(rules: Sequence[PredictionSetRule], noise: float) -> PredictionSetRule | None:
-    """Choose the narrowest rule valid at `noise` (in multiples of the rated noise), or None."""
+    """Return the rule with the least noise limit not below `noise` (relative to rated noise)."""
     known = [r for r in rules if r.score == MASS_ABOVE and (r.noise is None or noise <= r.noise)]
     return min(known, key=lambda r: np.inf if r.noise is None else r.noise, default=None)
 
 
 def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Compute for each class (..., class) the posterior mass of the more probable classes.
+    """Return for each class (..., class) the summed posterior of the more probable classes.
 
     It is 0 for the most probable class and close to 1 for the least. If the posterior of every
     class is 0, since a refusal has all of it, the classes count as equally probable.
@@ -123,7 +123,7 @@ def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def is_printable_name(text: str) -> bool:
-    """Return whether a text can be a name on terminals, pages and in logs."""
+    """Return whether a text is printable and has 1 to `MAX_NAME` characters."""
     return 0 < len(text) <= MAX_NAME and text.isprintable()
 
 
@@ -134,14 +134,14 @@ log = logging.getLogger("tactile_rt.classifier")
 
 
 class EarlyExit:
-    """The early exit: an episode ends once one class is probable enough.
+    """A rule that ends an episode early once one class is probable enough.
 
     Args:
-        sure: probability that the best class needs; None: no early exit.
-        in_a_row: consecutive steps in which the same class must be that probable.
+        sure: The probability that the best class needs, or None for no early exit.
+        in_a_row: The consecutive steps in which the same class must be that probable.
 
     Raises:
-        ConfigError: `sure` is no probability, or `in_a_row` not positive.
+        ConfigError: `sure` is no probability, or `in_a_row` is not positive.
     """
 
     def __init__(self, sure: float | None, in_a_row: int = IN_A_ROW) -> None:
@@ -153,11 +153,11 @@ class EarlyExit:
         self._best, self._sure_for = -1, 0
 
     def begin(self) -> None:
-        """Begin an episode."""
+        """Begin an episode: forget the steps counted so far."""
         self._sure_for = 0
 
     def may_end(self, best: int, probability: float) -> bool:
-        """Take a step's best class and probability; return whether the episode may end."""
+        """Update with a step's best class and probability; return whether the episode may end."""
         again = best == self._best
         self._best = best
         if probability < self._sure:
@@ -168,7 +168,7 @@ class EarlyExit:
 
 
 class Lanes:
-    """Overlapping windows, each computed exactly: one lane of the batch per phase.
+    """A schedule of overlapping windows, each computed exactly in a lane of the batch.
 
     A network with state can answer only for the window that began when its state was zero. With
     windows of n steps that begin every k steps, ceil(n / k) copies of the state run side by side,
@@ -196,7 +196,7 @@ class Lanes:
         return step // self.every % self.count if step % self.every == 0 else None
 
     def choose_lane(self, step: int) -> tuple[int, int] | None:
-        """Return the lane that answers after a step, with its own step; or None.
+        """Return the lane that answers after a step, and the lane's step, or None.
 
         A lane's steps are counted from 1. Until the first window is complete, its lane answers.
         """
@@ -207,7 +207,7 @@ class Lanes:
 
 
 class Deadline:
-    """The deadline of decisions: whether the network keeps up with its stream.
+    """A check of whether the network's steps keep up with its stream.
 
     The backlog of work shrinks as stream time passes and grows by the time that each step takes. A
     step is late if the backlog exceeds `limit_s` at its end, because it or the steps before it took
@@ -221,13 +221,13 @@ class Deadline:
             also log the first of an episode as a warning; ``skip``: count and withhold it, so that
             a robot does not act on it. The network takes every step in any case: with one left out,
             later decisions would be about another signal.
-        age: returns the present age, s, of the sample of a stream time (ns); None: not live.
+        age: returns the present age, s, of the sample at a stream time (ns); None if not live.
 
     Attributes:
         behind_s: The backlog at the end of the last step, s.
 
     Raises:
-        ConfigError: an unknown policy, or a limit that is not positive.
+        ConfigError: The policy is unknown, or the limit is not positive.
     """
 
     def __init__(
@@ -254,8 +254,8 @@ class Deadline:
         """Add a step to the backlog; return whether it is late.
 
         Args:
-            t_ns: stream time of its last sample, ns.
-            took_s: duration of the step, s.
+            t_ns: The stream time of the step's last sample, ns.
+            took_s: The duration of the step, s.
         """
         passed = 0.0 if self._last_ns is None else (t_ns - self._last_ns) / 1e9
         self._last_ns = t_ns

@@ -1,4 +1,4 @@
-"""Enrolled objects: identify touches of them, or refuse, from embeddings alone.
+"""Identification of enrolled objects, and refusal of others, from the embeddings of touches.
 
 A network that was trained to tell objects apart embeds touches of one object near each other. Two
 Gaussians, fitted on objects that it was not trained on, describe how objects differ and how touches
@@ -27,7 +27,7 @@ ENROLLED, JUDGED = 5, 2  # largest numbers of touches with thresholds of their o
 
 
 class IdentityRule(msgspec.Struct, frozen=True):
-    """The rule that identifies enrolled objects. Bytes are float16, little-endian.
+    """A rule that identifies enrolled objects. Fields of bytes hold little-endian float16.
 
     Attributes:
         score: The name of the score: `LOG_ODDS`.
@@ -55,10 +55,10 @@ class IdentityRule(msgspec.Struct, frozen=True):
 
 
 class EnrolledObject(msgspec.Struct, frozen=True):
-    """An object that was enrolled.
+    """An enrolled object: its name, and the mean embedding of a few touches.
 
     Attributes:
-        touches: The number of touches that it was enrolled by.
+        touches: The number of touches that the object was enrolled by.
         mean: (unit,) The mean of their embeddings, float16, little-endian.
     """
 
@@ -68,21 +68,21 @@ class EnrolledObject(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, name: str, embeddings: NDArray[Any]) -> Self:
-        """Enrol an object by its touches (touch, unit)."""
+        """Enrol an object by the embeddings (touch, unit) of its touches."""
         return cls(name, len(embeddings), embeddings.mean(axis=0).astype("<f2").tobytes())
 
 
 def identify(
     rule: IdentityRule, objects: Sequence[EnrolledObject], embeddings: Sequence[NDArray[Any]]
 ) -> tuple[str, float]:
-    """Identify the enrolled object that touches of one thing belong to.
+    """Identify an enrolled object, or none, from one or more touches of one object.
 
     Args:
-        embeddings: (unit,) of each touch, at its last step, in any order.
+        embeddings: The embedding (unit,) of each touch at its last step, in any order.
 
     Returns:
-        The object's name, or `NONE_OF_THESE`; and the score of the likeliest object less its
-        threshold, below 0 if it is refused.
+        The object's name, or `NONE_OF_THESE`; and the score of the likeliest object minus its
+        threshold, below 0 if the object is refused.
     """
     means = _decode_float16(b"".join(one.mean for one in objects)).reshape(len(objects), -1)
     enrolled = np.array([one.touches for one in objects])
@@ -93,7 +93,7 @@ def identify(
 
 
 def project(rule: IdentityRule, embeddings: NDArray[Any]) -> Floats:
-    """Map embeddings (..., unit), or means of them, to the rule's directions."""
+    """Project embeddings (..., unit), or their means, onto the rule's directions."""
     origin = _decode_float16(rule.origin)
     directions = _decode_float16(rule.directions).reshape(len(origin), -1)
     return np.asarray((embeddings - origin) @ directions)
@@ -106,12 +106,12 @@ def margins(
     touches: Floats,
     judged: int = 1,
 ) -> Floats:
-    """Compute the scores (..., object) less their thresholds.
+    """Return how far the score of each object exceeds its threshold, (..., object).
 
     Args:
-        objects: (..., object, direction) the mean of the touches that enrolled each object.
-        enrolled: (..., object) the number of these touches.
-        touches: (..., direction) the mean of the `judged` touches to identify.
+        objects: (..., object, direction) The mean of the touches that enrolled each object.
+        enrolled: (..., object) The number of these touches.
+        touches: (..., direction) The mean of the `judged` touches to identify.
     """
     between = np.array(rule.between)
     odds = log_odds(between, objects, enrolled[..., None], touches[..., None, :], judged)
@@ -124,11 +124,11 @@ def margins(
 def log_odds(
     between: Floats, objects: Floats, enrolled: ArrayLike, touches: Floats, judged: int
 ) -> Floats:
-    """Compute log odds (...) that touches are of an object, against an unknown one.
+    """Return log odds (...) that touches are of an enrolled object, against an unknown object.
 
     Args:
-        between: (direction,) variance between objects; that of touches of one object is 1.
-        objects, touches: (..., direction) means of `enrolled` and of `judged` touches.
+        between: (direction,) The variance between objects; that of touches of one object is 1.
+        objects, touches: (..., direction) The means of `enrolled` and of `judged` touches.
     """
     rest = between / (np.asarray(enrolled) * between + 1)  # variance left of the object's mean
     own, any_object = rest + 1 / judged, between + 1 / judged
@@ -140,7 +140,7 @@ def log_odds(
 def enrolment_fault(
     rule: IdentityRule | None, objects: Sequence[EnrolledObject], units: int
 ) -> str:
-    """Return why a card's enrolment cannot be used, or ""."""
+    """Return why a card's enrolled objects and their rule cannot be used, or ""."""
     if rule is None:
         return "enrolled objects, but no rule `identity`" if objects else ""
     if rule.score != LOG_ODDS:

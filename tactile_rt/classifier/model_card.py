@@ -1,4 +1,4 @@
-"""Model cards: a model file's metadata on its array, episode, classes and measured figures.
+"""Model cards: a model file's metadata on its array, episode, classes and measured results.
 
 A release ignores fields that it does not know; the version is raised only when an older reader
 would misread a file.
@@ -44,7 +44,7 @@ Kind = Literal["step", "window"]
 class StateTensor(msgspec.Struct, frozen=True):
     """One recurrent state: its name, shape without the batch axis, and element type.
 
-    `in_place`: a step writes only some of its rows, so `<name>_next` may be the same memory.
+    With `in_place`, a step writes only some rows, so `<name>_next` may share the state's memory.
     """
 
     name: str
@@ -68,7 +68,7 @@ class ModelCard(msgspec.Struct, frozen=True):
         temperature: The number that divides the logits, fitted on validation sweeps so that
             probabilities are calibrated.
         provenance: The origin of the file: network, training, data set, hashes.
-        figures: The figures measured on the model, such as parity and accuracy.
+        figures: The results measured on the model, such as parity and accuracy.
         kind: The form of the input, "step" or "window", see `model_file`.
         precision: The number format in which weights are stored and multiplied.
         opset: The version of ONNX's operators that the graph uses.
@@ -84,10 +84,10 @@ class ModelCard(msgspec.Struct, frozen=True):
         kinds: The kinds that the model distinguishes within a class, by class; only classes that
             have kinds. All kinds in this order are the columns of the output ``names``.
         names: The rules of prediction sets of these kinds, by class.
-        refusals: The last of the labels, if any: they name no class, but say that the object is
-            unknown, or what is wrong with the loads.
+        refusals: The last labels, if they name no class, but state that the object is unknown, or
+            what is wrong with the loads.
         identity: The rule that identifies enrolled objects, for networks whose embedding was
-            trained to tell objects apart; None: no object can be enrolled.
+            trained to tell objects apart; None if no object can be enrolled.
         enrolled: The objects that the model knows by a few touches, in addition to its classes.
         license: The licence of the file, an SPDX expression such as "Apache-2.0"; empty if unknown.
     """
@@ -125,7 +125,7 @@ class ModelCard(msgspec.Struct, frozen=True):
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The labels that are classes, which are those before the refusals."""
+        """The labels that name classes: all labels before the refusals."""
         return self.labels[: len(self.labels) - len(self.refusals)]
 
     @property
@@ -135,7 +135,7 @@ class ModelCard(msgspec.Struct, frozen=True):
 
     @property
     def class_of(self) -> dict[str, str]:
-        """The class of each category, from the recipe of the first sweep set."""
+        """The class of each category, from the first sweep set's recipe; empty if unknown."""
         with suppress(TypeError, KeyError, msgspec.ValidationError):
             classes = self.provenance["sweep_set"]["objects"]["classes"]
             merged = msgspec.convert(classes, dict[str, tuple[str, ...]])
@@ -144,21 +144,21 @@ class ModelCard(msgspec.Struct, frozen=True):
 
 
 def kind_columns(kinds: Mapping[str, Sequence[str]]) -> dict[str, slice]:
-    """Find the columns of the output ``names`` that belong to each class."""
+    """Return the columns of the output ``names`` that belong to each class."""
     ends = list(accumulate(map(len, kinds.values()), initial=0))
     return {name: slice(*ends[k : k + 2]) for k, name in enumerate(kinds)}
 
 
 def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.intp]:
-    """Find the source's index of each model element: ``samples[..., order, :]`` feeds the model.
+    """Return the source's index of each model element: ``samples[..., order, :]`` feeds the model.
 
-    Name, rate and the order of elements may differ; nothing else may.
+    Only the arrays' names, rates and orders of elements may differ.
 
     Returns:
-        (element,) indices into the source's elements, 0, 1, 2, ... when the order is the same.
+        (element,) Indices into the source's elements, 0, 1, 2, ... when the order is the same.
 
     Raises:
-        SpecMismatch: the arrays differ; the message says exactly where.
+        SpecMismatch: The arrays differ; the message says exactly where.
     """
     mine, theirs = card_spec.elements, source_spec.elements
     if set(mine) == set(theirs):
@@ -180,13 +180,13 @@ def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.in
 
 
 def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp]:
-    """Find the `element_order` of a source for a model file.
+    """Return the `element_order` of a source's array, or raise an error with advice.
 
     Args:
-        model: the file, for the message.
+        model: The model's file, for the message.
 
     Raises:
-        SpecMismatch: the model was made for another array; the message says where they differ, and
+        SpecMismatch: The model was made for another array; the message says where they differ, and
             what to do.
     """
     try:
@@ -202,10 +202,10 @@ def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp
 
 
 def parse_card(path: Path, text: str) -> ModelCard:
-    """Read a model's metadata.
+    """Parse and check the metadata of a model file.
 
     Raises:
-        ModelError: the metadata is damaged, of another version, or describes no usable model.
+        ModelError: The metadata is damaged, of another version, or describes no usable model.
     """
 
     def reject(why: object) -> ModelError:
@@ -286,8 +286,8 @@ def choose_label(card: ModelCard, probabilities: NDArray[np.float32], step: int)
     """Return the index of the label that a model decides for.
 
     Args:
-        probabilities: (class,) of all its labels.
-        step: of the episode, counted from 1.
+        probabilities: (class,) The posterior probabilities of all labels.
+        step: The step of the episode, counted from 1.
     """
     rule = card.unknown
     if rule is None or rule.score != POSTERIOR or UNKNOWN not in card.refusals:
@@ -305,7 +305,7 @@ def choose_label(card: ModelCard, probabilities: NDArray[np.float32], step: int)
 def rated_noise(card: ModelCard) -> NDArray[np.float32]:
     """Return the rated noise (channel,) per sample of a model's array, SI.
 
-    If neither the card nor a unit determines it, it is the card's floor.
+    If neither the card nor a unit determines the noise, the card's floor is returned.
     """
     try:
         return channel_limits(card.array, sensor_of(card), card.period_ns).noise

@@ -74,7 +74,7 @@ def hash_of(model: Path) -> str:
     """Return the SHA-256 (hex) of a model's file.
 
     Raises:
-        ConfigError: the file cannot be read.
+        ConfigError: The file cannot be read.
     """
     try:
         return hashlib.sha256(model.read_bytes()).hexdigest()
@@ -86,13 +86,13 @@ def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Content
     """Read a model file without running it; return card, contents and bytes.
 
     Args:
-        path: the ``.onnx`` file.
-        kind: the kind of model that is needed; None takes any.
+        path: The ``.onnx`` file.
+        kind: The required kind of model, or None for any.
 
     Raises:
-        ModelError: not of this kind, missing, too large, not ONNX, reaching outside the file or
-            past the limits of `onnx_check`, without our metadata, or with metadata that is damaged,
-            of another version, or names other inputs and outputs than the graph.
+        ModelError: The file is of another kind, missing, too large, not ONNX, refers to other files
+            or exceeds the limits of `onnx_check`; or its metadata is missing, damaged, of another
+            version, or names other inputs and outputs than the graph.
     """
     if not path.is_file():
         raise ModelError(f"no model file {path}")
@@ -129,17 +129,17 @@ def load_model(
     providers: Sequence[str] = ("CPUExecutionProvider",),
     kind: Kind | None = "step",
 ) -> tuple[ort.InferenceSession, ModelCard]:
-    """Open a model file for inference and read its card.
+    """Open a model file for inference; return the session and the card.
 
     Args:
-        path: the ``.onnx`` file.
+        path: The ``.onnx`` file.
         providers: onnxruntime's execution providers in the order of preference.
-        kind: the kind of model that is needed; None takes any.
+        kind: The required kind of model, or None for any.
 
     Raises:
-        ModelError: as `read_model`; or onnxruntime cannot run the graph, or the graph disagrees
+        ModelError: See `read_model`; or onnxruntime cannot run the graph, or the graph disagrees
             with the card.
-        ConfigError: this onnxruntime lacks a provider, or cannot use it here.
+        ConfigError: This onnxruntime lacks a provider, or cannot use it here.
     """
     available = ort.get_available_providers()
     for provider in providers:
@@ -172,17 +172,17 @@ def load_model(
 def check_graph(
     card: ModelCard, inputs: Mapping[str, Described], outputs: Mapping[str, Described], path: Path
 ) -> None:
-    """Compare a graph with the card of its file.
+    """Check that a graph's inputs and outputs agree with the card of its file.
 
     Args:
-        card: of the file.
-        inputs: shape and type of each, the latter as onnxruntime writes it, ``tensor(float)``; an
-            unknown axis is not an int, and an unknown shape is empty.
-        outputs: likewise.
-        path: of the file, for the message.
+        card: The card of the file.
+        inputs: The shape and type of each input, the type in onnxruntime's form ``tensor(float)``;
+            an unknown axis is not an int, and an unknown shape is empty.
+        outputs: The shape and type of each output, in the same form.
+        path: The path of the file, for the message.
 
     Raises:
-        ModelError: they disagree; the message names where.
+        ModelError: The graph and the card disagree; the message names where.
     """
     window = card.kind == "window"
     # (shape without the batch axis, element type) of everything the classifier will feed
@@ -190,15 +190,15 @@ def check_graph(
     elements, channels = card.array.shape
     sample = (card.substeps, elements, channels)
     expected: dict[str, tuple[tuple[Any, ...], str]] = {
-        "samples": ((card.steps, *sample) if window else sample, _onnx_type("float32")),
-        "offset": ((elements, channels), _onnx_type("float32")),
-        "sigma": ((elements, channels), _onnx_type("float32")),
-        **{s.name: (s.shape, _onnx_type(s.dtype)) for s in card.state},
+        "samples": ((card.steps, *sample) if window else sample, _make_onnx_type("float32")),
+        "offset": ((elements, channels), _make_onnx_type("float32")),
+        "sigma": ((elements, channels), _make_onnx_type("float32")),
+        **{s.name: (s.shape, _make_onnx_type(s.dtype)) for s in card.state},
     }
     if window and "samples" in inputs:
         steps = (without_batch["samples"][0] or (0,))[0]
         if not isinstance(steps, int):  # the graph takes any number of steps
-            expected["samples"] = ((steps, *sample), _onnx_type("float32"))
+            expected["samples"] = ((steps, *sample), _make_onnx_type("float32"))
     wrong = {k for k in without_batch | expected if without_batch.get(k) != expected.get(k)}
     wrong |= {name for name, (shape, _) in inputs.items() if not shape}  # not even a batch
     if wrong:
@@ -216,12 +216,12 @@ def check_graph(
         # onnxruntime may not know every size before it runs.
         axes = zip(shape[1:], state.shape, strict=False)
         same = all(a == b or not isinstance(a, int) for a, b in axes)
-        if not same or len(shape) != 1 + len(state.shape) or kind != _onnx_type(state.dtype):
+        if not same or len(shape) != 1 + len(state.shape) or kind != _make_onnx_type(state.dtype):
             raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
 
 
 def output_sizes(card: ModelCard) -> dict[str, int]:
-    """Return the sizes of the outputs that are not states, by name."""
+    """Return the size of each output of the graph except states, by name."""
     sizes = {"logits": len(card.labels), "embedding": card.embedding}
     names = sum(map(len, card.kinds.values()))
     return {**sizes, "names": names} if names else sizes
@@ -247,7 +247,7 @@ def _describe_mistake(data: bytes) -> str:
 
 
 def _shorten_reason(error: Exception) -> str:
-    """Return onnxruntime's message without locations in its source."""
+    """Return onnxruntime's message without the locations in onnxruntime's source."""
     text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", one_line(error))
     if newest := re.search(r"Opset (\d+) is .* is till opset (\d+)", text):
         return (
@@ -264,7 +264,7 @@ def _shorten_reason(error: Exception) -> str:
     return text[:MESSAGE]
 
 
-def _onnx_type(dtype: str) -> str:
+def _make_onnx_type(dtype: str) -> str:
     name = {"float32": "float", "float64": "double"}.get(dtype, dtype)
     return f"tensor({name})"
 
@@ -281,9 +281,9 @@ def file_outputs(
     """Run a model file of either kind on windows, each from a zero state.
 
     Args:
-        session, card: the file, as `load_model` gives it.
-        samples: (batch, step, sub-step, element, channel), SI.
-        offset, sigma: (batch, element, channel), SI.
+        session, card: The model, as `load_model` returns it.
+        samples: (batch, step, sub-step, element, channel) The windows, SI.
+        offset, sigma: (batch, element, channel) The baseline and its noise, SI.
 
     Returns:
         ``logits`` (batch, step, class), ``embedding`` (batch, step, unit) and, of a model with
@@ -306,17 +306,17 @@ def file_outputs(
 
 
 def probe_logits(session: ort.InferenceSession, card: ModelCard) -> Floats:
-    """Run the probe episode, the same on every machine; return logits (step, class)."""
+    """Run a model on the probe episode, equal on all machines; return logits (step, class)."""
     logits: Floats = file_outputs(session, card, *_make_probe(card))["logits"][0]
     return logits
 
 
 def verify_model(path: Path) -> list[str]:
-    """Check a file against its metadata; return a line for each check.
+    """Check a model file against its metadata; return a line of text for each check.
 
     Raises:
-        ModelError: as `load_model`; the graph is not the one that was exported, this machine
-            computes other logits than those stored, or a NaN sample affects later steps.
+        ModelError: See `load_model`; or the graph is not the exported one, this machine computes
+            other logits than those stored, or a NaN sample affects later steps.
     """
     session, card = load_model(path, kind=None)
     lines = []
@@ -359,7 +359,7 @@ def _are_equal(found: dict[str, Floats], expected: dict[str, Floats]) -> bool:
 
 
 def _make_probe(card: ModelCard) -> tuple[Floats, Floats, Floats]:
-    """Make samples, offset and sigma of the probe episode, a batch of one.
+    """Return samples, offset and sigma of the probe episode, a batch of one.
 
     Only integer and exact arithmetic is used, for a heavy-tailed sequence that reaches from below
     the scale of the input compression to above its clip.

@@ -55,12 +55,12 @@ INT64 = 7
 
 
 class BadModel(Exception):
-    """The bytes are no model that may be opened; the message is one line."""
+    """Raised for bytes that are no model safe to open; the message is one line."""
 
 
 @dataclass
 class Contents:
-    """The contents of a model file.
+    """The contents of a model file, as read without running it.
 
     Attributes:
         opset: The version of each operator set, by domain; ``""`` is ONNX's own.
@@ -83,17 +83,17 @@ def read_onnx(data: bytes) -> Contents:
     """Check a serialised ``ModelProto`` and return its contents.
 
     Raises:
-        BadModel: damaged, or with external data, foreign operators, functions, training, loops,
-            shapes that follow the values of an input, or anything past this module's limits.
+        BadModel: The model is damaged, or has external data, foreign operators, functions,
+            training, loops, shapes that depend on values of an input, or exceeds a limit.
     """
     return _Walk(data).model()
 
 
 def graph_sha256(data: bytes) -> str:
-    """Return the SHA-256 (hex) of a model without metadata, so of its computation alone.
+    """Return the SHA-256 (hex) of a model without metadata, which identifies its computation.
 
     Raises:
-        BadModel: damaged.
+        BadModel: The model is damaged.
     """
     digest = hashlib.sha256()
     for number, _, whole in split_fields(data):
@@ -103,10 +103,10 @@ def graph_sha256(data: bytes) -> str:
 
 
 def split_fields(data: bytes | memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
-    """Split a message into (field number, value, whole field); a number's value is empty.
+    """Yield (field number, value, whole field) of a protobuf message; numbers have empty values.
 
     Raises:
-        BadModel: damaged.
+        BadModel: The message is damaged.
     """
     walk, at = _Walk(data), 0
     for number, wire, start, end in walk.fields(0, len(data)):
@@ -115,7 +115,7 @@ def split_fields(data: bytes | memoryview) -> Iterator[tuple[int, memoryview, me
 
 
 class _Walk:
-    """A walker over a serialised model, with a method that checks each kind of message."""
+    """A parser of a serialised model, with a method that checks each kind of message."""
 
     def __init__(self, data: bytes | memoryview) -> None:
         if len(data) > MAX_BYTES:
@@ -209,10 +209,10 @@ class _Walk:
         return self.found
 
     def check_shapes(self) -> None:
-        """Refuse shapes that depend on the values of the graph's inputs.
+        """Raise `BadModel` if a shape depends on the values of the graph's inputs.
 
-        No trial run could cover them all. Nodes may be in any order, and names within a subgraph
-        count as global."""
+        No trial run could cover all such shapes. Nodes may be in any order, and names within a
+        subgraph count as global."""
         readers: dict[str, list[int]] = {}
         for i, (operator, inputs, _) in enumerate(self.nodes):
             if operator not in ("Shape", "Size"):  # they read shapes, which no touch changes
@@ -307,7 +307,7 @@ class _Walk:
     def attribute(
         self, at: int, end: int, depth: int, output: str
     ) -> list[tuple[list[str], list[str]]]:
-        """Check an attribute; return inputs and outputs of each graph in it.
+        """Check a node's attribute; return inputs and outputs of each graph within it.
 
         `output` is the name of the tensor if the node is a Constant."""
         graphs = []
@@ -327,7 +327,7 @@ class _Walk:
             self.tensor(start, stop)
 
     def tensor(self, at: int, end: int, name: str = "") -> str:
-        """Check a tensor, named `name` or as it says; return its name."""
+        """Check a tensor; return its name, which is `name` or else the stored name."""
         dims: list[int] = []
         kind, raw, values = 0, None, []
         for number, wire, value, stop in self.fields(at, end):
@@ -373,7 +373,7 @@ class _Walk:
         return values
 
     def value(self, at: int, end: int) -> str:
-        """Check the size of a value; return its name.
+        """Check the declared size of a graph's input, output or inner value; return its name.
 
         ValueInfoProto -> TypeProto -> TypeProto.Tensor -> TensorShapeProto -> dimensions.
         """

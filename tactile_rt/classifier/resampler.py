@@ -1,4 +1,4 @@
-"""Clocks and rates: one anti-aliased resampler, shared by data set and runtime.
+"""An anti-aliased resampler to a fixed period, shared by data sets and runtime.
 
 Training windows and the live stream pass through the same code, so that the network never meets
 at run time what it was not trained on.
@@ -18,12 +18,12 @@ LEAST_WEIGHT = 0.25
 
 
 class Resampler:
-    """Resample a stream to a fixed period with a Hann kernel; push chunks, take chunks.
+    """A resampler of a stream of chunks to a fixed period, with a Hann kernel.
 
     Each output is the mean of the valid inputs within one output period either side, weighted by
     ``(1 + cos(pi dt / period)) / 2``. The weights are never negative, so a force never changes its
     sign and a step never overshoots, and every input contributes equally to the outputs in sum, so
-    impulse is conserved. The price is gentle: -6 dB at the output's Nyquist frequency, a zero at
+    impulse is conserved. The cost is small: -6 dB at the output's Nyquist frequency, a zero at
     the output rate, and a delay of one output period. An input that already has the output's
     period passes unchanged. The result does not depend on how the input was cut into chunks.
 
@@ -50,10 +50,10 @@ class Resampler:
         self._held: Chunk | None = None  # inputs that a later output may still need
 
     def push(self, chunk: Chunk) -> Chunk | None:
-        """Take input samples, return the outputs that they complete, or None.
+        """Feed input samples; return the resampled outputs that these complete, or None.
 
         Args:
-            chunk: (n, element, channel) samples in time order.
+            chunk: (n, element, channel) The samples, in order of time.
 
         Returns:
             Outputs with `seq` counting output periods since the first (`aligned`: since time 0),
@@ -71,7 +71,7 @@ class Resampler:
         return concatenate(pieces) if pieces else None
 
     def _split_at_gaps(self, chunk: Chunk) -> list[Chunk]:
-        """Split a chunk at its long silences."""
+        """Split a chunk at gaps in time that are too long to fill."""
         cuts = np.flatnonzero(np.diff(chunk.t_ns) > self._longest_gap_ns) + 1
         edges = [0, *cuts.tolist(), len(chunk)]
         return [chunk.select(slice(a, b)) for a, b in itertools.pairwise(edges)]

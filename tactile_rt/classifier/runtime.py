@@ -39,16 +39,16 @@ WORDS = 8
 
 
 def available() -> tuple[str, ...]:
-    """Return the names of the providers that the installed onnxruntime was built with."""
+    """Return the short names of the execution providers that this onnxruntime has."""
     built = ort.get_available_providers()
     return tuple(name for name, known in PROVIDERS.items() if known in built)
 
 
 def onnxruntime_names(providers: Sequence[str]) -> list[str]:
-    """Translate provider names, first choice first, with the CPU as the last.
+    """Translate short provider names to onnxruntime's, with the CPU as the last choice.
 
     Raises:
-        ConfigError: no name, an unknown name, or a provider that this onnxruntime lacks.
+        ConfigError: No name is given, or a name is unknown or missing in this onnxruntime.
     """
     if isinstance(providers, str):
         providers = (providers,)

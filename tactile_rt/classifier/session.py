@@ -20,12 +20,12 @@ POLL_S = 0.1  # how soon a reader thread notices that it should stop
 
 
 class Session:
-    """A classifier on a source; iterate over it for chunks with their decisions.
+    """An iterable over a source's chunks, each with the decisions of a classifier.
 
     Args:
-        source: the source of samples; the session closes it.
-        classifier: made for the source's array.
-        queue_chunks: chunks that may wait for the classifier.
+        source: The source of samples; the session closes it.
+        classifier: The classifier, created for the source's array.
+        queue_chunks: The number of chunks that may wait for the classifier.
     """
 
     def __init__(self, source: Source, classifier: Classifier, queue_chunks: int = 256) -> None:

@@ -4,7 +4,7 @@ A network that is too slow, or that was denied the processor, falls behind its s
 it would decide about what was touched seconds ago. It can still take every step, as a laboratory
 may want (``all``); or skip to the newest sample, as a robot must (``newest``).
 
-A network with a state must not be fed a stream with a hole in it: it was trained on no such signal.
+A network with a state must not be fed a stream with a gap in it: it was trained on no such signal.
 So a stretch is skipped whole. It ends the current episode, an onset within it begins no episode,
 and the next onset after it begins one. The contact detector still takes every sample: that costs
 little, and keeps its baseline and contact state up to date.
@@ -41,16 +41,16 @@ class Skip:
 
 
 class Skips:
-    """The stretches of a stream to skip, planned or found while it runs.
+    """A schedule of stretches of a stream to skip, planned or added for late steps.
 
     Args:
-        planned: stretches that are known beforehand, in order of time.
-        most_s: greatest age of a step's newest sample at its decision, s; infinite: nothing is
-            skipped for its age.
-        age: returns the present age, s, of the sample of a stream time (ns).
+        planned: The stretches that are known beforehand, in order of time.
+        most_s: The greatest age of a step's newest sample at its decision, s; if infinite, nothing
+            is skipped for its age.
+        age: Returns the present age, s, of the sample at a stream time (ns).
 
     Attributes:
-        found: The stretches that were found since the list was last emptied.
+        found: The stretches added since the list was last emptied.
     """
 
     def __init__(
@@ -65,18 +65,18 @@ class Skips:
         self.found: list[Skip] = []
 
     def covers(self, t_ns: int) -> bool:
-        """Return whether the sample of this stream time is skipped; times must ascend."""
+        """Return whether the sample at a stream time is skipped; times must ascend."""
         while self._ahead and t_ns >= self._ahead[0].until_ns:
             self._ahead.popleft()
         return bool(self._ahead) and t_ns >= self._ahead[0].from_ns
 
     def add(self, from_ns: int, until_ns: int) -> None:
-        """Skip this stretch, which begins now."""
+        """Add a stretch to skip, which begins now."""
         self._ahead.append(Skip(from_ns, until_ns))
         self.found.append(Skip(from_ns, until_ns))
 
     def before_step(self, t_ns: int) -> bool:
-        """Return True, and skip up to now, if the coming step would be too late."""
+        """Return whether the coming step would be too late; if so, skip up to now."""
         if self._age is None:
             return False
         age_s = self._age(t_ns)
@@ -86,11 +86,11 @@ class Skips:
         return True
 
     def after_step(self, t_ns: int, took_s: float) -> bool:
-        """Return True, and skip up to now, if the finished step is too late.
+        """Return whether the finished step is too late; if so, skip up to now.
 
         Args:
-            t_ns: stream time of its newest sample, ns.
-            took_s: duration of the step, s.
+            t_ns: The stream time of the step's newest sample, ns.
+            took_s: The duration of the step, s.
         """
         self._expected_s += SMOOTHING * (took_s - self._expected_s)
         age_s = 0.0 if self._age is None else self._age(t_ns)

@@ -1,8 +1,8 @@
 """The network's step, bound once to preallocated buffers.
 
-The state lives in two sets of buffers; steps in turn read one and write the other. So a step
-allocates nothing, and with a GPU the state never leaves it. A cache of which a step writes only a
-few rows is the same buffer in both sets: onnxruntime then copies nothing.
+The state lives in two sets of buffers; steps alternately read one and write the other. So a step
+allocates nothing, and the state never leaves a GPU. If a step writes only a few rows of a cache,
+both sets have the same buffer for the cache: onnxruntime then copies nothing.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ WARM_UP = 4  # runs, two of each binding: the first runs allocate, and may even 
 
 
 class Tensor:
-    """An array that onnxruntime shares on the CPU, or copies to a device."""
+    """A host array that onnxruntime uses directly, or that is copied to its device."""
 
     def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
         self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)
@@ -29,12 +29,12 @@ class Tensor:
         self._on_device = device != "cpu"
 
     def send(self) -> None:
-        """Copy the host array to the device."""
+        """Copy the host array to the device, if it is not the CPU."""
         if self._on_device:
             self.value.update_inplace(self.array)
 
     def zero(self, lane: int | None = None) -> None:
-        """Zero one lane, or all."""
+        """Set one lane of the array to zero, or all lanes if `lane` is None."""
         if lane is None:
             self.array.fill(0)
         else:
@@ -45,15 +45,15 @@ class Tensor:
 
 
 class Stepper:
-    """A model file's graph, run step by step in several lanes at once.
+    """A runner of a model's graph, step by step, in several lanes at once.
 
     Attributes:
-        samples: (lane, sub-step, element, channel) SI: write the step's input here.
-        embedding: (lane, unit) The embedding of the last step, which the next one overwrites.
+        samples: (lane, sub-step, element, channel) The next step's input, SI; write it here.
+        embedding: (lane, unit) The embedding of the last step, which the next step overwrites.
         names: (lane, name) The logits of kinds, likewise; no columns for a model without kinds.
 
     Raises:
-        ConfigError: the graph's batch is fixed to another number than `lanes`.
+        ConfigError: The graph's batch is fixed to another number than `lanes`.
     """
 
     def __init__(self, session: ort.InferenceSession, card: ModelCard, lanes: int = 1) -> None:

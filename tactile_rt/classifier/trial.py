@@ -2,7 +2,7 @@
 
 `onnx_check` judges a file by its contents; its cost shows only when it runs. Computed shapes can
 ask for any memory, and a graph of a few kilobytes for hours. So before a daemon, which has samples
-to lose, loads a file, a child process does, with limits on its memory, processor time and duration.
+to lose, loads a file, a child process runs it, with limits on memory, processor time and duration.
 The child dies with its parent.
 
     try_model(path, Limits) -> Trial        in the parent
@@ -87,16 +87,16 @@ def try_model(
     every: int = 0,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Trial:
-    """Load a file, warm it up and take steps, in a child process.
+    """Load, warm up and run a model in a child process; return time and memory.
 
     Args:
-        path: of the ``.onnx`` file, of kind ``step``.
-        limits: None: the defaults.
-        every: steps between sliding windows, which determine the number of lanes; 0: one lane.
-        stopped: returns True once the result is no longer needed; called repeatedly.
+        path: The ``.onnx`` file, of kind ``step``.
+        limits: The limits on memory and time, or None for the defaults.
+        every: The steps between sliding windows, which determine the number of lanes; 0 for one.
+        stopped: Returns True once the result is no longer needed; called repeatedly.
 
     Raises:
-        ModelError: one line: what is wrong with the file, or which limit it broke.
+        ModelError: One line: what is wrong with the file, or which limit it broke.
     """
     limits = limits or TrialLimits()
     task = _Task(str(path), every, limits, os.getpid())
@@ -262,7 +262,7 @@ def _main() -> int:
 
 
 def _rewrite_error(text: str, task: _Task) -> str:
-    """Shorten an error text; replace onnxruntime's words on lack of memory."""
+    """Shorten an error text, or explain the limit if onnxruntime lacked memory."""
     if any(word in text for word in WANTED_MEMORY):
         return f"{task.path} is refused: {_explain_memory(task.limits)}"
     return text[:MESSAGE]

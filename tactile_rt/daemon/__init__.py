@@ -1,4 +1,4 @@
-"""The onboard daemon: sources, models and consumers, each in a thread of its own that is restarted.
+"""The onboard daemon: sources, models and consumers, each in its own thread, restarted on failure.
 
     source --+--> mailbox --> model --> decisions --+
              |                                      |

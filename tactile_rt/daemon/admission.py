@@ -1,7 +1,7 @@
 """Admission of a model to the daemon: a trial in a child process, then loading and warm-up.
 
-All of that happens in a background thread. A model that already decides goes on meanwhile; its part
-takes the new model when that is ready.
+The admission runs in a background thread. Meanwhile the present model of the part goes on deciding;
+the part replaces it when the new model is ready.
 """
 
 import threading
@@ -17,19 +17,19 @@ from tactile_rt.daemon.items import Opened
 
 
 class Admission:
-    """The admission of a model, which begins at once in a thread of its own.
+    """A background job that tries, loads and warms up a model; starts on construction.
 
     Args:
-        opened: the stream that the model will classify; None: the model is only tried.
-        age: of the stream's samples, see `Classifier`; used if the stream is live.
-        trial: an earlier trial of the same file, if any.
+        opened: The stream that the model will classify; with None, the model is only tried.
+        age: Returns the age of a step, s, see `Classifier`; used only for a live stream.
+        trial: The result of an earlier trial of the same file, which is then not repeated.
 
     Attributes:
         stamp: The `file_stamp` of the file that is tried.
         finished: Set when the model is ready or refused.
-        error: The reason for a refusal; None: the model is not refused.
-        trial: The result of the trial; None before.
-        classifier: The model, warm; None before, and without a stream.
+        error: The reason for a refusal, or None if the model is not refused.
+        trial: The result of the trial, or None before its end.
+        classifier: The loaded, warm classifier; None until it is ready, or without a stream.
     """
 
     def __init__(
@@ -51,12 +51,12 @@ class Admission:
         threading.Thread(target=self._run, name=ADMISSION, daemon=True).start()
 
     def give_up(self) -> None:
-        """Abandon the admission, whose model is no longer needed."""
+        """Abandon the admission, because its model is no longer needed."""
         self._given_up.set()
 
     @property
     def words(self) -> str:
-        """Description of the result, for the log."""
+        """Result of the admission in words, for the log."""
         if self.error is not None:
             return str(self.error)
         assert self.trial is not None
@@ -100,12 +100,12 @@ class Admission:
 
 
 def model_path(config: ModelConfig) -> Path:
-    """Return the model's file; the packaged model if the configuration names none."""
+    """Return the path of the model's file, by default that of the packaged model."""
     return Path(config.file) if config.file else shipped_model()
 
 
 def file_stamp(file: Path) -> tuple[int, ...]:
-    """Return a stamp that changes when a file is replaced, written or removed."""
+    """Return (mtime in ns, size, inode) of a file, empty if it is missing."""
     try:
         found = file.stat()
     except (OSError, ValueError):

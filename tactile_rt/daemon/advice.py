@@ -51,7 +51,7 @@ ADVICE = {
 
 
 class DiagnosticOnsets:
-    """The onsets of the current diagnostics; safe from any thread."""
+    """A thread-safe record of when each current diagnostic was first found."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -60,7 +60,7 @@ class DiagnosticOnsets:
     def explain(
         self, found: Sequence[Diagnostic], now_ns: int, utc_ns: int
     ) -> tuple[Diagnostic, ...]:
-        """Add onset and advice to the present diagnostics (host CLOCK_MONOTONIC and UTC, ns)."""
+        """Return current diagnostics with onset and advice; `now_ns` is host CLOCK_MONOTONIC."""
         when = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         with self._lock:
             keys = [(one.part, one.what) for one in found]

@@ -1,4 +1,4 @@
-"""Checks of whether a configuration as a whole can work, beyond those of single keys.
+"""Checks of a configuration as a whole, beyond the types and ranges of single keys.
 
 No device is opened or queried; named files must exist.
 """
@@ -63,7 +63,7 @@ def _check_names(loaded: Loaded, config: Config) -> None:
 
 
 def _check_source(loaded: Loaded, i: int, source: SourceConfig) -> ArraySpec | None:
-    """Check a source; return its array, if that is known before it opens."""
+    """Check a source's settings; return its array, or None if unknown before it is opened."""
     path: KeyPath = ["source", i]
     spec: ArraySpec | None = _try(loaded, [*path, "url"], check_source, source.url)
     given: dict[str, str] = {}
@@ -101,7 +101,7 @@ def _check_model(
 
 
 def _check_devices(loaded: Loaded, config: Config) -> None:
-    """Refuse two sources that share a device."""
+    """Raise `ConfigError` if two sources share a device."""
     taken: dict[str, str] = {}
     for i, source in enumerate(config.source):
         for key in device_keys([source.url]):
@@ -151,7 +151,7 @@ def _try(loaded: Loaded, path: KeyPath, check: Callable[[Any], Any], value: Any)
 
 
 def _check_host(loaded: Loaded, path: KeyPath, host: str) -> None:
-    """Refuse a host that is neither an IP address nor a valid host name."""
+    """Raise `ConfigError` if a host is neither an IP address nor a valid host name."""
     try:
         ipaddress.ip_address(host.strip("[]"))
     except ValueError:
@@ -162,7 +162,7 @@ def _check_host(loaded: Loaded, path: KeyPath, host: str) -> None:
 
 
 def _check_listeners(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse two consumers that listen at one port."""
+    """Raise `ConfigError` if two consumers listen at one port."""
     taken: list[tuple[str, int, str]] = []
     for one in wanted:
         for key, host, port in _list_addresses(one):
@@ -177,7 +177,7 @@ def _check_listeners(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
 
 
 def _check_domains(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse two publishers in one DDS domain, which a process can join only once."""
+    """Raise `ConfigError` if two publishers share a DDS domain, which a process joins once."""
     taken: dict[int, str] = {}
     for one in wanted:
         if one.kind == "ros2":
@@ -189,7 +189,7 @@ def _check_domains(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
 
 
 def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse an output file that is invalid, also an input, or written by another consumer."""
+    """Raise `ConfigError` if an output file is invalid, an input, or written by two consumers."""
     config = loaded.config
     read = [str(loaded.path), *(m.file for m in config.model)]
     read += [file for s in config.source for file in (s.calibration, s.array)]
@@ -217,7 +217,7 @@ def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
 
 
 def _check_folder(loaded: Loaded, folder: str) -> None:
-    """Refuse a recorder's folder that cannot be created."""
+    """Raise `ConfigError` if the recorder's folder cannot be created."""
     place = Path(folder)
     if "\0" in folder or (os.path.exists(folder) and not os.path.isdir(folder)):
         loaded.refuse(["recorder", "folder"], f"{folder!r} is not a folder")
@@ -229,9 +229,9 @@ def _check_folder(loaded: Loaded, folder: str) -> None:
 
 
 def _list_addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:
-    """Yield (key, host, port) at which a consumer will listen, except ports chosen later.
+    """Yield (key, host, port) of each known address at which a consumer will listen.
 
-    The options of kinds from other packages are unknown.
+    Ports chosen at the start are unknown, and so are the options of kinds from other packages.
     """
     options = wanted.options
     if wanted.kind in ("page", "metrics", "foxglove"):
@@ -249,13 +249,13 @@ def _list_addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:
 
 
 def _split_address(address: str) -> tuple[str, int]:
-    """Split an address into host and port; 0: no port."""
+    """Split ``HOST:PORT`` into its parts; the port is 0 if it is no number."""
     host, _, port = address.rpartition(":")
     return host, int(port) if port.isdecimal() else 0
 
 
 def _find_path(loaded: Loaded, wanted: Wanted, key: str = "") -> KeyPath:
-    """Return the key path of a consumer's table, or of a key in it."""
+    """Return the key path of a consumer's table, or of `key` among its options."""
     table, _, name = wanted.name.partition(".")
     if table != "publisher":
         return [table, key] if key else [table]

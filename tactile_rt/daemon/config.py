@@ -29,14 +29,14 @@ class _Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class SourceConfig(_Table, frozen=True, kw_only=True):
-    """``[[source]]``: an array.
+    """Table ``[[source]]``: a source of one array's samples.
 
     Attributes:
         array: A file that describes the source's array, as `tactile-rt describe` writes it, or an
-            ``.onnx`` model, for the array that it was made for; empty: as the URL says.
-        stuck_at_s: Time without a change of any value that counts as a stuck-at fault, s; 0: from
-            the noise, if the model, the tare or the stream determines it; otherwise never, as a
-            coarse sensor at rest does not change either.
+            ``.onnx`` model made for that array; empty if the URL determines the array.
+        stuck_at_s: Time without a change of any value that counts as a stuck-at fault, s. With 0 it
+            is derived from the noise, if the model, the tare or the stream determines the noise; if
+            not, there is no limit, as a coarse sensor at rest does not change either.
     """
 
     name: Name
@@ -47,18 +47,18 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
 
 
 class ModelConfig(_Table, frozen=True, kw_only=True):
-    """``[[model]]``: a classifier on a source.
+    """Table ``[[model]]``: a classifier of one source's samples.
 
     Attributes:
         mode: ``episode`` decides from the onset on, better with every step; ``sliding`` decides as
             long as contact lasts, each time about the newest steps, as many as an episode has.
         every: Number of steps from one sliding decision to the next, at most those of an episode;
-            0 for 4, or those of a shorter episode.
+            0 means 4, or all steps of a shorter episode.
         sure: Probability that ends an episode early when one class reaches it in `in_a_row`
-            consecutive steps; 0 for never.
+            consecutive steps; 0 means never.
         in_a_row: Number of consecutive steps for `sure`, at most those of an episode.
-        fuse_s: Time within which touches that follow each other count as one thing and are
-            identified together, s; 0 for each alone.
+        fuse_s: Time within which successive touches count as touches of one object, which is
+            identified from all of them, s; 0 identifies each touch alone.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
     """
 
@@ -79,11 +79,11 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
 
 
 class PublisherConfig(_Table, frozen=True, kw_only=True):
-    """``[[publisher]]``: a destination of messages.
+    """Table ``[[publisher]]``: a destination of messages.
 
     Attributes:
         kind: One of `publishers.PUBLISHERS`, or one that another package adds.
-        name: The name of the publisher in the log and on the page; empty to name it like its kind.
+        name: The name of the publisher in the log and on the page; by default its kind.
         options: The table of options that this kind of publisher takes.
     """
 
@@ -93,7 +93,7 @@ class PublisherConfig(_Table, frozen=True, kw_only=True):
 
 
 class RecorderConfig(_Table, frozen=True, kw_only=True):
-    """``[recorder]``: MCAP files."""
+    """Table ``[recorder]``: recording into MCAP files."""
 
     folder: Text
     rotate_mb: Megabytes = 512.0
@@ -106,7 +106,7 @@ class RecorderConfig(_Table, frozen=True, kw_only=True):
 
 
 class PageConfig(_Table, frozen=True, kw_only=True):
-    """``[page]``: the web page."""
+    """Table ``[page]``: the web page."""
 
     host: Text = "127.0.0.1"
     port: Port = 8765
@@ -115,14 +115,14 @@ class PageConfig(_Table, frozen=True, kw_only=True):
 
 
 class MetricsConfig(_Table, frozen=True, kw_only=True):
-    """``[metrics]``: Prometheus metrics and the health endpoint, loopback only by default."""
+    """Table ``[metrics]``: Prometheus metrics and health over HTTP, loopback only by default."""
 
     host: Text = "127.0.0.1"
     port: Port = 9464
 
 
 class LogConfig(_Table, frozen=True, kw_only=True):
-    """``[log]``: one line per event."""
+    """Table ``[log]``: the log, with one line per event."""
 
     level: Literal["info", "warning", "error"] = "info"
     format: Literal["text", "json"] = "text"
@@ -131,7 +131,7 @@ class LogConfig(_Table, frozen=True, kw_only=True):
 
 
 class LimitsConfig(_Table, frozen=True, kw_only=True):
-    """``[limits]``: sizes of queues and limits of time, explained in `EXAMPLE`."""
+    """Table ``[limits]``: sizes of queues and limits of time, explained in `EXAMPLE`."""
 
     queue_items: Annotated[int, msgspec.Meta(ge=16, le=1_000_000)] = 4096
     queue_mb: Annotated[float, msgspec.Meta(ge=1, le=4096)] = 32.0
@@ -149,7 +149,7 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
 
 
 class Config(_Table, frozen=True, kw_only=True):
-    """The whole file: one table, or a list of tables, for each kind of part."""
+    """The whole configuration file: a table or list of tables per kind of part."""
 
     version: Literal[1]
     source: tuple[SourceConfig, ...] = ()
@@ -163,7 +163,7 @@ class Config(_Table, frozen=True, kw_only=True):
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this computer can reach a host's address."""
+    """Return whether a host is localhost or a loopback address, unreachable for other computers."""
     if host == "localhost":
         return True
     try:

@@ -26,29 +26,29 @@ TAKEN = "all its connections are taken, and others are turned away"
 
 
 class View(Protocol):
-    """The daemon as a consumer sees it; every method returns at once, in any thread."""
+    """The daemon's interface for consumers; every method returns at once, in any thread."""
 
     def snapshot(self) -> Snapshot:
-        """Return all states now."""
+        """Return the present states of all parts."""
 
     def streams(self) -> Mapping[str, Opened]:
-        """Return the sources that are open now, by name."""
+        """Return the `Opened` item of each source that is open now, by source name."""
 
     def config_text(self) -> str:
-        """Return the configuration in force, whole, as TOML, without secrets."""
+        """Return the whole configuration in force as TOML, with secrets hidden."""
 
     def report(self, part: str, state: str, reason: str, level: str = "info") -> None:
-        """Put an event into the log and to all consumers."""
+        """Post an event to the log and all other consumers."""
 
     def send(self, consumer: str, control: Control) -> bool:
-        """Send a control to another consumer, e.g. ``recorder``; return whether it exists."""
+        """Send a control to a consumer, such as ``recorder``; return whether it was delivered."""
 
     def utc_offset_ns(self) -> int:
-        """Return UTC less host monotonic time, now, ns."""
+        """Return UTC minus host monotonic time at this moment, ns."""
 
     def silent(self) -> Mapping[str, float]:
-        """Return the duration of each critical thread's current turn, s. The threads are ``main``,
-        ``watch``, ``source.NAME`` and ``model.NAME``; 0 for a thread that waits for work."""
+        """Return how long each critical thread has been in its current loop pass, s. The threads
+        are ``main``, ``watch``, ``source.NAME`` and ``model.NAME``; 0 means waiting for work."""
 
 
 class Consumer(abc.ABC):
@@ -66,8 +66,8 @@ class Consumer(abc.ABC):
             needed.
         gather_s: The time that samples and packets may wait to be handed over together, s; other
             items are handed over at once.
-        tick_s: The longest time between two calls of `handle`, with no items if need be, s; 0:
-            never without items.
+        tick_s: The longest time between two calls of `handle`, with an empty list if no item has
+            come, s; with 0, `handle` is called only with items.
     """
 
     Options: ClassVar[Any] = None
@@ -77,34 +77,34 @@ class Consumer(abc.ABC):
 
     @abc.abstractmethod
     def open(self, view: View) -> None:
-        """Start. The sources that are already open are in `view.streams()`.
+        """Acquire resources and start. Sources that are already open are in `view.streams()`.
 
-        An `Opened` in the mailbox may be of one of these: compare `t_ns`.
+        The mailbox may contain the `Opened` of such a source again, with the same `t_ns`.
         """
 
     @abc.abstractmethod
     def handle(self, items: list[Item]) -> None:
-        """Take the items that arrived since the last call, in order."""
+        """Process the items that arrived since the last call, in order of arrival."""
 
     def close(self) -> None:  # noqa: B027
         """Release all resources, also after an error of `open` or `handle`. When the daemon stops,
         waiting items are handled before, if there is time."""
 
     def details(self) -> dict[str, str | int | float]:
-        """Return details for the snapshot; called from any thread, must be quick."""
+        """Return named details for the snapshot; called from any thread, must be quick."""
         return {}
 
     def diagnose(self) -> str:
-        """Return the cause that prevents its work now, or an empty string. The text has no number
+        """Return why the consumer cannot work now, or an empty string. The text contains no number
         that keeps changing; called from any thread, must be quick."""
         return ""
 
     def foresee(self) -> str:
-        """Return the cause that will soon prevent its work, and when; otherwise as `diagnose`."""
+        """Return why and when the consumer will soon stop working, or an empty string."""
         return ""
 
     def on_disk(self) -> Mapping[str, OnDisk]:
-        """Return a recording consumer's account of samples on disk, by source; see `details`."""
+        """Return which samples of each source are on disk; empty unless the consumer records."""
         return {}
 
 
@@ -132,7 +132,7 @@ class ConsumerPart(Part):
 
     @property
     def consumer_state(self) -> ConsumerState:
-        """State for the snapshot."""
+        """Present state of the consumer, for the snapshot."""
         try:
             details, diagnostic = self.consumer.details(), self.consumer.diagnose()
             on_disk, soon = self.consumer.on_disk(), self.consumer.foresee()

@@ -40,12 +40,12 @@ LATELY_NS = 1_000_000_000  # how long a jump of the wall clock is reported
 
 
 class Daemon:
-    """All parts of a configuration; a `View` for its consumers.
+    """The supervisor of all parts of a configuration, and the `View` of its consumers.
 
     Args:
-        locks: keep a second daemon away; None: no locks.
-        on_over: called once, from another thread, when all streams have ended.
-        freeze: whether to exempt the objects that exist after the start from garbage collection,
+        locks: Locks on devices and configuration against a second daemon, or None for no locks.
+        on_over: Called once, from another thread, when all streams have ended.
+        freeze: Whether to exempt the objects that exist after the start from garbage collection,
             which suits a process that does nothing else.
 
     Raises:
@@ -107,7 +107,7 @@ class Daemon:
     def reload(self, loaded: Loaded) -> None:
         """Reconcile the parts with a configuration; unchanged parts go on undisturbed.
 
-        A model goes on until its replacement is admitted.
+        A model goes on deciding until its replacement is admitted.
 
         Raises:
             ConfigError: a consumer cannot be created; nothing has changed.
@@ -135,16 +135,16 @@ class Daemon:
         self.report("daemon", "reloaded", f"{loaded.path}: {parts} new or changed")
 
     def refuse(self, reason: str) -> None:
-        """Report that the newest configuration is not in force, and why."""
+        """Report why a new configuration is rejected; the old one stays in force."""
         self._refused = reason
         self.report("daemon", "refused", f"the old configuration goes on: {reason}", "error")
 
     def stop(self) -> list[str]:
-        """Close sources, then models, then consumers, all within `limits.stop_s`. Each part first
-        takes the items that wait for it.
+        """Stop sources, then models, then consumers, all within `limits.stop_s`. Each part first
+        handles the items that wait for it.
 
         Returns:
-            The parts that did not end in time; their threads are left behind.
+            The names of parts that did not end in time; their threads may still run.
         """
         self._stopping = True
         until = time.monotonic() + self._loaded.config.limits.stop_s
@@ -178,7 +178,7 @@ class Daemon:
     # the view of consumers
 
     def snapshot(self) -> Snapshot:
-        """Return all states now."""
+        """Return the present states of all parts."""
         # Another thread may change these dictionaries; copying them is atomic.
         sources = tuple(p.source_state for p in self._sources.copy().values())
         models = tuple(p.model_state for _, p in self._models.copy().values())
@@ -207,20 +207,20 @@ class Daemon:
         )  # fmt: skip
 
     def streams(self) -> Mapping[str, Opened]:
-        """Return the sources that are open now, by name."""
+        """Return the `Opened` item of each source that is open now, by source name."""
         return self._hub.streams()
 
     def config_text(self) -> str:
-        """Return the configuration in force as TOML, without secrets."""
+        """Return the whole configuration in force as TOML, with secrets hidden."""
         return config_text(self._loaded.config)
 
     def report(self, part: str, state: str, reason: str, level: str = "info") -> None:
-        """Put an event into the log and to all consumers."""
+        """Post an event to the log and all other consumers."""
         now = time.monotonic_ns()
         self._hub.post(Event(part, state, reason, level, now, self._clock.utc_offset_ns()))
 
     def send(self, consumer: str, control: Control) -> bool:
-        """Send a control to a consumer; return whether one of that name takes it."""
+        """Send a control to the named consumer; return whether it was delivered."""
         box = self._hub.box(consumer)
         if box is None or Control not in box.wants:
             return False
@@ -228,15 +228,15 @@ class Daemon:
         return True
 
     def utc_offset_ns(self) -> int:
-        """Return UTC less monotonic time, now, ns."""
+        """Return UTC minus host monotonic time at this moment, ns."""
         return self._clock.utc_offset_ns()
 
     def note_turn(self, name: str) -> None:
-        """Record a turn of a critical thread that is no part: ``main`` or ``watch``."""
+        """Record a loop pass of a critical thread other than a part: ``main`` or ``watch``."""
         self._turns.take(name)
 
     def silent(self) -> Mapping[str, float]:
-        """Return the duration of each critical thread's current turn, s."""
+        """Return how long each critical thread has been in its current loop pass, s."""
         return {
             **({} if self._stopping else self._turns.silent()),
             **{p.name: p.silent_s for p in self._sources.copy().values()},
@@ -254,7 +254,7 @@ class Daemon:
         part.start()
 
     def _reconcile(self) -> None:
-        """Reconcile sources and models with the configuration."""
+        """Start, stop and replace sources and models, so that they match the configuration."""
         config = self._loaded.config
         limits = config.limits
         models = {m.name: ((m, limits, file_stamp(model_path(m))), m) for m in config.model}
@@ -290,7 +290,7 @@ class Daemon:
                 part.start()
 
     def _stop_parts(self, parts: list[Any]) -> None:
-        """Stop parts that are no longer configured."""
+        """Stop parts that are no longer configured, and wait at most `limits.stop_s`."""
         for part in parts:
             box = getattr(part, "box", None)
             if box is not None:
@@ -314,7 +314,7 @@ class Daemon:
                 on_it = [p for _, p in self._models.copy().values() if p.config.source == name]
                 sensor = next((p.sensor for p in on_it if p.sensor is not None), None)
                 source.expect(sensor, max((p.changes for p in on_it), default=0.0))
-            for part in self._parts():
+            for part in self._list_parts():
                 part.watch()
             late_s = {name: source.late_s for name, source in self._sources.copy().items()}
             self._trends.look(time.monotonic(), read_resident_bytes() or 0, late_s)
@@ -360,8 +360,8 @@ class Daemon:
             self.report("daemon", "memory", reason_of(error), "warning")
 
     def _renew_locks(self) -> None:
-        """Renew the locks on devices. A link to a device that was plugged in again may lead to
-        another device node: that is locked now, and the one before is released."""
+        """Store accepted arrays, and lock the device nodes that the URLs lead to now. When a device
+        was plugged in again, its link may lead to another node; the old node is released then."""
         if self._changing.acquire(blocking=False):
             try:
                 self._store_accepted_arrays()
@@ -381,7 +381,7 @@ class Daemon:
             why = f"it had no turn for {lasted_s:.1f} s: it was stopped, or the processor was taken"
             self.report("daemon", "starved", why, "warning")
 
-    def _parts(self) -> list[Part]:
+    def _list_parts(self) -> list[Part]:
         return [
             *self._sources.copy().values(),
             *(p for _, p in self._models.copy().values()),
@@ -391,7 +391,7 @@ class Daemon:
     def _has_started(self) -> bool:
         if time.monotonic_ns() - self._started_ns > STARTED_S * 1e9:
             return True
-        return all(p.state.state != "starting" or p.state.failures for p in self._parts())
+        return all(p.state.state != "starting" or p.state.failures for p in self._list_parts())
 
     def _report_degraded(self) -> None:
         lines = self.snapshot().degraded

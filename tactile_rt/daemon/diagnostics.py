@@ -5,7 +5,7 @@ configuration: the age of the newest sample, how long samples are not on disk an
 published, and what was lost within the newest second.
 
 The consequence of another diagnostic is not reported: without samples there are no decisions, and
-while the whole process had no turn, none of its parts is to blame.
+while the whole process gets no processor time, none of its parts is to blame.
 
 A diagnostic is one line that stays the same as long as it holds: it contains no number that keeps
 changing. The numbers are in the snapshot.
@@ -40,14 +40,14 @@ PERIODS = 3  # of a slow sensor, after which its newest sample is old
 
 
 class LossWindow:
-    """The growth of a count within the newest second and minute."""
+    """A meter of how much a count grew within the newest second and minute."""
 
     def __init__(self, first: int = 0) -> None:
         self._lock = threading.Lock()
         self._seen: deque[tuple[float, int]] = deque([(time.monotonic(), first)])
 
     def add(self, count: int) -> Losses:
-        """Take the count as it is now; return its growth. Safe from any thread."""
+        """Record the present count; return its growth. Safe from any thread."""
         now = time.monotonic()
         with self._lock:
             if now - self._seen[-1][0] >= LOOK_S:  # more frequent calls take no memory
@@ -63,7 +63,7 @@ class LossWindow:
 
 
 def oldest_s(limits: LimitsConfig, rate_hz: float) -> float:
-    """Return the greatest age of the newest sample of a source, s."""
+    """Return the greatest allowed age of a source's newest sample, s."""
     return max(limits.sample_age_s, PERIODS / rate_hz)
 
 
@@ -77,13 +77,13 @@ def diagnose(
     clock_stepped: bool = False,
     refused: str = "",
 ) -> tuple[Diagnostic, ...]:
-    """Return the diagnostics of all parts, in the order of the stream.
+    """Return the diagnostics of the daemon, sources, models and consumers, in this order.
 
     Args:
         now_ns: The time of these states, host CLOCK_MONOTONIC, ns.
-        starved_s: How long the whole process had no turn, within the newest second, s.
+        starved_s: How long the whole process recently got no processor time, s.
         clock_stepped: Whether the wall clock jumped within the newest second.
-        refused: The reason why the newest configuration is not in force; empty: it is.
+        refused: The reason why the newest configuration is not in force, or an empty string.
     """
     found = []
     if starved_s:

@@ -1,4 +1,4 @@
-"""HTTP for the page and the metrics: one small server, which each runs at an address of its own.
+"""A small HTTP server, which the page and the metrics each run at an address of their own.
 
 It exists so that metrics alone need no other package, and so that the protection against a hostile
 network is written once. It does only what those two need: GET and small POSTs, answers of known
@@ -29,7 +29,7 @@ from tactile_rt.core.errors import SourceError
 
 BACKLOG = 64
 END_S = 0.5  # for streams to end when the server closes
-TURNS = 5  # of the loop at closing; an accepted connection reaches `_accept` after three
+TURNS = 5  # loop passes at closing; an accepted connection reaches `_accept` after three
 JOIN_S = 2.0
 TOKEN = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
 CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
@@ -38,16 +38,16 @@ ONCE = ("host", "origin", "content-length", "transfer-encoding")  # ambiguous if
 
 @dataclass(frozen=True)
 class HttpLimits:
-    """The limits that clients of a server must keep.
+    """Limits on the connections and requests of a server's clients.
 
     Attributes:
         connections: The number of connections at a time; a further one is dropped at once, before
-            file descriptors run out elsewhere.
+            the process runs out of file descriptors.
         head_bytes: The largest head of a request with the empty line that ends it, in bytes.
         head_s: The time from the connection to the end of the head, however slowly it arrives, s.
         send_s: The time that a peer may take to receive what is sent, s.
-        newest_first: Whether a further connection replaces the oldest, which is slow then, instead
-            of being dropped: if all answers are short, no peer can keep others away.
+        newest_first: Whether a further connection replaces the oldest one instead of being dropped.
+            If all answers are short, the oldest is slow, and no peer can keep others away.
     """
 
     connections: int
@@ -58,7 +58,7 @@ class HttpLimits:
 
 
 class Refused(Exception):
-    """A request that is not served.
+    """Raised to answer a request with an HTTP error status.
 
     Args:
         reason: One line, shown to the client.
@@ -71,7 +71,7 @@ class Refused(Exception):
 
 @dataclass
 class Request:
-    """A client's request.
+    """A parsed HTTP request; `body` reads the rest of it from the connection.
 
     Attributes:
         path: The path as it was sent, not decoded, beginning with a slash.
@@ -92,10 +92,10 @@ class Request:
     reader: asyncio.StreamReader | None = None
 
     async def body(self, most: int, seconds: float) -> bytes:
-        """Read the whole body, of at most `most` bytes, within a time, s.
+        """Read and return the whole body, of at most `most` bytes, within `seconds`.
 
         Raises:
-            Refused: It is too large or too slow, breaks off, or does not state its length.
+            Refused: The body is too large or slow, breaks off, or does not state its length.
         """
         if "transfer-encoding" in self.headers:
             raise Refused(411, "give the length of the body")
@@ -118,12 +118,12 @@ class Request:
 
 @dataclass(frozen=True)
 class Response:
-    """The answer to a request.
+    """The answer to an HTTP request.
 
     Attributes:
-        body: The body; or a generator of its pieces, which is closed when the peer goes or the
+        body: The body, or a generator of its pieces, which is closed when the peer goes or the
             server ends. An error that it raises before its first piece becomes the answer.
-        headers: Headers in addition to those of all answers of the server.
+        headers: Headers in addition to those that the server adds to all answers.
     """
 
     status: int = 200
@@ -136,7 +136,7 @@ class HttpServer:
     """An HTTP server that answers from its creation until it is closed.
 
     Args:
-        listening: The socket, see `listen`; closed with the server.
+        listening: The listening socket, see `listen`; closed with the server.
         answer: The application, called in the thread of the server.
         failed: Called with the reason when an error of the application prevents an answer.
 
@@ -160,7 +160,7 @@ class HttpServer:
         self._limits, self._headers = limits, headers
         self.answered = self.refused = self.dropped = 0
         self._tasks: dict[asyncio.Task[None], asyncio.StreamWriter] = {}  # the oldest first
-        self._asking: set[asyncio.Task[None]] = set()  # those whose request is incomplete
+        self._asking: set[asyncio.Task[None]] = set()  # tasks whose request head is incomplete
         self._over = asyncio.Event()
         self._loop = asyncio.new_event_loop()
         # If file descriptors run out, count that, without a traceback on stderr.
@@ -170,21 +170,21 @@ class HttpServer:
 
     @property
     def alive(self) -> bool:
-        """True if it still answers."""
+        """True while the server's thread runs."""
         return self._thread.is_alive()
 
     @property
     def connections(self) -> int:
-        """Number of connections now; from any thread."""
+        """Number of open connections; safe from any thread."""
         return len(self._tasks)
 
     @property
     def full(self) -> bool:
-        """True if a further connection would be dropped; from any thread."""
+        """True if a further connection would be dropped; safe from any thread."""
         return self.connections >= self._limits.connections and not self._limits.newest_first
 
     def call(self, function: Callable[..., object], *arguments: Any) -> None:
-        """Call a function in the thread of the server, soon.
+        """Schedule a call of a function in the server's thread, without waiting for it.
 
         Raises:
             RuntimeError: The server has ended.
@@ -227,7 +227,7 @@ class HttpServer:
             slowest = next(iter(self._tasks))
             self._tasks.pop(slowest).transport.abort()
             slowest.cancel()
-        task = self._loop.create_task(self._connection(reader, writer))
+        task = self._loop.create_task(self._serve_peer(reader, writer))
         self._tasks[task] = writer
         self._asking.add(task)
         task.add_done_callback(lambda task: self._tasks.pop(task, None))
@@ -238,7 +238,7 @@ class HttpServer:
     def _count_drop(self) -> None:
         self.dropped += 1
 
-    async def _connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_peer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             await self._exchange(reader, writer)
             writer.close()
@@ -292,11 +292,11 @@ class HttpServer:
                 await stream.aclose()
 
     async def _receive(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Request:
-        """Read the head of a request.
+        """Read and parse the head of a request.
 
         Raises:
-            Refused: It is malformed or too long.
-            TimeoutError: Nothing at all has come, as from browsers that connect in advance.
+            Refused: The head is malformed, too long or too slow.
+            TimeoutError: No byte has arrived, as from browsers that connect in advance.
         """
         data, most = b"", self._limits.head_bytes
         try:
@@ -328,7 +328,7 @@ class HttpServer:
         writer: asyncio.StreamWriter,
         chunked: bool,
     ) -> None:
-        """Send a stream until it ends, the peer is gone, or the server ends."""
+        """Send a stream's pieces until it ends, the peer leaves, or the server closes."""
 
         async def send_all() -> None:
             async for piece in pieces:
@@ -357,11 +357,11 @@ class HttpServer:
 
 
 def listen(host: str, port: int, *, both: bool = False) -> socket.socket:
-    """Open a socket that listens for connections.
+    """Return a TCP socket that listens for connections at a host and port.
 
     Args:
         host: The address, or a name for it; IPv6 with or without brackets.
-        both: Whether an IPv6 address accepts IPv4, too, and a name means its IPv4 address.
+        both: Whether an IPv6 address also accepts IPv4, and a name means its IPv4 address.
 
     Raises:
         SourceError: The port is taken, or the address is not of this computer.
@@ -414,5 +414,5 @@ def parse_head(head: bytes) -> Request:
 
 
 def _encode_chunk(data: bytes) -> bytes:
-    """Encode a piece of a stream. An empty piece gives nothing, as it would end the stream."""
+    """Encode data as an HTTP chunk. Empty data gives no chunk, as that would end the stream."""
     return b"%x\r\n%b\r\n" % (len(data), data) if data else b""

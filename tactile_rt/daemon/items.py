@@ -1,7 +1,7 @@
-"""Items that move between the parts of the daemon, frozen, in the order of events.
+"""Immutable items that the daemon's parts send to each other, in the order of events.
 
 An item names its source and model as the configuration does; `frame` is the array's mount frame.
-Times are host CLOCK_MONOTONIC, ns, unless stated otherwise; `utc_offset_ns` is UTC less that.
+Times are host CLOCK_MONOTONIC, ns, unless stated otherwise; `utc_offset_ns` is UTC minus that.
 """
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from tactile_rt.core.stream import ArraySpec, Chunk, Source
 
 @dataclass(frozen=True)
 class Opened:
-    """A source has been opened, or opened again; its samples and packets follow.
+    """Notice that a source was opened or reopened; its samples and packets follow.
 
     Attributes:
         stream: The opened source, for `health`, `stats` and description; never read or close it.
-        accepted: Whether it is the array that the source began with; models receive no other.
-        prelude: The (packet, arrival in ns) pairs that a device sent while it was started, in which
-            it describes itself. The same packets also come as `Packet` items.
+        accepted: Whether the array is the accepted one of this source; models receive no other.
+        prelude: The (packet, arrival in ns) pairs in which a device described itself at its start.
+            The same packets are also posted as `Packet` items.
     """
 
     source: str
@@ -34,7 +34,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Closed:
-    """A source has been closed: it broke, has ended, or is no longer configured."""
+    """Notice that a source was closed: it broke, has ended, or is no longer configured."""
 
     source: str
     t_ns: int
@@ -42,7 +42,7 @@ class Closed:
 
 @dataclass(frozen=True)
 class SourceChunk:
-    """A calibrated chunk of a source, with the time at which it was read."""
+    """A calibrated chunk of a source's samples, and the time at which it was read."""
 
     source: str
     spec: ArraySpec
@@ -54,7 +54,7 @@ class SourceChunk:
 
 @dataclass(frozen=True)
 class Packet:
-    """A packet from a device's line: bytes or CAN frames; None: the line was opened."""
+    """A packet from a device's line: bytes, CAN frames, or None when the line opens."""
 
     source: str
     packet: Any
@@ -63,13 +63,13 @@ class Packet:
 
 @dataclass(frozen=True)
 class Decision:
-    """A model's decision.
+    """A model's decision after one step.
 
     Attributes:
         decision: The label, probabilities and step; its times are the stream's.
         sample_ns: The host time of the sample that completed the step.
         made_ns: The host time at which the decision was made.
-        deadline_ns: The age of that sample from which the decision is late, ns; 0: no deadline.
+        deadline_ns: The age of that sample from which the decision is late, ns; 0 means never.
     """
 
     source: str
@@ -84,7 +84,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class Contact:
-    """A model's contact detector found that contact begins (`touching`) or ends."""
+    """The beginning (`touching`) or end of contact, as a model's contact detector found it."""
 
     source: str
     model: str
@@ -96,7 +96,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Skipped:
-    """A model that was behind skipped a stretch of its stream.
+    """A stretch of its stream that a model skipped because it was behind.
 
     Attributes:
         from_ns, until_ns: The stream times of the first sample that was skipped, and of the first

@@ -1,5 +1,5 @@
-"""The account of a source's samples: recorded, at risk in a power cut, or lost, over all files and
-however often the source comes and goes."""
+"""Counts of a source's samples that are recorded, at risk in a power cut, or lost, over all files
+and all times that the source was open."""
 
 import time
 
@@ -10,25 +10,25 @@ Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
 
 
 class Ledger:
-    """The account of a source's samples; written by the recorder's thread, read by any thread."""
+    """Counts of a source's recorded and lost samples; only the recorder's thread updates them."""
 
     def __init__(self) -> None:
         self._now: tuple[Sums, tuple[RecordingWriter, ...]] = (0, 0, 0), ()  # finished; open files
         self._lost = (0, 0, "")
 
     def begin(self, file: RecordingWriter) -> None:
-        """Add a file that has been opened."""
+        """Add a file that was just opened to the counts."""
         past, files = self._now
         self._now = past, (*files, file)
 
     def lose(self, samples: int, why: str) -> None:
-        """Count samples that are not recorded, with the reason."""
+        """Add a number of samples to the lost ones, and store the reason."""
         if samples:
             self._lost = self._lost[0] + samples, time.monotonic_ns(), why
 
     def settle(self) -> list[tuple[RecordingWriter, int, int]]:
-        """Settle finished files; return those whose last sync failed, and what each lost. The
-        caller counts these samples and packets."""
+        """Add finished files to the totals; return the files whose last sync failed. Each comes
+        with the samples and packets that it lost, which the caller counts."""
         past, files = self._now
         done = tuple(file for file in files if file.done)
         failed = [(f, *f.disown(f.synced)) for f in done if f.failed is not None]
@@ -37,7 +37,7 @@ class Ledger:
         return failed
 
     def on_disk(self, open: bool, meant_ns: int, slow_s: float) -> OnDisk:
-        """Return the whole account; from any thread."""
+        """Return the counts and times of all files; safe from any thread."""
         past, files = self._now
         samples, written_ns, synced_ns = _add_files(past, files)
         waits_ns = min((ns for file in files if (ns := file.unsynced_ns)), default=0)
@@ -45,7 +45,7 @@ class Ledger:
 
 
 def _add_files(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:
-    """Add the counts and times of files to earlier ones."""
+    """Return earlier totals with the sample counts and newest times of files added."""
     samples, written_ns, synced_ns = past
     return (
         samples + sum(file.stats.samples for file in files),

@@ -1,4 +1,4 @@
-"""Loading of a configuration: one file, and the settings of the command line.
+"""Loading of a configuration from one file and from settings of the command line.
 
 Every error is one line that names file and line (or the ``--set``), the key, and the nearest valid
 name.
@@ -24,7 +24,7 @@ FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
 
 @dataclass(frozen=True)
 class Loaded:
-    """A configuration, with the origin of each of its values.
+    """A configuration, with the file and line of each of its values.
 
     Attributes:
         config: The configuration, with all names filled in and all paths absolute.
@@ -36,7 +36,7 @@ class Loaded:
     path: Path
 
     def refuse(self, path: list[str | int], why: str) -> NoReturn:
-        """Raise the `ConfigError` of a value."""
+        """Raise a `ConfigError` about the value at a key path."""
         raise refusal(self.nodes, path, why)
 
 
@@ -47,7 +47,7 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
         sets: ``a.b=value``; ``source.NAME.url=...`` selects an item of a list by its name.
 
     Raises:
-        ConfigError: anything is wrong; one line with file and line.
+        ConfigError: The configuration is invalid; the message names file, line and key.
     """
     try:
         with suppress(FileNotFoundError, ValueError):  # `read_toml` reports these
@@ -65,7 +65,7 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
 
 
 def _resolve_paths(nodes: SettingNode) -> None:
-    """Make relative paths absolute, from the folder of the file that states them."""
+    """Make relative paths absolute in place, from the folder of the file that states them."""
     for path, node in nodes.walk():
         if not isinstance(node.value, str) or not node.value or "\0" in node.value:
             continue
@@ -106,7 +106,7 @@ def _is_file(path: Path) -> bool:
 
 
 def _fill_names(loaded: Loaded) -> Config:
-    """Fill in the names that a file may omit."""
+    """Return the configuration with omitted names of models and publishers filled in."""
     config = loaded.config
     sources = [s.name for s in config.source]
     models, publishers = [], []

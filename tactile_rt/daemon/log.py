@@ -30,7 +30,7 @@ class _Seen:
 class Log(Consumer):
     """A consumer that logs events. The first of equal events of a part is written at once; the
     others are counted and reported together after `repeat_s`. A file that was moved or deleted is
-    begun anew. Lines that cannot be written are dropped, counted and reported."""
+    created again. Lines that cannot be written are dropped, counted and reported."""
 
     wants = frozenset({Event})
     tick_s = 1.0
@@ -79,7 +79,7 @@ class Log(Consumer):
         return self._why
 
     def _reopen_if_moved(self) -> None:
-        """Reopen the file if its name no longer leads to it."""
+        """Open the log file again if it was moved or deleted."""
         file, out = self._config.file, self._out
         if not file:
             return
@@ -147,7 +147,7 @@ class Log(Consumer):
 
 
 class EventHandler(logging.Handler):
-    """A logging handler that makes an event of each warning, for `Daemon.report`."""
+    """A logging handler that reports each warning as an event of the daemon."""
 
     def __init__(self, report: Callable[[str, str, str, str], None]) -> None:
         super().__init__(logging.WARNING)

@@ -11,12 +11,12 @@ FRAME_BYTES = 200  # and for a CAN frame
 
 
 class Mailbox(BoundedQueue[Item]):
-    """The queue of items for one part, counted as samples, packets, decisions and events.
+    """A part's bounded queue of items, counted as samples, packets, decisions and events.
 
     Args:
-        wants: classes of items that it takes; others are ignored and not counted.
-        gather_s: how long samples and packets may wait for more of them; other items are urgent.
-        source: only items of this source, and of the array that it began with; empty: of all.
+        wants: The classes of items to queue; other items are ignored and not counted.
+        gather_s: How long samples and packets may wait for more, s; other items are urgent.
+        source: The only source whose items are queued, from its accepted array; empty for all.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class Mailbox(BoundedQueue[Item]):
         self.taking = False  # until its part runs
 
     def _measure(self, item: Item) -> tuple[str, int, int] | None:
-        """Return class, count and bytes of an item, or None if it is not wanted."""
+        """Return the kind, count and bytes of an item, or None to ignore it."""
         if type(item) not in self.wants:
             return None
         if self._source and getattr(item, "source", self._source) != self._source:
@@ -54,8 +54,8 @@ class Mailbox(BoundedQueue[Item]):
 
 
 class Hub:
-    """The distribution of items to mailboxes; any thread may post. Posting takes only the locks of
-    mailboxes, except for `Opened` and `Closed`."""
+    """The distributor of items to mailboxes; any thread may post. Posting needs only the locks of
+    the mailboxes, except for `Opened` and `Closed`."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -64,20 +64,20 @@ class Hub:
         self._streams: dict[str, Opened] = {}
 
     def join(self, name: str, box: Mailbox) -> None:
-        """Add a mailbox, which first receives the streams that are open."""
+        """Add a named mailbox, and put the `Opened` of each open source into it."""
         with self._lock:
             for opened in self._streams.values():
                 box.put(opened)
             self._set_boxes({**self._boxes, name: box})
 
     def leave(self, name: str, box: Mailbox) -> None:
-        """Remove a mailbox; if its name has another by now, keep that."""
+        """Remove a mailbox, unless another mailbox has its name by now."""
         with self._lock:
             if self._boxes.get(name) is box:
                 self._set_boxes({k: b for k, b in self._boxes.items() if k != name})
 
     def post(self, item: Item) -> None:
-        """Put an item into all mailboxes that want it."""
+        """Put an item into all mailboxes that want its class."""
         kind = type(item)
         if kind is Opened or kind is Closed:
             with self._lock:  # else a mailbox that joins now might get it twice, or never
@@ -92,7 +92,7 @@ class Hub:
             box.put(item)
 
     def box(self, name: str) -> Mailbox | None:
-        """Return the mailbox of this name, if any."""
+        """Return the mailbox of this name, or None."""
         return self._boxes.get(name)
 
     def list_mailboxes(self, kind: type) -> tuple[Mailbox, ...]:
@@ -100,7 +100,7 @@ class Hub:
         return self._by_type.get(kind, ())
 
     def streams(self) -> Mapping[str, Opened]:
-        """Return the sources that are open now, by name."""
+        """Return the `Opened` item of each source that is open now, by source name."""
         return self._streams
 
     def _set_boxes(self, boxes: dict[str, Mailbox]) -> None:

@@ -45,7 +45,7 @@ class _FromSource(_Message, frozen=True, kw_only=True):
 
 
 class ArrayMessage(_FromSource, frozen=True, tag="array", kw_only=True):
-    """A source was opened; `array` is its `ArraySpec`: elements, grid, poses in `frame`, units."""
+    """Message that a source opened; `array` is its `ArraySpec`: elements, grid, poses, units."""
 
     topic: ClassVar[str] = "array"
     url: str
@@ -53,12 +53,12 @@ class ArrayMessage(_FromSource, frozen=True, tag="array", kw_only=True):
 
 
 class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
-    """A model decided.
+    """Message with a model's decision after one step.
 
     Attributes:
         t_ns: The stream time of the last sample used, ns.
-        onset_ns: The stream time at which contact began, ns: with `source` and `model` it names
-            the episode.
+        onset_ns: The stream time at which contact began, ns; with `source` and `model` it
+            identifies the episode.
         step: The number of the step since onset, from 1; `final` is the last of its episode.
         label: The most probable class, which for some models is a shape, or a refusal, such as
             "unknown".
@@ -80,7 +80,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
         object: The enrolled object, or "none of these", in the decision of a touch's last step;
             empty before, and if none is enrolled.
         object_margin: The object's score less its threshold; null without objects.
-        object_touches: The number of touches that `object` rests on.
+        object_touches: The number of touches from which `object` was identified.
     """
 
     topic: ClassVar[str] = "decision"
@@ -104,7 +104,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
 
 
 class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
-    """Contact began (`touching`) or ended; `t_ns` is the stream's time."""
+    """Message that contact began (`touching`) or ended; `t_ns` is the stream's time."""
 
     topic: ClassVar[str] = "contact"
     model: str
@@ -112,9 +112,9 @@ class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
 
 
 class SkipMessage(_FromSource, frozen=True, tag="skip", kw_only=True):
-    """A model that was behind its stream skipped to the newest sample. It decides nothing between
-    `from_ns` and `until_ns`, the stream times of the first sample that was skipped and of the first
-    that was not. Of the skipped samples, `lost` did not even reach its contact detector.
+    """Message that a model was behind its stream and skipped to the newest sample. It decides
+    nothing from `from_ns`, the stream time of the first skipped sample, to `until_ns`, that of the
+    next sample after these. Of the skipped samples, `lost` did not even reach its contact detector.
     """
 
     topic: ClassVar[str] = "skip"
@@ -125,7 +125,7 @@ class SkipMessage(_FromSource, frozen=True, tag="skip", kw_only=True):
 
 
 class HealthMessage(_Message, frozen=True, tag="health", kw_only=True):
-    """A part of the daemon or a device changed its state; see `items.Event`."""
+    """Message that a part or a device has changed its state; see `items.Event`."""
 
     topic: ClassVar[str] = "health"
     part: str
@@ -135,7 +135,7 @@ class HealthMessage(_Message, frozen=True, tag="health", kw_only=True):
 
 
 class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
-    """A chunk of n samples; `t_ns` and `utc_ns` are those of its last one.
+    """Message with a chunk of n samples; `t_ns` and `utc_ns` are of the last.
 
     Attributes:
         elements, channels, units: The axes of `values`, and the SI unit of each channel.
@@ -154,7 +154,7 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
 
 
 class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
-    """The state of all parts; see `states.Snapshot`."""
+    """Message with the state of all parts; see `states.Snapshot`."""
 
     topic: ClassVar[str] = "state"
     snapshot: Snapshot
@@ -175,27 +175,27 @@ _now_ns = time.monotonic_ns  # tests replace it
 
 
 def encode(message: Message) -> bytes:
-    """Encode a message as one line of JSON, without the end of the line."""
+    """Encode a message as one line of JSON, without a line break."""
     return _encoder.encode(message)
 
 
 def topic_of(message: Message, prefix: str = "tactile") -> str:
-    """Return a message's topic: ``tactile/SOURCE/decision``, ``tactile/health``, ``tactile/state``.
+    """Return a message's topic, such as ``tactile/SOURCE/decision`` or ``tactile/health``.
 
-    Letters, digits and ``-._~`` of a source's name stay, all else is percent-encoded.
+    Characters of a source's name other than letters, digits and ``-._~`` are percent-encoded.
     """
     parts = [quote(message.source, safe="")] if isinstance(message, _FromSource) else []
     return "/".join([prefix, *parts, message.topic])
 
 
 def state_message(snapshot: Snapshot) -> StateMessage:
-    """Make a message of a snapshot."""
+    """Return a snapshot as a message."""
     return StateMessage(t_ns=snapshot.t_ns, utc_ns=snapshot.utc_ns, snapshot=snapshot)
 
 
 def message_of(item: Item) -> Message | None:
-    """Return the message that publishes an item, or None. Instead of `Closed`, an `Event` is
-    published; `Packet` and `Control` are not published."""
+    """Return the message that publishes an item, or None. `Packet`, `Control` and `Closed` are not
+    published; an `Event` reports the closed source."""
     if isinstance(item, Decision):
         return _make_decision(item)
     if isinstance(item, SourceChunk):
@@ -267,7 +267,7 @@ SCALES = np.array([10.0 ** min(max(MOST - 1 - e, 0), 22) for e in _DECIMAL])
 
 
 def shortest(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Round float32 numbers, as doubles, to the shortest decimals that identify them.
+    """Return float32 numbers as doubles, rounded to the shortest decimals that identify them.
 
     Such a decimal is nearer to its number than to any other float32, so it is short to write and no
     less exact. The JSON encoder takes doubles only and would write all digits of the same number:
@@ -282,7 +282,7 @@ def shortest(values: NDArray[np.float32]) -> NDArray[np.float64]:
     within = (size >= SMALLEST) & (size < LARGEST)
     scale = SCALES[singles.view(np.uint32) >> 23 & 0xFF]
     # Whole numbers below 2^53 and powers of ten up to 10^22 are exact in double precision, so that
-    # their quotient is the very double as which the decimal is read.
+    # their quotient is the same double that a parser makes of the decimal.
     found = np.rint(exact * scale) / scale
     found[~within] = exact[~within]
     for n in range(1, MOST - FEWEST + 1):

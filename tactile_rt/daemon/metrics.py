@@ -1,8 +1,8 @@
 """Metrics, health and state over HTTP: ``/metrics`` for Prometheus, ``/health``, ``/state``.
 
 The text is Prometheus' exposition format 0.0.4; names and units follow its conventions: base units,
-``_total`` for counters. Only GET; at most 8 KiB a request, within two seconds, 16 at a time, where
-a further one replaces the oldest.
+``_total`` for counters. Only GET is served; a request has at most 8 KiB and two seconds, and beyond
+16 connections a further one replaces the oldest.
 """
 
 import resource
@@ -36,7 +36,7 @@ Row = tuple[str, str, str, Callable[[Any, int], Any]]
 
 
 class Metrics(Consumer):
-    """A consumer that answers requests at the address of the table ``[metrics]``."""
+    """A consumer that serves metrics, health and state at the address in table ``[metrics]``."""
 
     wants = frozenset()
     tick_s = 1.0
@@ -109,7 +109,7 @@ def _is_own(host: str) -> bool:
 
 
 def exposition(snapshot: Snapshot) -> bytes:
-    """Return all metrics of the daemon as Prometheus' text."""
+    """Return all metrics of the daemon in Prometheus' text format, as bytes."""
     lines = []
     for rows, labelled in _list_tables(snapshot):
         for name, label, about, value in rows:
@@ -131,19 +131,19 @@ def exposition(snapshot: Snapshot) -> bytes:
 
 
 def _list_tables(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labels, Any]]]]:
-    """Yield each table of metrics, with the things that it describes and their labels."""
+    """Yield each table of metrics, with the (labels, state) pairs that it applies to."""
     things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
     yield DAEMON, [({}, s)]
     yield DIAGNOSTIC, [({"part": t.part, "what": t.what}, t) for t in s.diagnostics]
     yield SOON, [({"part": t.part, "what": t.what}, t) for t in s.soon]
     yield PART, [({"part": x.part.name}, x.part) for x in things]
-    yield SOURCE, [({"source": _short_name(x)}, x) for x in s.sources]
-    yield MODEL, [({"model": _short_name(x), "source": x.source}, x) for x in s.models]
+    yield SOURCE, [({"source": _shorten_name(x)}, x) for x in s.sources]
+    yield MODEL, [({"model": _shorten_name(x), "source": x.source}, x) for x in s.models]
     yield CONSUMER, [({"consumer": x.part.name, "kind": x.kind}, x) for x in s.consumers]
     yield DISK, [({"source": n}, d) for c in s.consumers for n, d in c.on_disk.items()]
 
 
-def _short_name(thing: SourceState | ModelState) -> str:
+def _shorten_name(thing: SourceState | ModelState) -> str:
     return thing.part.name.partition(".")[2]
 
 

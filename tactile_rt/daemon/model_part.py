@@ -33,7 +33,7 @@ BEGINNING_NS = 60 * NS_PER_S  # longer than samples wait for a model that is sti
 
 
 class ModelPart(Part):
-    """The part that posts `Decision`, `Contact` and `Skipped` of one model."""
+    """The part that runs one model and posts its `Decision`, `Contact` and `Skipped` items."""
 
     def __init__(
         self, config: ModelConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
@@ -53,13 +53,13 @@ class ModelPart(Part):
         self._wanted: deque[ModelConfig] = deque()  # replacements that were requested
         self._next: Admission | None = None
         self._ready_at = 0.0
-        self._until = math.inf  # once it must end: until then, waiting samples are classified
+        self._until = math.inf  # after a stop, the time to finish waiting samples, monotonic s
         self.refused = ""  # why the newest replacement was refused
         self._half_ns = 0  # half the resampler's kernel
         self._deadline_ns = 0
         self._ahead_ns = 0  # host time less stream time
         self._last_ns: int | None = None  # stream time of the newest sample that was taken
-        self._dropped = self._hole = 0  # samples that the mailbox dropped, ever and since that one
+        self._dropped = self._gap = 0  # samples that the mailbox dropped: in all, since `_last_ns`
         self._missed = 0  # events that the mailbox dropped
         self._sha256 = ""
         with suppress(ConfigError):  # loading reports it
@@ -77,7 +77,7 @@ class ModelPart(Part):
 
     @property
     def model_state(self) -> ModelState:
-        """State for the snapshot."""
+        """Present state of the model, for the snapshot."""
         newest, queue, classifier = self._newest, self.box.state, self._classifier
         opened = self._opened
         return ModelState(
@@ -99,13 +99,13 @@ class ModelPart(Part):
         self.box.close()
 
     def may_exchange(self, config: ModelConfig, limits: LimitsConfig) -> bool:
-        """Return whether another model can replace this one while it decides."""
+        """Return whether `exchange` can apply a configuration without a restart of the part."""
         running = self.state.state == "running"
         return running and config.source == self.config.source and limits == self.limits
 
     def exchange(self, config: ModelConfig) -> None:
-        """Replace this model, or its options, as soon as the new one is admitted. Any thread may
-        call it; of several requests before that, the newest counts."""
+        """Request to replace the model or its options once the new model is admitted. Any thread
+        may call this; the newest of several requests counts."""
         self._wanted.append(config)
 
     def _work(self) -> None:
@@ -141,7 +141,7 @@ class ModelPart(Part):
         return self._refused is None or tried not in (None, self._refused[0])
 
     def _load(self) -> None:
-        """Load the classifier; without a source, check at least whether it is admitted."""
+        """Load the classifier for the open source; if none is open, only try the model."""
         self._opened = opened = self._hub.streams().get(self.config.source)
         if opened is not None:
             self._make_classifier(opened)
@@ -170,7 +170,7 @@ class ModelPart(Part):
             self._install(opened, admission)
 
     def _await_admission(self, opened: Opened | None) -> Admission | None:
-        """Admit the model and wait for it; return None if the part must end.
+        """Start the model's admission and wait for it; return None if the part must end.
 
         Raises:
             TactileError: The model is refused.
@@ -192,7 +192,7 @@ class ModelPart(Part):
     def _start_admission(self, config: ModelConfig, opened: Opened | None) -> Admission:
         known, trial = self._trial
         same = known == file_stamp(model_path(config)) and config.mode == self.config.mode
-        return Admission(config, self.limits, opened, self._age, trial if same else None)
+        return Admission(config, self.limits, opened, self._compute_age, trial if same else None)
 
     def _install(self, opened: Opened, admission: Admission) -> None:
         """Put an admitted model into use."""
@@ -210,7 +210,7 @@ class ModelPart(Part):
         self._last_ns = None
 
     def _advance_exchange(self, came: bool) -> None:
-        """Begin a requested exchange, or complete it once the new model is ready."""
+        """Start a requested replacement, or complete it once the new model is ready."""
         if self._wanted:
             if self._next is not None:
                 self._next.give_up()
@@ -243,7 +243,7 @@ class ModelPart(Part):
         self._report(self.name, "admitted", f"{new.words}{late}")
 
     def _can_take_over(self, new: Classifier, came: bool, waited: float) -> bool:
-        """Return whether a new model, with a baseline, may take over between touches."""
+        """Return whether a new model may take over: with a baseline between touches, or overdue."""
         old = self._classifier
         if old is None:
             return True
@@ -252,7 +252,7 @@ class ModelPart(Part):
         return new.go_on_from(old) or not came or new.detector.ready or waited > LONGEST_S
 
     def _warm_up(self, new: Classifier, old: Classifier, chunk: Chunk) -> None:
-        """Let a new model measure its own baseline while nothing is touched."""
+        """Feed a chunk to a new model between touches, so that it estimates its baseline."""
         if old.deciding:
             new.forget()
         else:
@@ -263,7 +263,7 @@ class ModelPart(Part):
     def _handle(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
         dropped = self.box.dropped  # the oldest go first, so these came before all of `items`
-        self._hole, self._dropped = dropped["samples"] - self._dropped, dropped["samples"]
+        self._gap, self._dropped = dropped["samples"] - self._dropped, dropped["samples"]
         opened = self._hub.streams().get(self.config.source)
         if dropped["events"] > self._missed and opened is not None:
             items = [opened, *items]  # it may have been dropped
@@ -288,7 +288,7 @@ class ModelPart(Part):
         before = replace(classifier.stats)
         arrived, newest = run[-1].arrived_ns, int(chunk.t_ns[-1])
         self._ahead_ns = 0 if keeps_host_time(opened.stream) else arrived - newest
-        lost = self._skip_hole(classifier, int(chunk.t_ns[0]))
+        lost = self._skip_gap(classifier, int(chunk.t_ns[0]))
         offset = run[-1].utc_offset_ns
         frame = opened.spec.frame
         for decision in classifier.decide(chunk):
@@ -338,17 +338,17 @@ class ModelPart(Part):
                 Decision(config.source, config.name, frame, d, sample, made, offset, deadline_ns)
             )
 
-    def _skip_hole(self, classifier: Classifier, t_ns: int) -> int:
-        """Skip the hole before a sample; return how many samples the mailbox dropped in it. No
-        network is fed a stream with a hole."""
-        lost, self._hole = self._hole, 0
+    def _skip_gap(self, classifier: Classifier, t_ns: int) -> int:
+        """Skip a gap before the sample at `t_ns`; return how many samples the mailbox dropped. No
+        network receives a stream with a gap."""
+        lost, self._gap = self._gap, 0
         if lost:
             first = t_ns - BEGINNING_NS if self._last_ns is None else self._last_ns + 1
             classifier.skips.add(first, t_ns)
         return lost
 
-    def _age(self, t_ns: int) -> float:
-        """Return the age of a step, s, from its newest resampled sample's stream time."""
+    def _compute_age(self, t_ns: int) -> float:
+        """Return the age of a step, s, given the stream time of its newest sample."""
         end = t_ns + self._half_ns + self._ahead_ns
         return max(0, time.monotonic_ns() - end) / 1e9
 
@@ -376,7 +376,7 @@ class ModelPart(Part):
 
 
 def _find_drift(classifier: Classifier, spec: ArraySpec) -> str:
-    """Describe the fastest drift at rest; empty: none exceeds its noise in 1 s."""
+    """Describe the fastest drift at rest; empty if below the noise in 1 s."""
     detector, period_s = classifier.detector, classifier.card.period_ns / NS_PER_S
     moves = np.abs(detector.drift) / detector.sigma / period_s
     at = np.unravel_index(moves.argmax(), moves.shape)

@@ -19,13 +19,13 @@ STEADY_S = 10.0  # a part that has worked so long restarts after the shortest pa
 
 
 class Report(Protocol):
-    """A function that puts an event into the log and to all consumers."""
+    """A function that posts an event to the log and all other consumers."""
 
     def __call__(self, part: str, state: str, reason: str, level: str = "info") -> None: ...
 
 
 class Part(abc.ABC):
-    """A part of the daemon: work in its own thread, restarted when it breaks."""
+    """A supervised part of the daemon: a thread whose work is restarted after an error."""
 
     def __init__(self, name: str, report: Report, limits: LimitsConfig) -> None:
         self.name, self.limits = name, limits
@@ -33,7 +33,7 @@ class Part(abc.ABC):
         self._stop = threading.Event()
         self._state, self._reason, self._since_ns = "starting", "", time.monotonic_ns()
         self._starts = self._failures = 0
-        self._busy_ns = 0  # start of its turn, which may hang; 0: it waits for work
+        self._busy_ns = 0  # start of its current work, which may hang; 0: it waits for work
         self._stalled = False
         self._pause_s = limits.retry_first_s
         self._thread = threading.Thread(target=self._run, name=f"tactile-rt {name}", daemon=True)
@@ -43,18 +43,18 @@ class Part(abc.ABC):
         self._thread.start()
 
     def stop(self) -> None:
-        """Ask it to end; from any thread, safe to call twice."""
+        """Request the part to end; from any thread, safe to call twice."""
         self._stop.set()
 
     def join(self, until: float) -> bool:
-        """Wait for its end until a CLOCK_MONOTONIC time, s; return whether it came."""
+        """Wait for the part to end until a CLOCK_MONOTONIC time, s; return whether it did."""
         if self._thread.ident is not None:
             self._thread.join(max(0.0, until - time.monotonic()))
         return not self._thread.is_alive()
 
     @property
     def state(self) -> PartState:
-        """State now; from any thread."""
+        """Present state of the part; safe from any thread."""
         state, reason, since = self._state, self._reason, self._since_ns
         silent = self.silent_s
         if state in ("starting", "running") and silent > self.limits.stall_s:
@@ -64,12 +64,12 @@ class Part(abc.ABC):
 
     @property
     def silent_s(self) -> float:
-        """Duration of its current turn of work, s; 0: it has nothing to do."""
+        """Time since the part began its current work, s; 0 while it waits for work."""
         busy = self._busy_ns
         return (time.monotonic_ns() - busy) / 1e9 if busy else 0.0
 
     def watch(self) -> None:
-        """Report when it stalls, and when it goes on; the daemon calls it regularly."""
+        """Report when the part stalls and when it goes on; the daemon calls this regularly."""
         stalled = self.state.state == "stalled"
         if stalled == self._stalled:
             return
@@ -84,8 +84,8 @@ class Part(abc.ABC):
 
     @abc.abstractmethod
     def _work(self) -> None:
-        """Work until `_stop` is set. An error is the reason of a restart; an earlier return means
-        that no work is left."""
+        """Do the part's work until `_stop` is set. An error leads to a restart; an earlier return
+        means that no work is left."""
 
     def _release(self) -> None:  # noqa: B027
         """Release all resources; called after every `_work`."""
@@ -95,7 +95,7 @@ class Part(abc.ABC):
         return False
 
     def _report_running(self, where: str = "") -> None:
-        """Report that it works, and where it can be reached."""
+        """Set and report the state ``running``, with the address if the part has one."""
         self._change_state("running", where)
 
     def _run(self) -> None:
@@ -142,7 +142,7 @@ class Part(abc.ABC):
 
 
 def reason_of(error: BaseException) -> str:
-    """Return an error in one line, with its source location if it is unexpected."""
+    """Describe an error in one line, with its source location if it is unexpected."""
     text = " ".join(str(error).split())
     if isinstance(error, TactileError):
         return text

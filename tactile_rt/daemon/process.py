@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
-TURN_S = 0.25  # longest time between turns of the main loop
+TURN_S = 0.25  # longest time between passes of the main loop
 READ_S = 2.0  # for a configuration to be read
 LOADED_S = 0.5  # for a model to be loaded, or given up
 SWITCH_S = 0.001  # how long a thread that computes may delay the threads that acquire
@@ -49,7 +49,7 @@ class ExitCode(IntEnum):
 
 
 def note_signals() -> None:
-    """Queue signals from now on; `run_daemon` obeys those that came before it, too.
+    """Queue signals from now on, so that `run_daemon` also obeys earlier ones.
 
     The handlers stay, so that no signal ends the process while Python shuts down."""
     for number in SIGNALS:
@@ -154,7 +154,7 @@ def _serve(
 
 
 class _Reload(threading.Thread):
-    """A thread that reads the configuration again.
+    """A thread that reads the configuration again and applies it.
 
     Signals are obeyed meanwhile, however long it takes; another reload may replace it."""
 
@@ -167,7 +167,7 @@ class _Reload(threading.Thread):
         self.late = False
 
     def hangs(self) -> bool:
-        """Return True, once, if reading takes too long."""
+        """Return True if reading takes too long, but only the first time."""
         before, self.late = self.late, not self._read and time.monotonic() > self._read_by
         return self.late and not before
 

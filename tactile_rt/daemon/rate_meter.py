@@ -1,7 +1,7 @@
 """The rate at which a device measures, over the newest second, lost samples included.
 
-The newest second is cut into stretches of a fifth of a second. A device is slow if it is so in all
-of them together, and in most: a hiccup or a reconnection affects only one stretch.
+The newest second is cut into stretches of a fifth of a second. A device is slow if its rate is low
+over all of them together and in most: a hiccup or a reconnection affects only one stretch.
 """
 
 import itertools
@@ -29,7 +29,7 @@ class RateMeter:
         self.hz = self.typical_hz = 0.0  # over all stretches, and their median; 0: unknown
 
     def add(self, count: int, t_ns: int) -> None:
-        """Add a reading of the total count at a time, ns."""
+        """Update the rates with the total count of measurements and the time of the count."""
         marks = self._marks
         if marks and t_ns - marks[-1][0] < self._stretch_ns:
             return
@@ -46,7 +46,7 @@ class RateMeter:
             self.hz = NS_PER_S * (count - marks[0][1]) / (t_ns - marks[0][0])
 
     def judge(self, nominal_hz: float, silent_s: float) -> tuple[float, bool]:
-        """Return the rate, Hz, or 0 after a silence, and whether it is slow."""
+        """Return the rate, Hz, or 0 after a silence, and whether the device is slow."""
         if silent_s > max(1.0, 3 / max(self.hz, 1e-9)):
             return 0.0, False
         hz = min(self.hz, max(self.typical_hz, nominal_hz))  # a backlog shows in one stretch only

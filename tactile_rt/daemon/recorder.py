@@ -1,4 +1,4 @@
-"""The recorder: MCAP files of every source, always or around what happens.
+"""The recorder: MCAP files of every source, continuously or around contacts and faults.
 
     FOLDER/whiskers-20261121T170512Z.mcap
 
@@ -59,7 +59,7 @@ MB, NS = 1e6, 1e9
 
 
 class _Track:
-    """A source, its open file, and the messages kept for a trigger."""
+    """Recording state of a source: its open file, and the messages kept for a trigger."""
 
     def __init__(self, opened: Opened, rotation: Rotation, ledger: Ledger) -> None:
         self.opened, self.rotation, self.ledger = opened, rotation, ledger
@@ -78,7 +78,7 @@ class _Track:
         self.retry_ns = 0  # earliest time to begin a file
 
     def keep(self, message: Raw, before_ns: int) -> list[Raw]:
-        """Add a message to the ring; return the oldest ones that it drops."""
+        """Append a message to the ring buffer; return the old messages dropped for it."""
         self.ring.append(message)
         self.ring_bytes += len(message.data)
         gone = []
@@ -90,7 +90,7 @@ class _Track:
         return gone
 
     def empty(self) -> list[Raw]:
-        """Empty the ring; return its messages."""
+        """Empty the ring buffer; return its messages."""
         kept = list(self.ring)
         self.ring.clear()
         self.ring_bytes = 0
@@ -100,7 +100,7 @@ class _Track:
 class Recorder(Consumer):
     """The consumer that records every source of the daemon.
 
-    It knows the controls ``start``, ``stop``, ``trigger`` (as if something had happened) and
+    It obeys the controls ``start``, ``stop``, ``trigger`` (as a contact or fault does) and
     ``rotate`` (begin new files). When the disk has less room than ``min_free_mb``, it closes the
     files, counts what it does not record, and resumes when there is room again. It does the same
     when the folder is deleted, moved or no longer writable.
@@ -160,10 +160,10 @@ class Recorder(Consumer):
             self._count_unsynced()
 
     def on_disk(self) -> Mapping[str, OnDisk]:
-        """Return the account on disk of each source that was ever open; from any thread."""
-        return {name: self._on_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
+        """Return the `OnDisk` of each source that was ever open; safe from any thread."""
+        return {name: self._find_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
 
-    def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
+    def _find_disk(self, name: str, ledger: Ledger) -> OnDisk:
         track, sync_s = self._tracks.get(name), self._config.sync_s
         slow_s = 2 * sync_s + SLOW_S if sync_s else 0.0
         if track is None:
@@ -180,12 +180,12 @@ class Recorder(Consumer):
             "mode": self._config.mode,
             "recording": recording,
             "files": self._files,
-            "megabytes": round(self._written_mb(), 1),
+            "megabytes": round(self._count_mb(), 1),
             "lost_samples": self._lost_samples,
             "newest": self._newest,
         }
 
-    def _written_mb(self) -> float:
+    def _count_mb(self) -> float:
         files = [track.file for track in list(self._tracks.values())]
         return (self._bytes + sum(f.stats.bytes for f in files if f is not None)) / MB
 
@@ -199,7 +199,7 @@ class Recorder(Consumer):
         if folder.why or not self._on:
             return folder.why
         for name, track in list(self._tracks.items()):
-            disk = self._on_disk(name, track.ledger)
+            disk = self._find_disk(name, track.ledger)
             if track.diagnostic and disk.meant_ns:
                 return track.diagnostic
         return ""
@@ -226,7 +226,7 @@ class Recorder(Consumer):
             self._record(item)
 
     def _record(self, item: Decision | Contact | Skipped | Event) -> None:
-        """Add a decision, contact or skip to its source's file, an event to all."""
+        """Record a decision, contact or skip with its source, an event with all sources."""
         message = message_of(item)
         if message is None:
             return
@@ -245,7 +245,7 @@ class Recorder(Consumer):
                 self._trigger(track)
 
     def _follow_exchange(self, model: str) -> None:
-        """Begin new files after an exchange of a model, as a file names its models."""
+        """Begin a new file after a model was replaced, as a file names its models."""
         for state in self._view.snapshot().models:
             if state.part.name == model and state.source in self._tracks:
                 self._rotate(self._tracks[state.source])
@@ -391,7 +391,7 @@ class Recorder(Consumer):
     def _maintain_files(self, sync: bool) -> None:
         """Flush, rotate and finish files as they are due, and check the disk."""
         self._folder.has_room()
-        self._soon = self._folder.foresee(self._written_mb())
+        self._soon = self._folder.foresee(self._count_mb())
         self._count_unsynced()
         now = time.monotonic_ns()
         closed = [
@@ -428,7 +428,7 @@ class Recorder(Consumer):
                 self._rotate(track)  # decisions after a source's end go into its last file
 
     def _sync(self, track: _Track, sync: bool = True) -> bool:
-        """Flush or sync a file; return False if that, or the sync before, failed."""
+        """Flush or sync a track's file; return whether this and the previous sync succeeded."""
         file = track.file
         assert file is not None
         try:
@@ -454,8 +454,8 @@ class Recorder(Consumer):
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
     def _leave_file(self, track: _Track, error: OSError) -> None:
-        """Stop writing a file that fails; it stays as it is. A new file is tried later, with pauses
-        if one after another fails. The reason names no file, so that it stays the same.
+        """Stop writing a file after an error, and leave it as it is. A new file is begun later,
+        with pauses if several fail. The reason names no file, so that it stays the same.
         """
         file, why = track.file, words(self._folder.path, error)
         if file is None:

@@ -24,12 +24,12 @@ class RecordingsFolder:
 
     Args:
         min_free_mb: The room that its disk must have, MB.
-        later: runs a job without waiting for it.
-        tell: called at every change with state, words and level.
+        later: Runs a job in the background.
+        tell: Called at every change with the state, the reason in words, and the level.
 
     Attributes:
         state: The folder's state: ``on``, ``no folder`` or ``disk full``.
-        why: The reason why nothing can be recorded, with present figures; empty if there is none.
+        why: The reason why nothing can be recorded, with present numbers, or an empty string.
     """
 
     def __init__(
@@ -46,14 +46,14 @@ class RecordingsFolder:
 
     @property
     def full(self) -> bool:
-        """True if its disk has no room."""
+        """True if the disk had too little room at the last check."""
         return self.state == "disk full"
 
     def open(self) -> list[str]:
-        """Create the folder; return the names of files that were cut short.
+        """Create the folder; return the names of recordings that were cut short.
 
         Raises:
-            OSError: it cannot be created or read.
+            OSError: The folder cannot be created or read.
         """
         self._create(parents=True)
         self._disk = self.path.stat().st_dev
@@ -95,7 +95,7 @@ class RecordingsFolder:
         return not why
 
     def foresee(self, written_mb: float) -> str:
-        """Describe within how many hours it will be full; empty: not within a day.
+        """Describe within how many hours the disk will be full; empty if over a day.
 
         Args:
             written_mb: The total that has been written so far, MB.
@@ -124,5 +124,5 @@ def _sync_name(folder: Path) -> None:
 
 
 def words(path: Path, error: OSError) -> str:
-    """Describe an error of a file in a line."""
+    """Describe a file's error in one line of text."""
     return f"{path}: {error.strerror or error}"

@@ -166,13 +166,13 @@ def install_script(unit: str, again: Sequence[str], user: str) -> str:
 
 
 def check_folders(loaded: Loaded, user: str) -> None:
-    """Refuse an output folder that systemd does not make, or that another user owns.
+    """Check that all outputs are in folders that systemd makes for the user.
 
     Args:
         user: The name of the service's user, who need not exist yet.
 
     Raises:
-        ConfigError: One line with the folder, its owner, and what to do.
+        ConfigError: An output is elsewhere, an input is in such a folder, or another user owns it.
     """
     names = " or ".join(map(str, MADE.values()))
     read = _list_inputs(loaded)
@@ -200,7 +200,7 @@ def _list_outputs(config: Config) -> Iterator[tuple[list[str | int], Path]]:
 
 
 def _list_inputs(loaded: Loaded) -> list[Path]:
-    """List the files that determine what the service does, which it must not write."""
+    """List the files and folders that the service reads, and must not write."""
     config = loaded.config
     names = [
         *(node.file for _, node in loaded.nodes.walk()),
@@ -219,7 +219,7 @@ def _find_uid(user: str) -> int | None:
 
 
 def _quote(word: str) -> str:
-    """Quote a word of ExecStart, where % and $ are special, see systemd.service(5)."""
+    """Quote a word for ExecStart, where % and $ are special, see systemd.service(5)."""
     word = word.replace("%", "%%").replace("$", "$$")
     if word and all(c.isalnum() or c in "-_./=:@+,%$" for c in word):
         return word

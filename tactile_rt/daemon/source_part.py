@@ -2,8 +2,8 @@
 
     lines --> Acquisition (one thread) --> SourcePart --> hub
 
-A source's own thread opens it, reads it if it has no line, and opens a lost line again; as long as
-there is a line, it lends the source to the thread that reads all lines.
+A source's own thread opens it, reads it if it has no line, and opens a lost line again. While there
+is a line, this thread lends the source to the single thread that reads all lines, and waits.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ class _Lent:
 
 
 class Acquisition:
-    """A thread that reads the sources lent to it by `attend`, while there are any."""
+    """The thread that reads all sources lent by `attend`; it runs while it has any."""
 
     def __init__(self) -> None:
         self._reader = Reader()
@@ -67,12 +67,12 @@ class Acquisition:
     def attend(
         self, source: Source, take: Callable[[Chunk | None], None], wanted: Callable[[], bool]
     ) -> None:
-        """Read a source until its line is lost, or it is no longer wanted.
+        """Lend a source to the reading thread, and wait until that stops reading it.
 
         Args:
             take: Called in the reading thread with each chunk; several times a second with None,
                 if none comes.
-            wanted: Returns whether to go on.
+            wanted: Returns whether to go on; reading also ends when the line is lost.
         """
         lent = _Lent(source, take, wanted)
         with self._lock:
@@ -112,7 +112,7 @@ class Acquisition:
 
 
 class SourcePart(Part):
-    """The part that posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source."""
+    """The part that reads one source and posts its `Opened`, `Packet`, `SourceChunk`, `Closed`."""
 
     def __init__(
         self,
@@ -147,7 +147,7 @@ class SourcePart(Part):
 
     @property
     def source_state(self) -> SourceState:
-        """State for the snapshot."""
+        """Present state of the source, for the snapshot."""
         spec, stream, device = self._spec, self._stream, self._device
         stats = self._before if stream is None else _add_stats(self._before, stream.stats)
         about = SourceState(
@@ -181,7 +181,7 @@ class SourcePart(Part):
 
     @property
     def silent_s(self) -> float:
-        """Duration of its current turn of work, s; 0 also while its device is away."""
+        """Time since the part began its work, s; 0 while it waits or is `_away`."""
         return 0.0 if self._away else super().silent_s
 
     def expect(self, sensor: SensorSpec | None, changes: float) -> None:
@@ -197,8 +197,8 @@ class SourcePart(Part):
         super().stop()
 
     def join(self, until: float) -> bool:
-        """Wait for its end as any part, except while it waits for its device. Then nothing is lost,
-        and its thread is left to end by itself, once the device's time to answer is over."""
+        """Wait for the part to end, briefly if its device is away; return whether done. While
+        the device is away, nothing is lost; the thread ends after the device's time to answer."""
         if super().join(min(until, self._stopped_s + AWAY_S) if self._stopped_s else until):
             return True
         if self._away:
@@ -211,7 +211,7 @@ class SourcePart(Part):
 
     @property
     def _away(self) -> bool:
-        """True if it waits for a device that does not answer or send yet."""
+        """True while the source is being opened, or its device is connecting or lost."""
         device = self._device
         return self._opening or (
             device is not None and device.health.state in (State.CONNECTING, State.LOST)
@@ -228,7 +228,7 @@ class SourcePart(Part):
                 return
 
     def _serve(self) -> None:
-        """Open the source, and read it until it ends."""
+        """Open the source, and read and post its chunks until it ends."""
         try:
             stream = self._open()
         except SpecMismatch as error:
@@ -365,7 +365,7 @@ class SourcePart(Part):
         self._report(self.name, f"device:{health.state}", _describe_changes(health, before), level)
 
     def _await_room(self) -> None:
-        """Wait for room in all mailboxes, for a source that waits for its reader."""
+        """Wait for room in all mailboxes for samples, when the source is not live."""
         for box in self._hub.list_mailboxes(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))

@@ -52,7 +52,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Losses:
-    """Losses within the newest second and minute."""
+    """Number of losses or other events within the newest second and minute."""
 
     second: int = 0
     minute: int = 0
@@ -60,7 +60,7 @@ class Losses:
 
 @dataclass(frozen=True)
 class PartState:
-    """A supervised part.
+    """State of a supervised part.
 
     Attributes:
         state: ``starting``; ``running``; ``stalled``: in a call that does not return, also while it
@@ -81,10 +81,10 @@ class PartState:
 
 @dataclass(frozen=True)
 class SourceState:
-    """A source: its part, address, array and samples.
+    """State of a source: its part, address, array and samples.
 
-    Times are host CLOCK_MONOTONIC, ns; 0: not yet. The fields of the array are empty before the
-    source is first opened.
+    Times are host CLOCK_MONOTONIC, ns, or 0 before the event. The fields of the array are empty
+    before the source is first opened.
     """
 
     part: PartState
@@ -98,28 +98,28 @@ class SourceState:
     device: Health | None = None  # None: no device, or not open
     stats: SourceStats = field(default_factory=SourceStats)  # over all times that it was opened
     samples: int = 0
-    newest_ns: int = 0  # of the newest sample; its arrival if the device's own clock is kept
+    newest_ns: int = 0  # when the newest sample was taken; its arrival if times are the device's
     read_ns: int = 0  # when the newest sample was read
     flowing_ns: int = 0  # since when samples have come without a pause
     live: bool = False  # samples come even if nothing reads them, so that they can be too old
     losses: Losses = field(default_factory=Losses)  # corrupt, missing or dropped
     repeats: Losses = field(default_factory=Losses)  # samples that came again
-    restarts: Losses = field(default_factory=Losses)  # of the device's counter, its line in place
+    restarts: Losses = field(default_factory=Losses)  # of the device's counter, while connected
     clock_off: bool = False  # the device's clock runs at another speed than the host's
     bad_samples: int = 0  # of one element, NaN or absurdly large, though not marked invalid
     bad: Losses = field(default_factory=Losses)
     stuck_at_s: float = 0.0  # time without a change of any value, though noise should change some
     stuck: tuple[str, ...] = ()  # elements of which no value changes, while others do
-    zeros: bool = False  # no other values have come
+    zeros: bool = False  # all values so far are 0
     another: str = ""  # how the array differs from the one that the source began with
     # rate of measurements within the newest second, lost or not; 0: unknown
     measured_hz: float = 0.0
-    slow: bool = False  # it is, most of the time, less than nine tenths of `rate_hz`
+    slow: bool = False  # `measured_hz` is mostly less than nine tenths of `rate_hz`
 
 
 @dataclass(frozen=True)
 class ModelState:
-    """A model: its source, file and decisions."""
+    """State of a model: its part, source, file and decisions."""
 
     part: PartState
     source: str
@@ -151,7 +151,7 @@ class ModelState:
 
 @dataclass(frozen=True)
 class OnDisk:
-    """A source's samples on disk. Times are host CLOCK_MONOTONIC, ns; 0: none."""
+    """State of a source's samples on disk. Times are host CLOCK_MONOTONIC, ns; 0 means none."""
 
     written_ns: int = 0  # of the newest sample that outlives the process: the system has it
     synced_ns: int = 0  # of the newest sample that outlives a power cut: the medium has it
@@ -167,7 +167,7 @@ class OnDisk:
 
 @dataclass(frozen=True)
 class ConsumerState:
-    """A consumer: its queue, its details, and its delay."""
+    """State of a consumer: its part, queue, details and delay."""
 
     part: PartState
     kind: str  # such as jsonl or recorder
@@ -214,7 +214,7 @@ class Diagnostic:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The daemon at `t_ns`, host CLOCK_MONOTONIC, which is `utc_ns` in UTC."""
+    """State of the whole daemon at `t_ns`, host CLOCK_MONOTONIC, which is `utc_ns` in UTC."""
 
     version: str
     pid: int
@@ -244,7 +244,7 @@ class LatencyMeter:
         self._count, self._sum = 0, 0.0
 
     def add(self, seconds: float) -> None:
-        """Add a duration."""
+        """Add a duration to the histogram and the newest values."""
         with self._lock:
             self._newest.append(seconds)
             self._buckets[bisect.bisect_left(EDGES_S, seconds)] += 1
@@ -253,18 +253,18 @@ class LatencyMeter:
 
     @property
     def state(self) -> Latency:
-        """Result of all measurements so far."""
+        """Histogram and percentiles of the durations added so far."""
         with self._lock:
             ordered = sorted(self._newest)
             count, total, buckets = self._count, self._sum, tuple(self._buckets)
         if not ordered:
             return Latency(edges_s=EDGES_S, buckets=buckets)
         return Latency(
-            count, total, 1e3 * _rank(ordered, 0.5), 1e3 * _rank(ordered, 0.99), 1e3 * ordered[-1],
-            EDGES_S, buckets,
+            count, total, 1e3 * _find_quantile(ordered, 0.5), 1e3 * _find_quantile(ordered, 0.99),
+            1e3 * ordered[-1], EDGES_S, buckets,
         )  # fmt: skip
 
 
-def _rank(ordered: list[float], share: float) -> float:
-    """Find the smallest value that at least this share of all values do not exceed."""
+def _find_quantile(ordered: list[float], share: float) -> float:
+    """Return the smallest of sorted values that a share (0 to 1) do not exceed."""
     return ordered[max(0, -(-len(ordered) * round(1000 * share) // 1000) - 1)]

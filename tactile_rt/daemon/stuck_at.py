@@ -4,10 +4,10 @@ A sensor whose noise is above its resolution cannot give the same values twice; 
 gives the same values for as long as it rests. So equal samples are a fault only if the noise is
 known, or if a limit of time is configured.
 
-Without a description, noise is inferred if readings differ from the one before in three cases of
-four, in the tare, at rest before a lesson or in each half minute of the stream. Noise above a step
-of the resolution does so. A quarter of it, once motors stop, still changes one reading of ten at
-any level.
+Without a description of the sensor, noise is inferred if three of four readings differ from the one
+before: in the tare, at rest before a lesson, or in each half minute of the stream. Noise above a
+step of the resolution has that effect. A quarter of this noise, as when motors stop, still changes
+one reading of ten at any level.
 """
 
 import math
@@ -31,7 +31,7 @@ class StuckAtDetector:
 
     Attributes:
         after_s: The longest time without a change of any value, s; infinite: no limit.
-        each_after_s: The same for one element, while others change.
+        each_after_s: The longest time without a change for one element while others change, s.
         noisy: Whether some values of the stream change often, also at rest.
         seconds: The time without a change of any value, s; 0 unless it exceeds the limit.
         elements: The numbers of elements of which no value has changed for too long.
@@ -49,19 +49,19 @@ class StuckAtDetector:
     def expect(
         self, spec: ArraySpec, sensor: SensorSpec | None, changes: float, after_s: float = 0.0
     ) -> None:
-        """Derive for how long readings may be equal, from what is known of the sensor.
+        """Set the limits `after_s` and `each_after_s` from what is known of the sensor.
 
         Args:
-            changes: share of readings at rest that differ from the one before, for the element
-                that repeats most; 0: unknown.
-            after_s: the configured limit for all elements together, s; 0: none.
+            changes: Share of readings at rest that differ from the one before, for the element
+                that repeats most; 0 if unknown.
+            after_s: The configured limit for all elements together, s; 0 for none.
         """
         noisy = changes > OFTEN and not self._rested
         self.after_s = after_s or derive_stuck_at_s(spec, sensor, noisy=noisy or self.noisy)
         self.each_after_s = derive_stuck_at_s(spec, sensor, each=True, noisy=noisy)
 
     def add(self, *chunks: Chunk) -> None:
-        """Take the next samples of the stream; ignore those without any valid element."""
+        """Update with the next samples; invalid values end a stretch of equal samples."""
         chunk = concatenate(list(chunks))
         values = (chunk.values + 0.0).view(np.uint32)  # bits: NaN is equal to NaN, and -0 to 0
         last, self._last = self._last, values[-1]
@@ -97,11 +97,11 @@ class StuckAtDetector:
 def derive_stuck_at_s(
     spec: ArraySpec, sensor: SensorSpec | None, each: bool = False, noisy: bool = False
 ) -> float:
-    """Derive from the noise for how long samples may be equal, s; infinite: no limit.
+    """Return for how long noise allows samples to be equal, s, or infinity if unknown.
 
     Args:
-        each: for one element, not for all together.
-        noisy: whether some values change often; used without a sensor.
+        each: Whether the limit is for one element instead of all together.
+        noisy: Whether some values change often; used without a sensor.
 
     Two readings of a channel with white noise of standard deviation s, rounded to steps of q, are
     equal with a probability of about q / (2 s sqrt(pi)), and at most 1; channels are independent.

@@ -13,12 +13,12 @@ from tactile_rt.daemon.states import Snapshot
 
 TICK_S = 1.0
 SEND_S = 0.2  # a manager that does not read must not block the daemon
-LEAST_S = 1.0  # on a busy host, a thread may be without a turn for less
+LEAST_S = 1.0  # on a busy host, a thread may get no processor for less
 LONGEST = 400  # characters of a status
 
 
 class Systemd(Consumer):
-    """The consumer that notifies systemd; it pings the watchdog while nothing is `hanging`.
+    """The consumer that notifies systemd; it pings the watchdog while no thread is `hanging`.
 
     Raises:
         ConfigError: $NOTIFY_SOCKET or $WATCHDOG_USEC is not what systemd sets.
@@ -107,11 +107,11 @@ class Systemd(Consumer):
 
 
 def hanging(silent: Mapping[str, float], limit: float) -> tuple[str, ...]:
-    """Return the critical threads without a turn for longer than a limit, s.
+    """Return the names of critical threads whose current loop pass exceeds a limit, s.
 
     A part that broke is restarted; but a thread in a call that does not return can only be ended
     with its process. That is worthwhile for the main loop, the watch and every source; and for
-    models once none works. Consumers do not count here: the samples matter more than their use.
+    models once all hang. Consumers do not count here: the samples matter more than their use.
     """
     late = [name for name, seconds in silent.items() if seconds > limit]
     models = [name for name in silent if name.startswith("model.")]
@@ -121,7 +121,7 @@ def hanging(silent: Mapping[str, float], limit: float) -> tuple[str, ...]:
 
 
 def status_of(snapshot: Snapshot) -> str:
-    """Describe in one line the state, the diagnostics or the number of parts."""
+    """Return the state in one line, with the diagnostics or the number of parts."""
     if snapshot.degraded:
         return f"{snapshot.state}: {'; '.join(snapshot.degraded)}"[:LONGEST]
     counts = (
@@ -135,7 +135,7 @@ def status_of(snapshot: Snapshot) -> str:
 
 
 def _read_watchdog_s(environment: Mapping[str, str]) -> float:
-    """Read the watchdog's time limit, s; 0: no watchdog."""
+    """Return the watchdog's time limit, s, or 0 if systemd expects no pings."""
     text = environment.get("WATCHDOG_USEC", "")
     if not text or environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return 0.0

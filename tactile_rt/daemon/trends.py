@@ -1,4 +1,4 @@
-"""Trends: what will soon stop working if it goes on so, and is no fault yet."""
+"""Trends of memory and delays, from which diagnostics predict what will soon stop working."""
 
 import os
 from collections import deque
@@ -16,7 +16,7 @@ MB = 1e6
 
 
 class Trend:
-    """A quantity over the newest half hour, by its largest value of every 20 s."""
+    """Half an hour's history of a quantity: its largest value of every 20 s."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[float, float]] = deque(maxlen=KEPT + 1)
@@ -32,7 +32,7 @@ class Trend:
     def growth(self) -> tuple[float, float, float] | None:
         """Return the medians of the first and the last third, and the time between, s.
 
-        None unless all values of each third exceed all of the third before.
+        Return None unless all values of each third exceed all of the third before.
         """
         kept = list(self._kept)[:-1]  # the last one is not complete
         n = len(kept) // 3
@@ -45,7 +45,7 @@ class Trend:
 
 
 def read_resident_bytes() -> int | None:
-    """Read how much memory this process has, bytes; None if unknown."""
+    """Return the resident memory of this process, bytes, or None if unknown."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
@@ -53,7 +53,7 @@ def read_resident_bytes() -> int | None:
 
 
 def read_free_bytes() -> float:
-    """Read how much memory is free, bytes; infinite if unknown."""
+    """Return the available memory of the host, bytes, or infinity if unknown."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
     except OSError:
@@ -70,14 +70,14 @@ class Trends:
         self._memory, self._late = Trend(), dict[str, Trend]()
 
     def look(self, at_s: float, resident_bytes: int, late_s: Mapping[str, float]) -> None:
-        """Add the present measurements; forget sources that are not named."""
+        """Add measurements at a time, s; forget sources that are not in `late_s`."""
         self._memory.add(at_s, resident_bytes / MB)
         self._late = {name: self._late.get(name, Trend()) for name in late_s}
         for name, seconds in late_s.items():
             self._late[name].add(at_s, 1e3 * seconds)
 
     def foresee(self) -> list[Diagnostic]:
-        """Return diagnostics of what will soon stop working."""
+        """Return diagnostics of what will soon stop working if the trends continue."""
         found = []
         if growth := self._memory.growth():
             free_mb = self._free_bytes() / MB

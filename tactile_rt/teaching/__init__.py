@@ -2,7 +2,7 @@
 
     Source --> Classifier(features.onnx) --> Lesson --> model.onnx     (`tactile-rt teach`)
 
-`lesson` keeps touches with their labels; `features` computes features and `head` learns classes;
+`lesson` stores touches with labels; `features` computes features and `head` learns classes;
 `model` and `onnx_bytes` write the file, also of a network with enrolled objects; `teacher` and
 `page` guide the user. Nothing here needs torch, or the package onnx.
 """

@@ -4,7 +4,7 @@ An array's loads are reduced to a few signals: for every channel the sum over th
 the loads of a unit their centre and spread. Random temporal kernels filter the signals. Each kernel
 gives three features: the share of time since the onset with an output above a threshold, the mean,
 and the largest value (Dempster et al. 2021, doi:10.1145/3447548.3467231; Tan et al. 2022,
-doi:10.1007/s10618-022-00844-1). They are so many that a few touches show which of them matter.
+doi:10.1007/s10618-022-00844-1). They are so many that a few touches show which features matter.
 
 Loads are divided by the largest of their unit since the onset: a soft and a firm touch of a kind
 are alike, and the firmness is a feature of its own. So units and ranges do not matter, and the
@@ -33,7 +33,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FeatureNetwork:
-    """The network that computes features of an array's stream, step by step."""
+    """A network of random kernels that computes features of an array's stream, step by step."""
 
     spec: ArraySpec
     substeps: int
@@ -43,7 +43,7 @@ class FeatureNetwork:
 
     @classmethod
     def draw(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":
-        """Draw the network of an array from a seed, the same on every machine."""
+        """Create an array's network with random kernels, equal for equal seeds on all machines."""
         rng = np.random.default_rng(seed)
         signals = sum(cls._count_signals(spec, unit) for unit in dict.fromkeys(spec.units))
         reach = [d for d in DILATIONS if d * (TAPS - 1) < 0.8 * steps * substeps] or [1]
@@ -60,7 +60,7 @@ class FeatureNetwork:
 
     @staticmethod
     def _locate_elements(spec: ArraySpec) -> Floats:
-        """Compute coordinates (element, axis) along the axes that the array extends in, -1 to 1."""
+        """Return centred coordinates (element, axis), -1 to 1, along axes with an extent."""
         places = np.array(spec.positions)
         if np.ptp(places, axis=0).max() == 0:  # no positions given
             places = np.array(spec.grid, dtype=float)
@@ -71,7 +71,7 @@ class FeatureNetwork:
 
     @classmethod
     def _count_signals(cls, spec: ArraySpec, unit: str) -> int:
-        """Count the signals of the loads of a unit."""
+        """Return the number of signals that are made of the channels with a unit."""
         of_places = 1 + 2 * cls._locate_elements(spec).shape[1] if len(spec.elements) > 1 else 0
         return spec.units.count(unit) + of_places
 
@@ -82,20 +82,20 @@ class FeatureNetwork:
 
     @property
     def size(self) -> int:
-        """Number of features."""
+        """Number of features in a step."""
         return 3 * len(self.kernels) + len(set(self.spec.units))
 
     def state(self) -> dict[str, tuple[int, ...]]:
-        """Return the shape of every state, by name."""
+        """Return the shape of each recurrent state of the network, by name."""
         n, signals = self.kernels.shape[:2]
         kept = {"count": (1,), "high": (n,), "total": (n,), "largest": (n,)}
         return {"past": (self.past, signals), "peak": (len(set(self.spec.units)),), **kept}
 
     def build(self, g: OnnxGraph) -> tuple[str, dict[str, str]]:
-        """Add the network to a graph.
+        """Add the inputs and operators of the network to a graph.
 
         Returns:
-            The name of the (batch, feature) output, and the next value of each state, by name.
+            The name of the (batch, feature) output, and that of each state's next value, by state.
         """
         elements, channels = self.spec.shape
         samples = g.input("samples", ["batch", self.substeps, elements, channels])
@@ -147,7 +147,7 @@ class FeatureNetwork:
         }  # fmt: skip
 
     def _add_signals(self, g: OnnxGraph, load: str, noise: str) -> tuple[str, str]:
-        """Add signals (batch, sub-step, signal) of a unit's loads; return them and the peak."""
+        """Add a unit's signals (batch, sub-step, signal) and peak to `g`; return both names."""
         summed = g("ReduceSum", load, g.integers(2), keepdims=0)  # (batch, sub-step, channel)
         level = g("Sqrt", g("ReduceSum", g("Mul", noise, noise), g.integers(2), keepdims=0))
         faint = g("Mul", g("ReduceMax", level, g.integers(1), keepdims=1), g.constant(FAINT))
@@ -174,6 +174,6 @@ class FeatureNetwork:
 
     @property
     def kinds(self) -> tuple[slice, ...]:
-        """Features of one kind each: shares of time, means, largest values, and peaks."""
+        """Slices of the features, one per kind: shares of time, means, largest values, peaks."""
         n = len(self.kernels)
         return slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n), slice(3 * n, None)

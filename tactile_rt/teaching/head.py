@@ -3,7 +3,7 @@
 At every step, a class is the mean of its touches' features, and all classes share one covariance of
 touches within a class: a few main directions, and the same small variance in all others
 (probabilistic principal components: Tipping & Bishop 1999, doi:10.1111/1467-9868.00196). A
-decision is the nearest mean by that measure; a touch that is far from all of them is unknown. The
+decision is the nearest mean by that metric; a touch that is far from all means is unknown. The
 reach, how far a touch may be from the mean of its class, is learnt leave-one-out and, if there are
 touches of anything else, also from these.
 """
@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TouchClasses:
-    """The learnt classes, step by step.
+    """Classes learnt from touches: their means, shared covariance and reach in every step.
 
     Standardised features are (f - mean) / scale, limited to 5.
     """
@@ -47,8 +47,8 @@ class TouchClasses:
     mean: Floats  # (step, feature)
     scale: Floats  # (step, feature)
     centres: Floats  # (step, class, feature) means of the classes, standardised
-    # (step, feature, axis) main directions of the covariance; the squared length of each is the
-    # weight that a unit along it loses
+    # (step, feature, axis) main directions of the covariance; the squared length of each is
+    # 1 / rest minus the inverse variance along it
     axes: Floats
     rest: Floats  # (step,) variance in all other directions
     # (class,) factor of squared distances that corrects for the error of a mean of few touches
@@ -57,7 +57,7 @@ class TouchClasses:
     temperature: float  # divides half of the squared distances, so that posteriors are calibrated
 
     def distances(self, features: Floats) -> Floats:
-        """Compute squared distances (touch, step, class) of touches (touch, step, feature)."""
+        """Return squared distances (touch, step, class) of features (touch, step, feature)."""
         found = np.clip((features - self.mean) / self.scale, -LIMIT, LIMIT)
         away = found[:, :, None] - self.centres
         along = np.einsum("tscf,sfa->tsca", away, self.axes)
@@ -67,7 +67,7 @@ class TouchClasses:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """The leave-one-out results: every touch is judged by the others alone."""
+    """Leave-one-out results: each touch is classified by what is learnt from the others."""
 
     distances: Floats  # (touch, step, class) squared distances from the classes of the others
     right: NDArray[np.bool_]  # (touch,) whether the nearest class at the last step was its own
@@ -80,14 +80,14 @@ def fit_classes(
     judged: LeaveOneOut | None = None,
     others: Floats | None = None,
 ) -> TouchClasses:
-    """Learn classes from touches.
+    """Learn classes from labelled touches, and their reach and temperature leave-one-out.
 
     Args:
-        features: (touch, step, feature) of all touches.
-        labels: (touch,) the class of each.
-        kinds: slices of features of one kind, and so of one scale.
-        judged: the result of `leave_one_out` for these touches; None: it is computed.
-        others: (touch, step, feature) of touches of anything else; None: no such touches.
+        features: (touch, step, feature) The features of all touches.
+        labels: (touch,) The class of each touch.
+        kinds: The slices of features of one kind, which have similar scales.
+        judged: The result of `leave_one_out` for these touches, or None to compute it.
+        others: (touch, step, feature) The features of touches of anything else, or None.
     """
     _check_enough(labels)
     judged = judged or leave_one_out(features, labels, kinds)
@@ -114,7 +114,7 @@ def fit_classes(
 def count_refused(
     features: Floats, labels: Sequence[str], kinds: Sequence[slice], others: Floats
 ) -> int:
-    """Count the touches of anything else that are refused at the last step.
+    """Return how many touches of no class (`others`) are refused at the last step.
 
     Each of `others` (touch, step, feature) is judged by what is learnt without it.
     """
@@ -126,19 +126,19 @@ def count_refused(
 
 
 def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeaveOneOut:
-    """Judge every touch by what is learnt from the others.
+    """Classify each touch by what is learnt from the other touches.
 
-    Of many touches, a tenth of each class is left out at a time. At least two of each are needed.
+    Of more than ten touches of a class, a tenth is left out at a time. A class needs two or more.
     """
     _check_enough(labels)
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
-    turn = np.empty(len(own), dtype=int)
+    fold_of = np.empty(len(own), dtype=int)
     for k in range(len(classes)):
         count = int((own == k).sum())
-        turn[own == k] = np.arange(count) % min(FOLDS, count)
+        fold_of[own == k] = np.arange(count) % min(FOLDS, count)
     distances = np.empty((*features.shape[:2], len(classes)))
-    for fold in range(turn.max() + 1):
-        out = turn == fold
+    for fold in range(fold_of.max() + 1):
+        out = fold_of == fold
         learnt = TouchClasses(
             tuple(classes), *_fit_shared(features[~out], own[~out], kinds), np.zeros(0), 1.0
         )
@@ -147,7 +147,7 @@ def leave_one_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice
 
 
 def _check_enough(labels: Sequence[str]) -> None:
-    """Refuse labels if a class has fewer than two touches."""
+    """Raise `ConfigError` if a class has fewer than two touches."""
     for name in dict.fromkeys(labels):
         if list(labels).count(name) < FEWEST:
             raise ConfigError(f"there is one touch of {name!r}; a class needs {FEWEST} at least")
@@ -156,7 +156,7 @@ def _check_enough(labels: Sequence[str]) -> None:
 def _fit_shared(
     features: Floats, own: NDArray[np.intp], kinds: Sequence[slice]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Compute mean, scale, centres, axes, rest and share of `TouchClasses`."""
+    """Return the fields mean, scale, centres, axes, rest and share of `TouchClasses`."""
     count = int(own.max()) + 1
     share = 1 - 1 / (np.bincount(own) + 1.0)
     freedom = max(1, len(own) - count)
@@ -188,7 +188,7 @@ def _compute_means(features: Floats, own: NDArray[np.intp]) -> Floats:
 
 
 def _fit_temperature(distances: Floats, own: NDArray[np.intp]) -> float:
-    """Find the temperature with the likeliest posteriors of the touches' own classes."""
+    """Return the temperature that makes the touches' own classes most likely."""
     if distances.shape[1] == 1:
         return float(max(1.0, np.median(distances)))
     least = distances - distances.min(axis=1, keepdims=True)

@@ -32,8 +32,8 @@ from tactile_rt.teaching.head import FEWEST, LeaveOneOut
 from tactile_rt.teaching.listener import Listener
 from tactile_rt.teaching.model import TOUCH, Enrolment, FewShot, write_features
 
-ORDERS = ("next", "undo", "done", "list")  # to a teacher; any other word is the label from now on
-NAMING = ("forget", "rename")  # orders with names after them
+ORDERS = ("next", "undo", "done", "list")  # commands to a teacher; any other text is a new label
+NAMING = ("forget", "rename")  # commands with names after them
 FEATURES, MODEL = "features.onnx", "model.onnx"
 ANYTHING_ELSE = "anything else"  # the label of touches of no class, which are to be refused
 BEFORE_NS = 20_000_000  # from the beginning of a touch's interval to its onset
@@ -45,7 +45,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TaughtTouch:
-    """A touch of a lesson."""
+    """A labelled touch of a lesson, with its features."""
 
     label: str
     features: NDArray[np.float32]  # (step, feature) what was felt, step by step
@@ -55,7 +55,7 @@ class TaughtTouch:
 
 @dataclass
 class Lesson:
-    """Touches and what is learnt from them, kept in a folder."""
+    """A lesson in a folder: labelled touches, and the model learnt from them."""
 
     folder: Path
     taught: FewShot | Enrolment
@@ -80,12 +80,12 @@ class Lesson:
         """Begin a lesson that enrols objects on a network.
 
         Args:
-            folder: the lesson's folder; created if missing.
-            model: the network's file, which is copied.
+            folder: The lesson's folder; created if missing.
+            model: The network's file, which is copied.
 
         Raises:
-            ConfigError: the folder holds a lesson already, or the file cannot enrol objects.
-            ModelError: the file cannot be used.
+            ConfigError: The folder holds a lesson already, or the file cannot enrol objects.
+            ModelError: The file cannot be used.
         """
         _check_free(folder)
         taught = Enrolment(model)
@@ -96,7 +96,7 @@ class Lesson:
 
     @classmethod
     def read(cls, folder: Path) -> "Lesson":
-        """Read a lesson that was begun before, with all its touches."""
+        """Read an existing lesson with all its touches from its folder."""
         path = folder / FEATURES
         if not path.exists():
             raise ConfigError(f"{folder} holds no lesson: there is no {FEATURES}")
@@ -110,11 +110,11 @@ class Lesson:
 
     @classmethod
     def embedded_again(cls, folder: Path, model: Path) -> "Lesson":
-        """Continue a network's lesson on another network, which embeds all recordings again.
+        """Continue an enrolment lesson on another network, which embeds all recordings again.
 
         Raises:
-            ConfigError: the lesson has no network, or the other one cannot enrol objects.
-            SpecMismatch: the network is for another array than the recordings.
+            ConfigError: The lesson has no network, or the other network cannot enrol objects.
+            SpecMismatch: The network is for another array than the recordings.
         """
         if load_model(folder / FEATURES)[1].labels == (TOUCH,):
             raise ConfigError(f"{folder} holds a lesson without a network: name another folder")
@@ -150,7 +150,7 @@ class Lesson:
                 self.touches.append(TaughtTouch(interval.label, inside[0], path.name, line))
 
     def _find_touches(self, path: Path, model: Path) -> list[tuple[float, NDArray[np.float32]]]:
-        """Find the touches in a recording: onset, s since its beginning, and features."""
+        """Return onset, s since the recording's first sample, and features of each touch."""
         recording = Recording(path)
         # the labels say which of them counted
         listener = Listener(model, recording.spec, self.taught.describe, hasty_ns=0)
@@ -161,7 +161,7 @@ class Lesson:
         return found
 
     def listener(self, spec: ArraySpec) -> Listener:
-        """Make a listener that finds touches in a stream of an array."""
+        """Create a detector of this lesson's touches in a stream of an array."""
         listener = Listener(self.folder / FEATURES, spec, self.taught.describe)
         self._largest.append(listener.largest)
         return listener
@@ -174,12 +174,12 @@ class Lesson:
     def add(
         self, label: str, features: NDArray[np.float32], recording: str, span_s: tuple[float, float]
     ) -> None:
-        """Add a touch; on return its label is on disk.
+        """Add a touch to the lesson, and write its label to disk.
 
         Args:
-            features: (step, feature).
-            recording: the recording's name; its newest samples may not be on disk yet.
-            span_s: interval of the touch, seconds since the recording's first sample.
+            features: (step, feature) The features of the touch.
+            recording: The recording's name; its newest samples may not be on disk yet.
+            span_s: The interval of the touch, seconds since the recording's first sample.
         """
         begin_s, end_s = max(0.0, span_s[0]), span_s[1]
         interval = labels.LabelledInterval(label=label, start_s=begin_s, end_s=end_s)
@@ -187,17 +187,17 @@ class Lesson:
         self.touches.append(TaughtTouch(label, features, recording, line))
 
     def undo(self) -> TaughtTouch | None:
-        """Remove the last touch and return it; None: no touch is left."""
+        """Remove and return the last touch, or return None if no touch is left."""
         if not self.touches:
             return None
         labels.remove_label(self.folder / labels.LABELS, self.touches[-1].line)
         return self.touches.pop()
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a label, or forget all its touches if the new name is empty.
+        """Rename a label, or remove all its touches if the new name is empty.
 
         Raises:
-            ConfigError: the label does not exist, or the new one is invalid.
+            ConfigError: The label does not exist, or the new name is invalid.
         """
         if old not in (*self.labels, *self.unfelt):
             raise ConfigError(f"there is no {old!r}: `list` shows the names")
@@ -228,7 +228,7 @@ class Lesson:
         return tuple(name for name in self.labels if self.count(name) >= FEWEST)
 
     def leave_one_out(self) -> "LessonProgress":
-        """Judge every touch by the others alone, at its last step.
+        """Classify each touch at its last step by the other touches; return the results.
 
         With a single class no touch can be wrong, so none is counted as right.
         """
@@ -245,7 +245,7 @@ class Lesson:
         return progress
 
     def learn(self) -> ModelCard:
-        """Write the model of all classes with enough touches."""
+        """Learn a model of all classes with enough touches, and write it into the folder."""
         used, names = self._select_touches()
         if not used:
             why = f"nothing to learn from: no class has {FEWEST} touches yet"
@@ -265,13 +265,13 @@ class Lesson:
         )
 
     def _select_touches(self) -> tuple[list[int], list[str]]:
-        """Return the numbers and labels of the touches of classes with enough of them."""
+        """Return the indices and labels of touches whose class has enough touches."""
         enough = self.taught_enough
         used = [k for k, touch in enumerate(self.touches) if touch.label in enough]
         return used, [self.touches[k].label for k in used]
 
     def _stack_others(self) -> Floats:
-        """Return the features (touch, step, feature) of touches of anything else."""
+        """Return the features (touch, step, feature) of touches labelled `ANYTHING_ELSE`."""
         found = [touch.features for touch in self.touches if touch.label == ANYTHING_ELSE]
         return np.array(found, dtype=float)
 
@@ -297,7 +297,7 @@ class LessonProgress:
 
     @property
     def right(self) -> tuple[int, int]:
-        """Number of touches that were right, and of all touches."""
+        """Number of rightly classified touches, and number of all touches."""
         return sum(c[2] for c in self.classes), sum(c[1] for c in self.classes)
 
 
@@ -341,7 +341,7 @@ def _check_free(folder: Path) -> None:
 
 
 def check_label(name: str) -> str:
-    """Check a label, and return it."""
+    """Return a label, or raise `ConfigError` if it is invalid or a command."""
     if why := labels.check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
     if name in ORDERS or name.partition(" ")[0] in NAMING:

@@ -1,4 +1,4 @@
-"""The touches in the stream of a lesson: onset, end and features of each."""
+"""Detection of touches in the stream of a lesson: onset, end and features of each."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from tactile_rt.core.errors import RecordingError
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 
 HASTY_NS = 200_000_000  # after the end of a contact, within which another belongs to that touch
-FELT = 6.0  # times the noise, in two consecutive samples, is felt
+FELT = 6.0  # times the noise: a reading as large in two consecutive samples counts as a touch
 LONG_AGO_NS = 2**62
 # Parts of a rest, and by how many times the noise within them their means differ at most.
 REST_PARTS, MOVED = 8, 10.0
@@ -20,15 +20,15 @@ QUIET = 0.3  # of the noise at rest: the least noise that the contact detector a
 
 
 class Listener:
-    """A detector of the touches in a stream.
+    """A detector of touches in a stream, which also computes their features.
 
     Args:
-        model: ``features.onnx``.
-        felt: computes features of a touch's steps.
-        hasty_ns: how soon after the end of a contact another counts as its continuation, ns.
+        model: The path of the lesson's ``features.onnx``.
+        felt: Computes the features of a touch from the decisions after its steps.
+        hasty_ns: How soon after the end of a contact another counts as its continuation, ns.
 
     Raises:
-        SpecMismatch: the stream is from another array than the lesson.
+        SpecMismatch: The stream is from another array than the lesson.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Listener:
         self.hasty = 0  # contacts so soon after another that they may belong to it; ignored
 
     def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
-        """Take samples; yield (onset, end, features (step, feature)) of complete touches."""
+        """Feed samples; yield onset and end (stream ns) and features of each complete touch."""
         if self._first_ns is None:
             self._first_ns = int(chunk.t_ns[0])
         self._received += len(chunk)
@@ -76,14 +76,14 @@ class Listener:
             if decision.step == 1:
                 self._steps = []
                 onset = decision.onset_ns
-                hasty = onset - self._released_before(onset) < self._hasty_ns
+                hasty = onset - self._find_release(onset) < self._hasty_ns
                 self.hasty, self._counts = self.hasty + hasty, not hasty
             self._steps.append(decision)
             if decision.final and self._counts:
                 self._received, self._strongest = 0, 0.0  # this touch was not missed
                 yield decision.onset_ns, decision.t_ns, self._describe(self._steps)
 
-    def _released_before(self, onset_ns: int) -> int:
+    def _find_release(self, onset_ns: int) -> int:
         """Return the stream time at which the contact before an onset ended."""
         changes = self.classifier.touches
         while changes and changes[0][0] < onset_ns:
@@ -93,7 +93,7 @@ class Listener:
         return self._released_ns
 
     def hint(self) -> str:
-        """Explain why no touch may have been found for a while."""
+        """Explain to the user why no touch was found since the last touch or hint."""
         received, strongest = self._received, self._strongest
         self._received, self._strongest = 0, 0.0
         if not received:
@@ -114,7 +114,7 @@ class Listener:
 
 
 def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
-    """Find a reading that was not at rest; return its element and channel, or "".
+    """Return element and channel of a reading that was not at rest, or "".
 
     At rest, the means of eighths of the time differ by no more than ten times the noise, or by two
     steps between the levels of a reading.
@@ -135,7 +135,7 @@ def find_motion(chunks: Sequence[Chunk], spec: ArraySpec) -> str:
 
 
 def measure_changes(chunks: Sequence[Chunk]) -> float:
-    """Measure the share of readings that differ from the one before, for the steadiest element."""
+    """Return the share of readings that differ from the one before, for the steadiest element."""
     values = np.concatenate([c.values for c in chunks])
     return float((values[1:] != values[:-1]).mean(axis=0).max(axis=1).min())
 
@@ -143,8 +143,8 @@ def measure_changes(chunks: Sequence[Chunk]) -> float:
 def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
     """Estimate the least noise (channel,) for a contact detector, from an array at rest.
 
-    It is a share of the noise of the median element; for a channel that hardly changes, it follows
-    from the smallest difference between its readings, or from a millionth of the largest.
+    The estimate is a share of the median element's noise. For a channel that hardly changes, it is
+    derived from the smallest difference of readings, or from a millionth of the largest reading.
     """
     values = np.concatenate([c.values for c in chunks]) if chunks else np.empty((0, 0, 0))
     valid = np.concatenate([c.valid for c in chunks]) if chunks else np.empty((0, 0))

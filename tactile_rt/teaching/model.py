@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FewShot:
-    """The few-shot learning of a model, from a lesson alone."""
+    """A few-shot learner, which makes a model from the touches of a lesson alone."""
 
     spec: ArraySpec
     # (channel,) smallest noise that the contact detector assumes, in the channel's unit
@@ -74,11 +74,11 @@ class FewShot:
         return np.stack([step.embedding for step in steps if step.embedding is not None])
 
     def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
-        """Judge every touch by the others alone, at its last step."""
+        """Classify each touch at its last step by what is learnt from the others."""
         return head.leave_one_out(features[:, -1:], labels, self.network.kinds)
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
-        """Count the touches of anything else that are refused, each judged without it."""
+        """Return how many of `others` are refused, each by what is learnt without it."""
         return head.count_refused(features[:, -1:], labels, self.network.kinds, others[:, -1:])
 
     def learn(
@@ -91,7 +91,7 @@ class FewShot:
         name: str,
         provenance: dict[str, Any],
     ) -> ModelCard:
-        """Write the model of the classes of these touches (touch, step, feature)."""
+        """Learn classes from touches (touch, step, feature); write the model to `path`."""
         graph, network = OnnxGraph(), self.network
         classes = head.fit_classes(features, labels, network.kinds, others=others)
         found, after = network.build(graph)
@@ -112,11 +112,11 @@ class FewShot:
 
 
 class Enrolment:
-    """The enrolment of objects on a network that tells objects apart.
+    """An enroller of objects on a network that was trained to tell objects apart.
 
     Raises:
-        ModelError: the model cannot be used.
-        ConfigError: it was not trained to tell objects apart, or has enrolled objects already.
+        ModelError: The model cannot be used.
+        ConfigError: The model was not trained for that, or has enrolled objects already.
     """
 
     each, few = 5, 3
@@ -143,7 +143,7 @@ class Enrolment:
         return embedding[None]
 
     def leave_one_out(self, features: Floats, labels: Sequence[str]) -> head.LeaveOneOut:
-        """Judge every touch (touch, 1, unit) by the others alone."""
+        """Identify each touch (touch, 1, unit) among objects enrolled with the other touches."""
         rule = self.card.identity
         assert rule is not None
         touches = enrolment.project(rule, features[:, -1])
@@ -155,7 +155,7 @@ class Enrolment:
         return head.LeaveOneOut(-above[:, None], (above.argmax(axis=1) == own) & (above[mine] >= 0))
 
     def count_refused(self, features: Floats, labels: Sequence[str], others: Floats) -> int:
-        """Count the touches of anything else that match none of the objects."""
+        """Return how many of `others` (touch, 1, unit) match none of the labelled objects."""
         found = self._enrol(features, labels)
         assert self.card.identity is not None
         names = [enrolment.identify(self.card.identity, found, [other[-1]])[0] for other in others]
@@ -171,7 +171,7 @@ class Enrolment:
         name: str,
         provenance: dict[str, Any],
     ) -> ModelCard:
-        """Write a copy of the model file whose card has the objects of these touches."""
+        """Enrol the touches' objects; write a copy of the model with them to `path`."""
         card = msgspec.structs.replace(
             self.card,
             name=name,
@@ -201,7 +201,7 @@ def write_features(path: Path, taught: FewShot) -> ModelCard:
 def _add_head(
     g: OnnxGraph, features: str, count: str, timing: Timing, classes: head.TouchClasses
 ) -> str:
-    """Add logits (batch, class and unknown): minus half of squared distances and reach."""
+    """Add logits (batch, class + 1): squared distances and the reach, times -1/2."""
     done = g("Div", count, g.constant(float(timing.substeps)))
     step = g("Cast", g("Sub", done, g.constant(1.0)), to=7)
     step = g("Clip", step, g.constant(0, np.int64), g.constant(timing.steps - 1, np.int64))
@@ -247,7 +247,7 @@ def _write_model(
 
 
 def write_checked(path: Path, graph: OnnxGraph, card: ModelCard) -> ModelCard:
-    """Write a file with its own hash and probe logits, for `model verify`."""
+    """Write a model file that stores its graph's hash and probe logits, for `model verify`."""
     whole = path.with_name(f".{path.name}")
     whole.write_bytes(_serialise(graph, card))
     try:

@@ -25,12 +25,12 @@ class TeachingPage:
     """The server of the teaching page, which runs until it is closed.
 
     Args:
-        host, port: the address to listen at; port 0: any free port.
-        state: returns what the page shows, see `Teacher.state`; called in another thread.
-        obey: takes an order; called in another thread.
+        host, port: The address to listen at; port 0 means any free port.
+        state: Returns what the page shows, see `Teacher.state`; called in the server's thread.
+        obey: Called with a command of the user, in the server's thread.
 
     Raises:
-        SourceError: the address is taken, or not of this computer.
+        SourceError: The address is taken, or not of this computer.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """The dialogue of a lesson: the user names what is touched, and sees how well it is told apart.
 
-orders (keys, lines, a page's buttons) --> Teacher <-- touches
+commands (keys, lines, a page's buttons) --> Teacher <-- touches
 """
 
 import shlex
@@ -20,19 +20,19 @@ LONG = 9  # digits: more are no class's number
 
 @dataclass
 class Teacher:
-    """The dialogue with the user who touches."""
+    """State machine of a lesson's dialogue: executes commands, adds touches, prompts the user."""
 
     lesson: Lesson
     # names of the classes to be taught, in their order; more come as they are named
     wanted: list[str]
     each: int
     label: str = ""  # name of what is touched now; empty: not named yet
-    done: bool = False  # whether the user has ended it, or all wanted touches are there
+    done: bool = False  # whether the user has ended the lesson, or all wanted touches were made
     ended: str = ""  # how the lesson ended; empty: it goes on
     said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether the lesson ends after a list of classes
-    _ends_s: float | None = None  # time at which there is enough of anything else
+    _ends_s: float | None = None  # when the time for touches of anything else is over
 
     def __post_init__(self) -> None:
         for name in self.wanted:
@@ -43,14 +43,14 @@ class Teacher:
         self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
 
     def obey(self, order: str) -> str:
-        """Execute an order: one of `ORDERS`, a class's name or number; return the answer.
+        """Execute a command: one of `ORDERS`, a class's name or number; return the answer.
 
-        ``forget NAME`` and ``rename OLD NEW`` take names with spaces in quotes.
+        Further commands are ``forget NAME`` and ``rename OLD NEW``; quote names with spaces.
         """
         return self.note(self._obey(order.strip()))
 
     def note(self, said: str) -> str:
-        """Show an answer on the page, too; return it."""
+        """Store an answer to show it on the page, too; return it."""
         self.said = said
         return said
 
@@ -61,7 +61,7 @@ class Teacher:
         if order == "undo":
             return self._undo()
         if order == "next":
-            return self._next()
+            return self._go_to_next()
         if order == "list":
             return "\n".join(self._describe_classes()) or "nothing is taught yet"
         if order.partition(" ")[0] in NAMING:
@@ -80,7 +80,7 @@ class Teacher:
         return self.prompt()
 
     def watch(self, now_s: float | None) -> None:
-        """End after anything else was touched for long enough; None: no sample comes."""
+        """Set `done` if touches of anything else had enough time, or samples end (None)."""
         if self.label != ANYTHING_ELSE or not self._planned:
             self._ends_s = None
         elif now_s is None:
@@ -96,7 +96,7 @@ class Teacher:
         recording: str,
         span_s: tuple[float, float],
     ) -> str:
-        """Take a touch that was begun under a label; return the answer."""
+        """Add a touch to the lesson under a label; return the answer for the user."""
         if not label:
             return self.note("touched, but what? say so first: nothing was learnt")
         self.lesson.add(label, features, recording, span_s)
@@ -135,7 +135,7 @@ class Teacher:
         return f"touch it: {self.label} ({count + 1}{of})"
 
     def state(self) -> dict[str, Any]:
-        """Return the state that the page shows."""
+        """Return the state that the page shows; safe from any thread."""
         # Called in another thread: what is read twice must not change in between.
         progress, touches = self.progress, tuple(self.lesson.touches)
         right, of = progress.right
@@ -197,7 +197,7 @@ class Teacher:
         return [f"{name}: {self.lesson.count(name)} touches{right.get(name, '')}" for name in names]
 
     def _rename(self, order: str) -> str:
-        """Rename or forget a class."""
+        """Execute a command to rename or forget a class; return the answer."""
         try:
             verb, old, *new = shlex.split(order)
             if len(new) != (verb == "rename"):
@@ -230,7 +230,7 @@ class Teacher:
         self.label, self.done = gone.label, False
         return f"touch {len(self.lesson.touches) + 1} ({gone.label}) is taken back\n{self.prompt()}"
 
-    def _next(self) -> str:
+    def _go_to_next(self) -> str:
         if not self.wanted:
             return self.prompt()
         at = self.wanted.index(self.label) + 1 if self.label in self.wanted else 0
@@ -238,7 +238,7 @@ class Teacher:
         return self.prompt()
 
     def _choose_next(self) -> None:
-        """Choose the next class that lacks touches; if none does, end the list."""
+        """Choose the next class that lacks touches, else `ANYTHING_ELSE`, else end the list."""
         short = self._list_short()
         if short:
             self.label = short[0]

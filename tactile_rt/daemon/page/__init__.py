@@ -25,7 +25,7 @@ SHORTEST_TOKEN = 16
 
 
 class Page(Consumer):
-    """The consumer that serves the page of the table ``[page]``.
+    """The consumer that serves the web page, configured by table ``[page]``.
 
     Raises:
         ConfigError: Other computers could reach the page without a token.
@@ -49,7 +49,7 @@ class Page(Consumer):
         self._frames = 0
 
     def open(self, view: View) -> None:
-        """Start to listen.
+        """Start the server at the configured address.
 
         Raises:
             SourceError: The port is taken, or the address is not of this computer.
@@ -71,10 +71,10 @@ class Page(Consumer):
             )  # fmt: skip
 
     def handle(self, items: list[Item]) -> None:
-        """Send new lines to the browsers.
+        """Encode items as lines and send them to the connected browsers.
 
         Raises:
-            TactileError: The server is gone.
+            TactileError: The server's thread has ended.
         """
         answers, server = self._routes, self._server
         if answers is None or server is None or not server.alive:
@@ -112,7 +112,7 @@ class Page(Consumer):
         }
 
     def _greet(self) -> list[bytes]:
-        """Make the first lines for a browser, in the server's thread."""
+        """Return the first lines for a new browser; called in the server's thread."""
         snapshot = self._view.snapshot()
         hello = {
             "type": "hello", "version": FEED_VERSION, "control": self._options.control,

@@ -24,11 +24,11 @@ FEED_VERSION = 1
 FRAME_S = 0.024  # with the gathering, some thirty a second
 KEPT_EVENTS, KEPT_DECISIONS = 40, 160
 
-Line = tuple[str, bytes]  # the one source that it is about, or empty; JSON with the end of the line
+Line = tuple[str, bytes]  # source whose watchers get it, or empty for all; JSON with line break
 
 
 class _Fold:
-    """The range and the newest of a source's samples since the last frame."""
+    """Accumulator of a source's samples since the last frame: least, most, newest values."""
 
     def __init__(self) -> None:
         self.samples = 0
@@ -61,7 +61,7 @@ class _Fold:
 
 
 class Feed:
-    """The lines made from items; for the consumer's thread, except `recent`."""
+    """Encoder of items as lines for browsers; for the consumer's thread, except `recent`."""
 
     def __init__(self) -> None:
         self._folds: dict[str, _Fold] = {}
@@ -71,7 +71,7 @@ class Feed:
         self._decisions: deque[bytes] = deque(maxlen=KEPT_DECISIONS)
 
     def take(self, items: list[Item], watched: Collection[str]) -> list[Line]:
-        """Return the lines to send now; samples of unwatched sources cost nothing."""
+        """Encode items; return the lines to send now, without samples of unwatched sources."""
         lines: list[Line] = []
         for item in items:
             if isinstance(item, SourceChunk):
@@ -92,7 +92,7 @@ class Feed:
         return lines
 
     def recent(self) -> list[bytes]:
-        """Return the newest events and decisions, for a new browser; from any thread."""
+        """Return lines of the newest events and decisions; safe from any thread."""
         with self._lock:
             return [*self._events.values(), *self._decisions]
 
@@ -113,7 +113,7 @@ class Feed:
 
 
 def array_line(opened: Opened) -> bytes:
-    """Encode the array of a source as a line."""
+    """Encode the array of an opened source as a line of JSON."""
     spec = opened.spec
     return (
         msgspec.json.encode(
@@ -128,7 +128,7 @@ def array_line(opened: Opened) -> bytes:
 
 
 def map_axes(spec: ArraySpec) -> NDArray[np.float64]:
-    """Compute the matrices (element, 2, 3) from elements' own frames to the map's (right, down).
+    """Return matrices (element, 2, 3) from elements' own frames to the map's (right, down).
 
     Right is the mean direction, in the mount frame, in which the columns of the grid follow each
     other, down that of the rows. So the map shows the part of a force in the plane of the array,

@@ -69,11 +69,11 @@ class _Control(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Guard:
-    """The checks of requests by their headers alone.
+    """Access control of requests, by their headers alone.
 
     Args:
         host: The address that the page is bound to, as configured.
-        token: The secret that a browser must know; empty: no secret.
+        token: The secret that a browser must know; empty for none.
     """
 
     def __init__(self, host: str, port: int, token: str) -> None:
@@ -86,14 +86,14 @@ class Guard:
         self._session = hmac.digest(self._token, b"tactile_rt page", hashlib.sha256).hex().encode()
 
     def check(self, headers: Mapping[str, str], method: str) -> None:
-        """Refuse a request that comes from another site.
+        """Raise `Refused` if a request comes from another website.
 
         A foreign site cannot point its own name at this address (DNS rebinding), as only IP
         addresses and this host's names are served. It cannot send requests from its own pages, as
         browsers state the origin.
 
         Raises:
-            Refused: 403.
+            Refused: Status 403.
         """
         host = headers.get("host", "")
         if not self._is_own(host):
@@ -107,7 +107,7 @@ class Guard:
             raise Refused(403, "asked for by another site")
 
     def knows(self, headers: Mapping[str, str]) -> bool:
-        """Return whether a request carries the token in a header, or its cookie."""
+        """Return whether a request has the token or its cookie, or no token is set."""
         if not self._token:
             return True
         kind, _, given = headers.get("authorization", "").partition(" ")
@@ -120,13 +120,13 @@ class Guard:
         return False
 
     def is_token(self, given: str) -> bool:
-        """Return whether a text is the token, in a time independent of its content."""
+        """Return whether a text is the token; the time does not depend on its content."""
         return len(given) <= MAX_TOKEN and hmac.compare_digest(
             given.encode("utf-8", "surrogatepass"), self._token
         )
 
     def set_cookie(self) -> str:
-        """Return the header that lets a browser in, hidden from scripts and other sites."""
+        """Return the ``Set-Cookie`` value that logs a browser in, hidden from scripts and sites."""
         return (
             f"{self.cookie}={self._session.decode()}; HttpOnly; SameSite=Strict; Path=/; "
             f"Max-Age={COOKIE_S}"
@@ -144,7 +144,7 @@ class Guard:
 
 
 def urlsplit_netloc(origin: str) -> str:
-    """Return HOST:PORT of an ``Origin`` header, or an empty text for no web site."""
+    """Return HOST:PORT of an ``Origin`` header, or an empty string if it is no website."""
     try:
         parts = urlsplit(origin)
     except ValueError:
@@ -153,7 +153,7 @@ def urlsplit_netloc(origin: str) -> str:
 
 
 class PageClient:
-    """The lines that wait for one browser; excess lines are dropped, oldest first."""
+    """A bounded queue of lines for one browser, which drops the oldest when full."""
 
     def __init__(self, source: str) -> None:
         self.source = source
@@ -166,28 +166,28 @@ class PageClient:
         return self._lines.dropped["items"]
 
     def put(self, line: bytes) -> None:
-        """Add a line."""
+        """Append a line to the queue."""
         self._lines.put(line)
         self._some.set()
 
     async def take(self) -> bytes:
-        """Wait for lines; return all that wait."""
+        """Wait for lines; remove and return all queued lines, joined."""
         await self._some.wait()
         self._some.clear()
         return b"".join(self._lines.take(0))
 
 
 class PageRoutes:
-    """The answers to requests, all in the thread of the page's server.
+    """The request handler of the page; runs in the thread of the page's server.
 
     Args:
         greet: Returns the first lines for a new client.
-        control: Called with an action and the client's address; returns whether there is a
-            recorder. None: the page may only look.
+        control: Called with an action and the client's address; returns whether a recorder exists.
+            With None, the page may not control it.
 
     Attributes:
         clients: The browsers that stream now.
-        dropped: The number of lines that earlier browsers were too slow for.
+        dropped: The number of lines dropped for browsers that have left.
     """
 
     def __init__(
@@ -206,14 +206,14 @@ class PageRoutes:
         }
 
     def deliver(self, lines: list[Line]) -> None:
-        """Queue lines for the clients that they concern."""
+        """Queue each line for the clients that watch its source, or for all clients."""
         for client in self.clients:
             for source, line in lines:
                 if not source or source == client.source:
                     client.put(line)
 
     async def answer(self, request: Request) -> Response:
-        """Answer a request."""
+        """Return the answer to a request, or raise `Refused`."""
         path = request.path
         self._guard.check(request.headers, request.method)
         if path in self._files:
@@ -230,7 +230,7 @@ class PageRoutes:
         if path == "/live":
             only(request, "GET")
             source = parse_qs(request.query[:1024]).get("source", [""])[0]
-            return Response(200, self._live(source), "application/x-ndjson")
+            return Response(200, self._stream_lines(source), "application/x-ndjson")
         only(request, "POST")
         if self._control is None:
             raise Refused(403, "this page may only look: set control = true in [page]")
@@ -252,7 +252,7 @@ class PageRoutes:
             raise Refused(401, "the token is wrong")
         return Response(204, headers={"set-cookie": self._guard.set_cookie()})
 
-    async def _live(self, source: str) -> AsyncGenerator[bytes, None]:
+    async def _stream_lines(self, source: str) -> AsyncGenerator[bytes, None]:
         if len(self.clients) >= MAX_STREAMS:
             raise Refused(503, f"{MAX_STREAMS} browsers are looking already")
         client = PageClient(source)
@@ -267,7 +267,7 @@ class PageRoutes:
 
 
 async def json_body(request: Request, kind: Any) -> Any:
-    """Decode the body of a request as a msgspec type; refuse anything else."""
+    """Decode the JSON body of a request as a msgspec type, or raise `Refused`."""
     # A form of another site needs a CORS preflight to send this type, which is never granted.
     sent = request.headers.get("content-type", "").partition(";")[0]
     if sent.strip().lower() != "application/json":
@@ -280,6 +280,6 @@ async def json_body(request: Request, kind: Any) -> Any:
 
 
 def only(request: Request, method: str) -> None:
-    """Refuse a request of another method."""
+    """Raise `Refused` unless a request has the given HTTP method."""
     if request.method != method:
         raise Refused(405, f"only {method}", {"allow": method})

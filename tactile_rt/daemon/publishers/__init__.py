@@ -29,10 +29,10 @@ PUBLISHERS = {
 
 
 def publisher_class(kind: str) -> Any:
-    """Return the class of a kind of publisher.
+    """Return the class of a kind of publisher, built in or from another package.
 
     Raises:
-        ConfigError: no such kind, it cannot be loaded, or an extra is not installed.
+        ConfigError: The kind is unknown, cannot be loaded, or needs an extra to be installed.
     """
     if kind in PUBLISHERS:
         where, extra = PUBLISHERS[kind]
@@ -45,7 +45,7 @@ def publisher_class(kind: str) -> Any:
 
 
 def load_class(where: str, what: str, extra: str) -> Any:
-    """Return the class at ``module:Class``, which needs an extra to be installed."""
+    """Import and return the class at ``module:Class``; an error names the missing extra."""
     module, _, name = where.partition(":")
     try:
         return getattr(import_module(module), name)
@@ -62,11 +62,11 @@ TABLES = ("log", "recorder", "page", "metrics")  # each a class of its own modul
 
 @dataclass(frozen=True)
 class Wanted:
-    """A consumer that a configuration asks for.
+    """A consumer that a configuration requires, not yet created.
 
     Attributes:
         name: The name of the part that runs the consumer, e.g. ``publisher.zmq``.
-        key: Equal for two consumers with the same configuration: the running one need not restart.
+        key: Equal for consumers with the same configuration, so that a running one goes on.
         make: Creates the consumer; may raise `ConfigError`.
         options: The table of the configuration; for a publisher, that of its ``options``.
     """
@@ -82,7 +82,7 @@ def wanted_consumers(loaded: Loaded) -> list[Wanted]:
     """List the consumers of a configuration, without creating them.
 
     Raises:
-        ConfigError: no such kind of publisher, or a wrong option.
+        ConfigError: A kind of publisher is unknown, or an option is wrong.
     """
     config, limits = loaded.config, loaded.config.limits
     wanted = [_resolve(loaded, i, publisher) for i, publisher in enumerate(config.publisher)]

@@ -58,8 +58,8 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes:
         host: The address to listen on. Foxglove's protocol has no password.
         port: The TCP port to listen on; 0: a free one.
-        rate_hz: The largest number of pictures and values a second, Hz.
-        m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen by the largest force.
+        rate_hz: The highest rate of ``scene`` and ``values`` messages, Hz.
+        m_per_n: The length of the arrow of a force of 1 N, m; 0 adapts it to the largest force.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"
@@ -182,7 +182,7 @@ class FoxglovePublisher(Consumer):
         self._messages += 1
 
     def _add_source(self, item: Opened) -> None:
-        base = self._base_topic(item.source)
+        base = self._make_base_topic(item.source)
         self._scenes[item.source] = Scene(item.source, item.spec, self._options.m_per_n)
         if f"{base}/scene" not in self._channels:
             self._channels[f"{base}/scene"] = SceneUpdateChannel(
@@ -196,7 +196,7 @@ class FoxglovePublisher(Consumer):
 
     def _remove_source(self, item: Closed) -> None:
         scene = self._scenes.pop(item.source, None)
-        channel = self._channels.get(f"{self._base_topic(item.source)}/scene")
+        channel = self._channels.get(f"{self._make_base_topic(item.source)}/scene")
         if scene is not None and channel is not None:
             utc_ns = item.t_ns + self._view.utc_offset_ns()
             channel.log(scene.gone(utc_ns), log_time=utc_ns)
@@ -206,7 +206,7 @@ class FoxglovePublisher(Consumer):
         if scene is None or now < self._due.get(item.source, 0.0):
             return
         self._due[item.source] = now + 0.9 / self._options.rate_hz
-        base, chunk = self._base_topic(item.source), item.chunk
+        base, chunk = self._make_base_topic(item.source), item.chunk
         values, valid = chunk.values[-1], chunk.valid[-1]
         t_ns = int(chunk.t_ns[-1])
         utc_ns = t_ns + item.utc_offset_ns
@@ -229,12 +229,12 @@ class FoxglovePublisher(Consumer):
             self._publish(message)
         utc_ns = messages[-1].utc_ns
         for source, scene in self._scenes.items():
-            channel = self._channels[f"{self._base_topic(source)}/scene"]
+            channel = self._channels[f"{self._make_base_topic(source)}/scene"]
             if channel.has_sinks():
                 channel.log(scene.bases(utc_ns), log_time=utc_ns)
                 self._messages += 1
 
-    def _base_topic(self, source: str) -> str:
+    def _make_base_topic(self, source: str) -> str:
         return f"/{self._options.prefix}/{quote(source, safe='')}"
 
     def _add_channel(self, topic: str, schema: dict[str, Any]) -> Channel:
@@ -244,8 +244,8 @@ class FoxglovePublisher(Consumer):
 
 
 def schema_of(message: Message) -> dict[str, Any]:
-    """Return a message's JSON schema for Foxglove, which takes no references. That of a decision
-    has its labels, so that each probability can be chosen for a plot."""
+    """Return a message's JSON schema without references, as Foxglove needs it. The schema of a
+    decision lists its labels, so that each probability can be chosen for a plot."""
     schema = _infer_schema(msgspec.to_builtins(message))
     return {"title": f"tactile.{type(message).topic}", **schema}
 
@@ -260,7 +260,7 @@ def _infer_schema(value: Any) -> dict[str, Any]:
 
 
 def _group_values(spec: ArraySpec, values: list[list[float]], valid: list[bool]) -> dict[str, Any]:
-    """Return {channel: {element: value}}, with None where a value is not trustworthy."""
+    """Return a sample as {channel: {element: value}}, with None for invalid elements."""
     return {
         channel: {
             element: row[c] if ok else None

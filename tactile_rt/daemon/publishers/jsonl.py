@@ -18,7 +18,7 @@ class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         file: The file that lines are appended to; empty: standard output.
-        state_s: The time between two ``state`` messages, s; 0: no such messages.
+        state_s: The time between two ``state`` messages, s; 0 sends none.
     """
 
     file: str = ""

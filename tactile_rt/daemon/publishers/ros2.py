@@ -1,7 +1,7 @@
 """Messages for ROS 2 nodes: over DDS, with the names of topics and types that ROS 2 uses.
 
-No ROS is needed here. A node needs the definitions, which `tactile-rt config ros2-messages` writes
-as a package. Messages for a node that cannot keep up are dropped, so it delays nothing.
+The daemon needs no ROS. A node needs the message definitions, a package that `tactile-rt config
+ros2-messages` writes. Messages for a node that cannot keep up are dropped, so it delays nothing.
 """
 
 import os
@@ -86,7 +86,7 @@ class Ros2Options(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Ros2Publisher(Publisher):
-    """A publisher that writes each message at once to the topic of its name."""
+    """A DDS publisher that writes each message to its topic without gathering."""
 
     Options = Ros2Options
 
@@ -195,7 +195,7 @@ class Ros2Publisher(Publisher):
         self._bytes += len(data)
 
     def _find_writer(self, name: str, message: str, keep: bool = False) -> "DataWriter[Any]":
-        """Return a topic's writer; `keep`: nodes that come later also get the newest message."""
+        """Return a topic's writer; with `keep`, nodes that come later get the newest message."""
         if name in self._writers:
             return self._writers[name]
         assert self._participant is not None
@@ -223,8 +223,8 @@ class Ros2Publisher(Publisher):
 
 
 def _keep_to_loopback(domain: int) -> bool:
-    """Restrict the sockets of DDS to loopback; return whether the system allows that. DDS itself
-    listens at any address."""
+    """Restrict the sockets of DDS to loopback; return whether the system allows that. By itself,
+    DDS listens at all addresses."""
     first = FIRST_PORT + PORTS * domain
     for name in os.listdir("/proc/self/fd"):
         try:
@@ -252,7 +252,7 @@ def _wrap(kind: Any, data: bytes) -> Any:
 
 @cache
 def _make_type(message: str) -> Any:
-    """Make the DDS type of a message."""
+    """Return the DDS type of a named ROS 2 message definition."""
     fields: dict[str, Any] = {}
     sequence: Any = types.sequence
     for name, kind, many in fields_of(message):

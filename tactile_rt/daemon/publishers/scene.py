@@ -35,11 +35,11 @@ FORCE = Color(r=0.95, g=0.5, b=0.1, a=1.0)
 
 
 class Scene:
-    """The pictures of one array.
+    """Builder of the 3-D scene updates of one array, in its mount frame.
 
     Args:
-        m_per_n: length of the arrow of 1 N, m; 0: so that the largest force of the last half
-            minute is as long as a third of the array.
+        m_per_n: Length of the arrow of 1 N, m; 0 scales the largest force of the last half minute
+            to a third of the array's extent.
     """
 
     def __init__(self, source: str, spec: ArraySpec, m_per_n: float) -> None:
@@ -53,12 +53,12 @@ class Scene:
         self._spacing = self._extent / max(1.0, len(self._at) ** 0.5)
 
     def bases(self, utc_ns: int) -> SceneUpdate:
-        """Draw the positions of the elements and their directions, the own x axes."""
+        """Draw the elements' positions as spheres and their own x axes as lines."""
         ends = self._at + 0.5 * self._spacing * self._turns[:, :, 0]
         size = 0.15 * self._spacing
         spheres = [
             SpherePrimitive(
-                pose=Pose(position=_vector(at), orientation=Quaternion(w=1.0)),
+                pose=Pose(position=_make_vector(at), orientation=Quaternion(w=1.0)),
                 size=Vector3(x=size, y=size, z=size), color=BASE,
             )
             for at in self._at.tolist()
@@ -69,7 +69,7 @@ class Scene:
             points=[Point3(x=x, y=y, z=z) for x, y, z in points],
         )  # fmt: skip
         entity = SceneEntity(
-            timestamp=_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/array",
+            timestamp=_make_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/array",
             lifetime=NEVER, spheres=spheres, lines=[lines],
             metadata=[KeyValuePair(key="array", value=self._spec.name)],
         )  # fmt: skip
@@ -78,11 +78,11 @@ class Scene:
     def forces(
         self, values: NDArray[np.float32], valid: NDArray[np.bool_], utc_ns: int
     ) -> SceneUpdate | None:
-        """Draw an arrow per element with a trustworthy value; None without force channels.
+        """Draw the force of each valid element as an arrow; return None without force channels.
 
         Args:
-            values: (element, channel), forces in each element's own frame, N.
-            valid: (element,).
+            values: (element, channel) One sample, with forces in each element's own frame, N.
+            valid: (element,) Whether the values of the element are trustworthy.
         """
         if not self._columns:
             return None
@@ -95,17 +95,17 @@ class Scene:
         self._largest = max(FORGET * self._largest, float(size.max()))
         scale = self._m_per_n or (self._extent / 3 / self._largest if self._largest > 0 else 0.0)
         entity = SceneEntity(
-            timestamp=_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/forces",
+            timestamp=_make_time(utc_ns), frame_id=self._spec.frame, id=f"{self._source}/forces",
             lifetime=Duration(sec=LIFETIME_S), arrows=list(self._draw_arrows(force, size, scale)),
             metadata=[KeyValuePair(key="m_per_N", value=f"{scale:.6g}")],
         )  # fmt: skip
         return SceneUpdate(entities=[entity])
 
     def gone(self, utc_ns: int) -> SceneUpdate:
-        """Remove the array and its forces from the scene."""
+        """Return the update that removes the array and its forces from the scene."""
         return SceneUpdate(
             deletions=[
-                SceneEntityDeletion(timestamp=_time(utc_ns), id=f"{self._source}/{what}")
+                SceneEntityDeletion(timestamp=_make_time(utc_ns), id=f"{self._source}/{what}")
                 for what in ("array", "forces")
             ]
         )
@@ -120,7 +120,7 @@ class Scene:
             length = scale * float(size[i])
             yield ArrowPrimitive(
                 pose=Pose(
-                    position=_vector(self._at[i].tolist()),
+                    position=_make_vector(self._at[i].tolist()),
                     orientation=Quaternion(x=x, y=y, z=z, w=w),
                 ),
                 shaft_length=0.75 * length, shaft_diameter=thick,
@@ -129,7 +129,7 @@ class Scene:
 
 
 def force_columns(spec: ArraySpec) -> dict[int, int]:
-    """Return the channels of an array's forces in N, by axis (0: x)."""
+    """Return the channel number of each force in N, by its axis (0 is x)."""
     return {
         axis: spec.channels.index(name)
         for axis, name in enumerate(FORCES)
@@ -138,7 +138,7 @@ def force_columns(spec: ArraySpec) -> dict[int, int]:
 
 
 def turn_x_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute unit quaternions (n, 4), w first, from x to unit vectors (n, 3)."""
+    """Return unit quaternions (n, 4), w first, that rotate x to unit vectors (n, 3)."""
     x, y, z = directions.T
     # Half-way between the axis and the direction; for opposite ones, any half turn will do.
     found = np.stack([1 + x, np.zeros_like(x), -z, y], axis=1)
@@ -147,9 +147,9 @@ def turn_x_to(directions: NDArray[np.float64]) -> NDArray[np.float64]:
     return unit
 
 
-def _vector(at: list[float]) -> Vector3:
+def _make_vector(at: list[float]) -> Vector3:
     return Vector3(x=at[0], y=at[1], z=at[2])
 
 
-def _time(utc_ns: int) -> Timestamp:
+def _make_time(utc_ns: int) -> Timestamp:
     return Timestamp(sec=utc_ns // 10**9, nsec=utc_ns % 10**9)

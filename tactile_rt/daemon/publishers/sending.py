@@ -37,7 +37,7 @@ Key = tuple[int, int]  # descriptor and inode, which identify a socket as long a
 
 
 class ConnectionLimit:
-    """A limit of connections: excess ones are shut down until the limit is closed.
+    """A thread that shuts down a server's connections beyond a limit, until it is closed.
 
     Args:
         addresses: The TCP ports and the paths of Unix sockets where a server listens.
@@ -60,7 +60,7 @@ class ConnectionLimit:
 
     @property
     def connections(self) -> int:
-        """Number of connections at the last look."""
+        """Number of connections when the thread last looked."""
         return len(self._kept)
 
     @property
@@ -69,7 +69,7 @@ class ConnectionLimit:
         return len(self._kept) >= self._most
 
     def close(self, stop: Callable[[], object] | None = None) -> None:
-        """Stop limiting connections.
+        """Stop limiting connections, and end the thread.
 
         Args:
             stop: Stops the server before that. Connected peers have `BYE_S` to say goodbye and are
@@ -140,7 +140,7 @@ class ConnectionLimit:
         return dropped
 
     def _is_ours(self, connection: socket.socket) -> bool:
-        """Return whether a socket is connected to one of the addresses, without listening."""
+        """Return whether a socket is a connection at one of the addresses, not the listener."""
         if connection.type != socket.SOCK_STREAM or connection.getsockopt(
             socket.SOL_SOCKET, socket.SO_ACCEPTCONN
         ):
@@ -152,7 +152,7 @@ class ConnectionLimit:
 
 
 def _trim_memory() -> None:
-    """Return memory of closed connections to the system, which the C library would keep."""
+    """Return freed memory to the system, which the C library would otherwise keep."""
     with suppress(AttributeError, OSError):  # musl has no such call, and keeps less
         ctypes.CDLL(None).malloc_trim(0)
 
@@ -176,11 +176,11 @@ StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
 
 
 class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options that all of these publishers have.
+    """Options that all network publishers have.
 
     Attributes:
         state_s: The time after which ``state`` and all ``array`` messages are repeated, for peers
-            that come late, s; 0: never.
+            that come late, s; 0 means never.
     """
 
     prefix: Prefix = "tactile"
@@ -195,7 +195,7 @@ class ListenerOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw
 
 
 class Due:
-    """A timer for an action that is due every so many seconds; 0: never."""
+    """A timer of an action that is due regularly; a period of 0 means never."""
 
     def __init__(self, every_s: float) -> None:
         self._every_s, self._due_at = every_s, 0.0
@@ -210,13 +210,13 @@ class Due:
 
 
 def repeat_messages(view: View) -> list[Message]:
-    """Make the messages that are sent repeatedly: the open arrays, and the state."""
+    """Return the messages to repeat: the array of each open source, and the state."""
     arrays = [m for m in map(message_of, view.streams().values()) if m is not None]
     return [*arrays, state_message(view.snapshot())]
 
 
 class Publisher(Consumer):
-    """The base of publishers of messages: samples only on request, the state regularly."""
+    """The base class of message publishers, with optional samples and a timer for the state."""
 
     def __init__(self, name: str, samples: bool, state_s: float) -> None:
         self.name = name
@@ -227,7 +227,7 @@ class Publisher(Consumer):
 
 
 class Sender(Publisher):
-    """A publisher that hands each message to `_send`, and repeats the state."""
+    """The base class of publishers that pass each message to `_send` and repeat the state."""
 
     def __init__(self, name: str, options: SenderOptions) -> None:
         super().__init__(name, options.samples, options.state_s)
@@ -251,7 +251,7 @@ class Sender(Publisher):
 
     @abc.abstractmethod
     def _connect(self, view: View) -> None:
-        """Connect or listen; may raise."""
+        """Connect to peers, or listen for them; may raise an error."""
 
     @abc.abstractmethod
     def _send(self, message: Message) -> int:
@@ -264,7 +264,7 @@ def is_port(text: str) -> bool:
 
 
 def tell_exposed(view: View, name: str, host: str) -> None:
-    """Warn if others than this computer's own programs can read the messages."""
+    """Report a warning if programs on other computers can read the messages."""
     if not is_loopback(host):
         view.report(
             f"publisher.{name}", "exposed",

@@ -45,7 +45,7 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
             protocol, slash, address = endpoint.partition("/")
             if not (protocol.isalnum() and slash and address):
                 raise ValueError(f"an endpoint is like tcp/127.0.0.1:7447, not {endpoint}")
-            port = _port_text(address)
+            port = _split_port(address)
             if protocol in ON_PORTS and port != "0" and not is_port(port):
                 raise ValueError(f"{endpoint}: a port is a number from 0 to 65535, not {port}")
         if not (self.listen or self.connect or self.scouting or self.config_file):
@@ -53,7 +53,7 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ZenohPublisher(Sender):
-    """A Zenoh peer that puts messages; it listens only at the endpoints of `listen`."""
+    """A Zenoh peer that publishes messages; it listens only at the endpoints of `listen`."""
 
     Options = ZenohOptions
 
@@ -131,14 +131,14 @@ class ZenohPublisher(Sender):
         return config
 
 
-def _port_text(address: str) -> str:
+def _split_port(address: str) -> str:
     return re.split("[?#]", address)[0].rpartition(":")[2]
 
 
 def _find_port(endpoint: str) -> int:
-    """Return an endpoint's TCP port; 0: none, or a free port that stays unknown."""
+    """Return an endpoint's TCP port, or 0 without TCP or a fixed port."""
     protocol, _, address = endpoint.partition("/")
-    return int(_port_text(address)) if protocol in ("tcp", "tls", "ws") else 0
+    return int(_split_port(address)) if protocol in ("tcp", "tls", "ws") else 0
 
 
 def _shorten(error: BaseException) -> str:

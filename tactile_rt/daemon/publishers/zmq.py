@@ -48,7 +48,7 @@ class ZmqOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ZmqPublisher(Sender):
-    """A PUB socket; a message's first frame is its topic, by which subscribers filter."""
+    """A publisher on a PUB socket; subscribers filter by a message's first frame, its topic."""
 
     Options = ZmqOptions
 
