@@ -40,7 +40,7 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A symmetry of an array: a permutation of its elements and a matrix for each one's loads.
+    """A symmetry of an array: a permutation of elements and matrices for their loads.
 
     Attributes:
         source: (element,) The index of the element whose loads each element receives.
@@ -137,7 +137,7 @@ def _symmetry(spec: ArraySpec, source: NDArray[np.int64], image: NDArray[np.floa
 
 
 def _find_vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
-    """Return the channel indices (x, y, z) of the force "f" and the moment "m", if present."""
+    """Return the channel indices (x, y, z) of the vectors "f" and "m", if present."""
     found = {}
     for vector, unit in VECTORS.items():
         names = [vector + axis for axis in AXES]
@@ -156,7 +156,7 @@ def _find_vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
 
 
 def _smallest_rotation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation matrix of least angle from unit vector a to unit vector b (Rodrigues)."""
+    """Return the smallest rotation that takes unit vector a to unit vector b (Rodrigues)."""
     v, c = np.cross(a, b), float(a @ b)
     if c < -1 + 1e-9:  # opposite: half a turn about any normal axis, the same for b to a
         across = np.cross(a, np.eye(3)[np.abs(a).argmin()])
@@ -182,7 +182,7 @@ def _as_is(x: T, _: Generator) -> T:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Random augmentations of a batch: of its loads, of its frames, and a mask of steps.
+    """Random augmentations of a batch: of loads, of frames, and by masked steps.
 
     Attributes:
         loads: Function of (samples, offset, sigma) in SI units and a CPU generator; returns the

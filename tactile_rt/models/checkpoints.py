@@ -74,7 +74,7 @@ def no_checkpoint(path: Path, error: Exception) -> ModelError:
 
 
 def reason(error: Exception) -> str:
-    """Return the first line of an error's message, or its type if it has no message."""
+    """Return the first line of an error's message, or the error's type without one."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -114,7 +114,7 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
 def trained_on(
     checkpoint: Path, saved: Mapping[str, Any], data: Sequence[Path] = ()
 ) -> list[tuple[Path, SweepManifest]]:
-    """Read the manifests of the sweep sets that a checkpoint was trained on, with their folders.
+    """Return folders and manifests of the sweep sets that a checkpoint was trained on.
 
     Args:
         data: folders of the sets; default: those in the checkpoint's configuration.
@@ -151,7 +151,7 @@ def trained_on(
 def probed_on(
     checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
 ) -> tuple[Path, SweepManifest]:
-    """Return the folder and manifest of the sweep set to probe a checkpoint on, after checks.
+    """Return folder and manifest of the sweep set to probe a checkpoint on.
 
     Args:
         folder: the folder to write the probe into.

@@ -29,7 +29,7 @@ NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which traini
 
 @dataclass(frozen=True)
 class SweepSet:
-    """The sweeps of one split of a sweep set, with all that is needed to cut windows.
+    """The sweeps of one split of a set, with the settings for cutting windows.
 
     Attributes:
         noise: (channel,) The rated noise per sample, SI.
@@ -197,7 +197,7 @@ def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, Swee
 
 
 def join_sets(sets: Sequence[SweepSet]) -> SweepSet:
-    """Join sets of one array into a set with all their categories and the first set's faults.
+    """Join sets of one array, with all their categories and the first set's faults.
 
     Shorter sweeps are padded: with their rest before the touch, with their last sample after it.
     """
@@ -221,7 +221,7 @@ def join_sets(sets: Sequence[SweepSet]) -> SweepSet:
 
 
 def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
-    """Pad sweeps to `lead` samples before the touch and `after` from then on; return the values."""
+    """Return the sweeps' values padded to `lead` samples before the touch and `after` from then."""
     own, samples = data.manifest.lead, data.sweeps.values.shape[1]
     if (own, samples) == (lead, lead + after):
         return data.sweeps.values
@@ -264,7 +264,7 @@ def relabel_set(data: SweepSet, categories: Sequence[str]) -> SweepSet:
 
 
 def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
-    """Check that sweeps are finite and no shorter than a window, and no object is in two splits.
+    """Check that sweeps are finite and long enough, and no object is in two splits.
 
     Raises:
         RecordingError: a check fails; the message names the object or the length.

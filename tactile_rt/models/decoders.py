@@ -74,7 +74,7 @@ class MLPDecoder(nn.Sequential):
 
 
 class MLPAllDecoder(nn.Module):
-    """Decoder of all steps of an episode by an MLP, (steps * feature)-1024-512-class at width 1.
+    """Decoder of all steps so far by an MLP, (steps * feature)-1024-512-class at width 1.
 
     At step t the features of later steps count as zero. So the last step's logits are the
     paper's, and the first layer is a running sum with one matrix product for each step.

@@ -85,7 +85,7 @@ class TactileClassifier(nn.Module):
 
 
 class InputStage(nn.Module):
-    """Input layer that maps samples in SI units (N, N m) to frames on the array's grid.
+    """Input layer that maps samples in SI units to frames on the array's grid.
 
     Args:
         positions: grid (row, column) of each element, in the order of the samples.
@@ -243,10 +243,7 @@ class EAD(nn.Module):
         return out
 
     def answer(self, frames: Tensor) -> Tensor:
-        """Map frames to all outputs of the last layer (batch, step, output).
-
-        With the readout "mean" they are running means over the steps.
-        """
+        """Map frames to all outputs (batch, step, output); running means with readout "mean"."""
         logits: Tensor = self.decoder(self.features(frames))
         if self.config.readout == "last":
             return logits

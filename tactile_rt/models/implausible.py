@@ -20,7 +20,7 @@ FEWEST = 4  # smallest array in which half of the elements can be missing
 
 
 def _swap_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Swap two random axes (x, y, z) in each sweep, of the force, the moment or both."""
+    """Swap two random axes in each sweep, of the force, the moment or both."""
     vectors = _find_vectors(spec)
     out = samples.copy()
     for k in range(len(out)):
@@ -31,7 +31,7 @@ def _swap_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> S
 
 
 def _invert_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Invert random axes (x, y, z) in each sweep, of the force, the moment or both."""
+    """Invert random axes in each sweep, of the force, the moment or both."""
     vectors = _find_vectors(spec) or [tuple(range(len(spec.channels)))]
     out = samples.copy()
     for k in range(len(out)):
@@ -51,7 +51,7 @@ def _scale_loads(samples: Samples, spec: ArraySpec, rng: np.random.Generator) ->
 
 
 def _silence_half(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Set about half of the elements to zero in each sweep: at random, or on one side."""
+    """Set about half of each sweep's elements to zero, at random or on one side."""
     elements = len(spec.elements)
     grid = np.array(spec.grid, dtype=np.float64)
     alive = np.ones((len(samples), elements))
@@ -80,7 +80,7 @@ def implausible(spec: ArraySpec) -> tuple[str, ...]:
 
 
 def _find_vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
-    """Return channel indices (x, y, z) of each vector that the channels form, such as fx fy fz."""
+    """Return channel indices (x, y, z) of each vector among the channels, such as force."""
     names = list(spec.channels)
     stems = dict.fromkeys(name[:-1] for name in names if name[-1] in AXES)
     whole = [stem for stem in stems if all(stem + axis in names for axis in AXES)]

@@ -90,7 +90,7 @@ def _detect(
 
 
 class _Baseline:
-    """Running baselines of all sweeps, and a queue of recent samples to be added to each."""
+    """Running baselines of all sweeps, each with a queue of samples to add."""
 
     def __init__(self, values: NDArray[np.float32], floor: NDArray[np.float32]) -> None:
         n, samples, *rest = values.shape

@@ -121,7 +121,7 @@ def grey(x: Tensor) -> Tensor:
 
 
 def with_hue(x: Tensor, by: float) -> Tensor:
-    """Rotate the hue of pictures (..., colour, row, column) by a fraction of the colour circle."""
+    """Shift the hue of pictures (..., colour, row, column) by a fraction of its circle."""
     red, green, _ = x.unbind(-3)
     value, least = x.amax(-3), x.amin(-3)
     span, none = value - least, value == least
@@ -142,7 +142,7 @@ def with_hue(x: Tensor, by: float) -> Tensor:
 
 
 def blur_pictures(x: Tensor, sigma: float) -> Tensor:
-    """Blur pictures (..., row, column) by a 3 x 3 Gaussian of width `sigma`, mirrored at edges."""
+    """Blur pictures (..., row, column) by a 3 x 3 Gaussian; mirror cells at edges."""
     at = torch.arange(-1.0, 2.0)
     kernel = torch.exp(-0.5 * (at / sigma) ** 2).to(x)
     kernel = kernel / kernel.sum()

@@ -113,7 +113,7 @@ class SweepManifest:
         return {c: tuple(sorted(found[c])) for c in self.categories if c in found}
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
-        """List the object names of the given splits, or of all splits if none is given.
+        """List the object names of the given splits; without splits, of all.
 
         Raises:
             ConfigError: the set has no such split.
@@ -135,7 +135,7 @@ class SweepManifest:
         return category
 
     def label(self, name: str) -> int:
-        """Return the label of an object: the index of its category, -1 if not in `categories`."""
+        """Return an object's label: the index of its category, -1 if not in `categories`."""
         category = self.category(name)
         return self.categories.index(category) if category in self.categories else -1
 

@@ -231,7 +231,7 @@ def _damage_error(path: Path, error: Exception) -> RecordingError:
 
 
 def read_skipped(folder: Path) -> dict[str, str]:
-    """Read the set's list of objects that could not be made: cause by name, empty without a list.
+    """Read the list of objects that could not be made: cause by name, or empty.
 
     Raises:
         RecordingError: the list is damaged.
@@ -246,6 +246,6 @@ def read_skipped(folder: Path) -> dict[str, str]:
 
 
 def write_skipped(folder: Path, skipped: dict[str, str]) -> None:
-    """Write the set's list of objects that could not be made: cause by name."""
+    """Write the list of objects that could not be made: cause by name."""
     text = msgspec.json.format(msgspec.json.encode(dict(sorted(skipped.items()))), indent=1)
     write_whole(folder / SKIPPED, lambda file: file.write(text))

@@ -36,7 +36,7 @@ def check_labelled(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """Check that splits share no object and that every object of a labelled split has a label."""
+    """Check that splits share no object and objects to train or test on have labels."""
     side: dict[str, str] = {}
     for split, names in manifest.split.items():
         for name in names:
@@ -67,7 +67,7 @@ def trained_objects(
 
 
 def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
-    """Join manifests of sets of one array: the first, with the categories and objects of all.
+    """Join manifests of one array: return the first, with categories and objects of all.
 
     Raises:
         ConfigError: the sets differ in array, sensor or sample period.
