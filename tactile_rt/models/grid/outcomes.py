@@ -105,7 +105,7 @@ def outcome_path(folder: Path, task: Task) -> Path:
 def write_tested(
     folder: Path, objects: NDArray[np.str_], classes: int, known: NDArray[np.str_] | None = None
 ) -> None:
-    """Write a grid's test objects (sweep,), training objects of new sweeps (sweep,), and classes."""
+    """Write a grid's test objects (sweep,), objects of new sweeps, and number of classes."""
     new, old = (
         tuple((name, len(list(same))) for name, same in groupby(names.tolist()))
         for names in (objects, objects[:0] if known is None else known)

@@ -112,7 +112,7 @@ def prepare(grid: Grid, folder: Path) -> None:
 
 
 def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
-    """Copy the first sweeps of each object of a set into a new set; keep existing files."""
+    """Copy the first sweeps of each object into a new set; keep existing files."""
     manifest = SweepManifest.read(source)
     taken = {split: getattr(sweeps, split) for split in SPLITS}
     recipe = {key: value for key, value in manifest.recipe.items() if key != "contacts"}
