@@ -289,7 +289,7 @@ class _GatheredRows(torch.autograd.Function):
 
 
 class SimSiam(Objective):
-    """SimSiam objective: a three-layer projector, a predictor with a bottleneck, a stopped gradient."""
+    """SimSiam objective: a projector, a predictor with a bottleneck, and a stopped gradient."""
 
     views = 2
 
