@@ -99,7 +99,7 @@ def traces_of(layers: Layers) -> Traces:
 
 
 def traces_of_stimuli(stimuli: StimuliInput) -> Traces:
-    """Convert loads, averaged over each step's samples, to a layer "raw"; SI."""
+    """Return the loads, averaged over each step's samples, SI, as a layer "raw"."""
     steps = stimuli.samples.astype(np.float64).mean(axis=2)
     return {"raw": steps.reshape(*steps.shape[:2], -1)}
 
@@ -189,7 +189,7 @@ def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
 
 
 def _convert_to_layer(animal: Animal) -> Floats:
-    """Return an animal's mean responses (stimulus, bin, unit), constant without time courses."""
+    """Return an animal's mean responses (stimulus, bin, unit) as a layer for other animals."""
     sessions = sessions_of(animal)
     means = means_of(sessions, bins_of(sessions))
     return np.repeat(means, LONGEST, axis=1) if means.shape[1] == 1 else means

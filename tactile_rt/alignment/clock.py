@@ -39,7 +39,7 @@ ELSEWHERE_Z, CLEARLY = 7.0, 1.5  # least z of another clock, also as a multiple 
 
 @dataclass(frozen=True, eq=False)
 class ContactResponse:
-    """The change of rates with contact, in one session or several."""
+    """The change of firing rates with contact, measured in one session or several."""
 
     session: str
     shift_s: float  # shift that was subtracted from the stored spike times, in s
@@ -54,7 +54,7 @@ class ContactResponse:
 
     @property
     def z(self) -> float:
-        """Rise in units of its spread by chance; 0 if there is no spread."""
+        """Rise divided by its standard deviation by chance; 0 if that is 0."""
         return self.rise / self.spread if self.spread > 0 else 0.0
 
     @property

@@ -35,7 +35,7 @@ MODELS = {"another-mouse": 0.0, "lost-25": 0.25, "lost-50": 0.5, "random": 1.0}
 
 @dataclass(frozen=True)
 class Brain:
-    """Parameters of the synthetic brain: numbers of mice, sessions, units, trials; statistics."""
+    """Parameters of the synthetic brain: its size, and the statistics of its responses."""
 
     mice: int = 11
     sessions: int = 2  # of each mouse; each session has other units
@@ -66,7 +66,7 @@ class Brain:
         )
 
     def features(self, rng: np.random.Generator, shared: Floats, lost: float = 0.0) -> Floats:
-        """Draw features (6, feature) of a mouse without a share `lost` of the shared variance."""
+        """Draw a mouse's features (6, feature), with a share `lost` of shared variance replaced."""
         kept = (1 - self.private) * (1 - lost)
         own = _standardise(rng.normal(size=shared.shape))
         return np.asarray(np.sqrt(kept) * shared + np.sqrt(1 - kept) * own)
@@ -106,7 +106,7 @@ class Brain:
 def example_models(
     brain: Brain, rng: np.random.Generator, shared: Floats
 ) -> Mapping[str, dict[str, Floats]]:
-    """Draw the models in `MODELS`, whose lost share of variance is known; responses by layer."""
+    """Draw the example models in `MODELS`: responses (6, unit) by model and layer."""
     return {
         name: brain.model(rng, brain.features(rng, shared, lost)) for name, lost in MODELS.items()
     }

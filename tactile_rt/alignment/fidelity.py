@@ -72,7 +72,7 @@ def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[La
 
 
 def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layers:
-    """Run an ONNX file on the stimuli; return its layers, with the reference's first steps."""
+    """Run an ONNX file on the stimuli; return its layers for comparison with a reference."""
     from tactile_rt.alignment.onnx_activations import onnx_layers
 
     exported, _ = onnx_layers(path, stimuli)

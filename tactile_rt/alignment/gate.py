@@ -237,7 +237,7 @@ class Check:
 
 
 def exit_code(checks: Sequence[Check]) -> int:
-    """Return the exit code of several tests: fail, else inconclusive, if any test is so."""
+    """Combine tests' exit codes: fail if any fails, else inconclusive if any is."""
     codes = {check.code for check in checks}
     return FAIL if FAIL in codes else INCONCLUSIVE if INCONCLUSIVE in codes else PASS
 

@@ -165,7 +165,7 @@ def _find_reader(
 
 
 def _follow_activation(tensor: str, readers: dict[str, list[onnx.NodeProto]]) -> str:
-    """Return the ReLU's output after a tensor and a few sums; else the tensor."""
+    """Return the output of the ReLU that follows a tensor, or the tensor itself."""
     at = tensor
     for _ in range(4):
         if (node := _find_reader(at, readers, "Relu")) is not None:

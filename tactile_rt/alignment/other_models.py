@@ -144,8 +144,8 @@ def fit_loads(stimuli: StimuliInput, shape: Sequence[int | str | None], what: st
 
     Args:
         shape: the input's shape, batch first; an axis of any length is not a number. The other axes
-            are time, elements and channels in any order; or time and both flattened; or all
-            flattened.
+            are time, elements and channels in any order; or time, and the last two flattened; or
+            all three flattened.
         what: the file and the input, for error messages.
 
     Raises:

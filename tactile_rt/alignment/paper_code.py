@@ -45,7 +45,7 @@ def freeze_paper_code(
         rates: (row, 6, unit) per animal, in the published layout.
 
     Raises:
-        ConfigError: no animal has an RDM. If only some animals lack it, they are left out, noted.
+        ConfigError: no animal has an RDM. Single animals without RDM are left out, with a note.
     """
     steps = 2 * len(rates) + 1
     targets: list[Target] = []

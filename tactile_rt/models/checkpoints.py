@@ -63,7 +63,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def network_of(path: Path) -> dict[str, Any]:
-    """Read the network's options from a checkpoint, as a training configuration names them."""
+    """Read a network's options from a checkpoint, for use in a training configuration."""
     network = describe_checkpoint(path)["network"]
     return {key: value for key, value in network.items() if key in NETWORK}
 

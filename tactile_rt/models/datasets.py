@@ -48,7 +48,7 @@ class SweepSet:
 
     @classmethod
     def read(cls, folder: Path, split: str) -> "SweepSet":
-        """Read a split of the sweep set in a folder, with its manifest."""
+        """Read a split of the sweep set in a folder."""
         return cls.read_known(folder, SweepManifest.read(folder), split)
 
     @classmethod
@@ -96,7 +96,7 @@ class SweepSet:
 
     @property
     def refusals(self) -> tuple[str, ...]:
-        """Labels that are no categories: "unknown" and faults, as far as training has examples."""
+        """Labels other than categories: "unknown" and faults, if training has examples of them."""
         unknown = (UNKNOWN,) if (self.sweeps.labels < 0).any() else ()
         named = implausible(self.manifest.spec) if self.manifest.faults.implausible else ()
         return (*unknown, *named)

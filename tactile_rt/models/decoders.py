@@ -69,7 +69,7 @@ class MLPDecoder(nn.Sequential):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Map the features (batch, feature) of one step to (batch, unit), and an empty state."""
+        """Map one step's features (batch, feature) to an embedding (batch, unit), and no state."""
         return self.embed(features), {}
 
 
@@ -121,7 +121,7 @@ class MLPAllDecoder(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Map the features (batch, feature) of step `index` (batch,) to (batch, unit) and a state.
+        """Map features (batch, feature) of step `index` (batch,) to an embedding and a state.
 
         Features of steps beyond the decoder's number of steps are ignored.
         """

@@ -75,7 +75,7 @@ class TactileClassifier(nn.Module):
         return Timing(config.max_steps, config.frame[0] // len(self.inputs.clip))
 
     def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
-        """Map samples (batch, step, sub-step, element, channel), SI, to (batch, step, class)."""
+        """Map samples (batch, step, sub-step, element, channel) to logits (batch, step, class)."""
         logits: Tensor = self.network(self.inputs(samples, offset, sigma))
         return logits
 

@@ -20,7 +20,7 @@ from tactile_rt.alignment.rdm import Floats, pearson, upper
 
 
 def crossnobis(animal: Animal) -> Measure:
-    """Prepare the correlation of a layer's distances with an animal's crossnobis distances."""
+    """Prepare a measure: the correlation of a layer's distances with an animal's crossnobis."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING

@@ -25,7 +25,7 @@ def sessions_of(animal: Animal) -> tuple[NeuralSession, ...]:
 
 
 def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
-    """Return the number of bins that enough trials of each stimulus reach, 0 without courses."""
+    """Return the number of bins that enough trials reach in all sessions; 0 without courses."""
     reached = [LONGEST]
     for session in sessions:
         if session.course is None:
@@ -45,7 +45,7 @@ def values_of(session: NeuralSession, bins: int) -> Floats:
 
 
 def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.bool_]:
-    """Divide a session's trials at random into halves: (division, trial), True for half 1."""
+    """Draw random halves of a session's trials: masks (division, trial), True for half 1."""
     rng = np.random.default_rng([SEED, len(session.stimulus)])
     first = np.zeros((number, len(session.stimulus)), dtype=np.bool_)
     for stimulus in range(len(session.stimuli)):

@@ -24,12 +24,12 @@ NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # for too few trial
 
 
 def rsa(animal: Animal) -> Measure:
-    """Prepare the RSA of a layer with an animal, from responses averaged over time."""
+    """Prepare a measure: the RSA of a layer and an animal, from time-averaged responses."""
     return _compare_means(animal, rdm, pearson)
 
 
 def rsa_time(animal: Animal) -> Measure:
-    """Prepare the RSA of a layer with an animal, averaged over bins of 45 ms."""
+    """Prepare a measure: the RSA of a layer and an animal, averaged over time bins."""
     found = time_course(animal)
     if found is None:
         return NOTHING
@@ -64,7 +64,7 @@ def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
 
 
 def cka(animal: Animal) -> Measure:
-    """Prepare the U-centred kernel alignment (CKA) of a layer with an animal."""
+    """Prepare a measure: the U-centred CKA of a layer and an animal's time-averaged responses."""
     return _compare_means(animal, u_centred, cosine)
 
 

@@ -61,7 +61,7 @@ class Cell(nn.Module):
                 norm._optim = {"stacked": True}  # type: ignore[attr-defined]
 
     def drive(self, x: Tensor) -> Tensor | None:
-        """Return W*x + b, for one or many steps; None if the cell uses none."""
+        """Return the gates' input W*x + b, of one or many steps; None if unused."""
         return convolve(self.conv.weight[..., : self.channels], self.conv.bias, x)
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
@@ -71,7 +71,7 @@ class Cell(nn.Module):
     def convolve_gates(self, x: Tensor, recurrent: Tensor, drive: Tensor | None) -> Tensor:
         """Return the gates (..., gate * channel) before the non-linearity, in the state's type.
 
-        So autocast rounds the convolutions, but not the state.
+        Autocast rounds the convolutions, but the state keeps its precision.
         """
         if drive is None:
             gates = self.conv(x, recurrent)

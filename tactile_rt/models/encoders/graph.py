@@ -135,7 +135,7 @@ class Graph:
 
     @property
     def remaining(self) -> dict[str, int]:
-        """Number of edges from each node to the readout; the frame's edges do not count."""
+        """Length of the shortest path from each part to the readout, without frame edges."""
         distance = {self.readout: 0}
         nodes = {node.name: node for node in self.nodes}
         queue = [self.readout]

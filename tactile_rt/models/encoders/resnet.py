@@ -58,7 +58,7 @@ class ConvNorm(nn.Module):
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
+        """Map x (frame, site in * inputs) to (frame, site out * outputs)."""
         y = F.linear(x, self.matrix())  # (frame, site out * outputs)
         y = self.norm(y.view(-1, len(self.weight)))  # statistics over frames and sites
         out: Tensor = y.view(len(x), -1)
@@ -92,7 +92,7 @@ class ResidualBlock(nn.Module):
         self.shortcut = None if same else ConvNorm(inputs, outputs, 1, stride, shape)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
+        """Map x (frame, site in * inputs) to (frame, site out * outputs)."""
         short = x if self.shortcut is None else self.shortcut(x)
         out: Tensor = F.relu(short + self.second(F.relu(self.first(x))))
         return out

@@ -45,13 +45,13 @@ class Record:
 def record_share(
     name: str, estimate: "Interval", bar: str, how: str, unit: str = "%", beside: str = ""
 ) -> Record:
-    """Make a model's record of a share (0 to 1), in percent, with its interval."""
+    """Return a `Record` of a model's share (0 to 1), in percent, with its interval."""
     interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
     return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
 
 
 def record_count(name: str, estimate: "Interval", how: str) -> Record:
-    """Make a model's record of a mean number, with its interval."""
+    """Return a `Record` of a model's mean number, with its interval."""
     interval = f"95 % interval {estimate.low:.1f} to {estimate.high:.1f}, by object"
     return Record(f"models.{name}", estimate.value, "", "", interval, how)
 

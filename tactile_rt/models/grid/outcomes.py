@@ -90,7 +90,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def saw_nothing(trials: Sequence[Training], chance: float) -> bool:
-    """Return whether trials cannot rank learning rates: all near chance, or all equal."""
+    """Return whether trials' scores are all near chance or equal, so rank no learning rates."""
     scores = [trial.score for trial in trials if not trial.diverged]
     if not scores:
         return False  # all diverged, as longer trials would
@@ -128,7 +128,7 @@ def runs_of(folder: Path, task: Task) -> Path:
 
 
 def read_point(path: Path, key: str) -> Training | None:
-    """Read the result of a training, None if unfinished; refuse settings other than `key`."""
+    """Read a training's result, None if unfinished; raise if its settings are not `key`."""
     if not path.exists():
         return None
     found = _decode(path, Training, f"delete {path.parent}")
@@ -141,7 +141,7 @@ def read_point(path: Path, key: str) -> Training | None:
 
 
 def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
-    """Read a task's outcome, None if unfinished; refuse an outcome of other settings."""
+    """Read a task's outcome, None if unfinished; raise if its settings are not the grid's."""
     path = outcome_path(folder, task)
     if not path.exists():
         return None

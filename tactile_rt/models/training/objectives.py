@@ -342,9 +342,9 @@ class Autoencoder(Objective):
 class Predictive(Objective):
     """Predictive objective: a linear layer predicts the next four frames from each step's features.
 
-    A causal network reads no later steps, so no masking is needed; masked steps are predicted too.
-    The loss is the mean squared error of the normalised frames, over all predictions within the
-    window from steps that an input has reached.
+    A causal network reads no later steps, so the targets are hidden; masked steps are predicted
+    too. The loss is the mean squared error of the normalised frames, over all predictions within
+    the window from steps that an input has reached.
     """
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:

@@ -28,7 +28,7 @@ KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A recipe file.
+    """The content of a recipe file: values of a training's options, and values to search.
 
     Attributes:
         train: Values of fields of `TrainingConfig`, by name.
