@@ -189,7 +189,7 @@ def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
 
 
 def _convert_to_layer(animal: Animal) -> Floats:
-    """Return an animal's mean responses (stimulus, bin, unit) as a layer for other animals."""
+    """Return an animal's mean responses (stimulus, bin, unit), to be scored as a layer."""
     sessions = sessions_of(animal)
     means = means_of(sessions, bins_of(sessions))
     return np.repeat(means, LONGEST, axis=1) if means.shape[1] == 1 else means

@@ -115,7 +115,7 @@ TARGET_PARTS = ("all", *LAYERS_UM, *CELLS)
 
 
 def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
-    """Return animals with only the units of one part of cortex, without empty animals.
+    """Select the units of one part of cortex; animals without such units are left out.
 
     The borders of layers are those of `LAYERS_UM`, though they differ between mice: units near a
     border are assigned by depth alone.

@@ -221,7 +221,7 @@ def join_sets(sets: Sequence[SweepSet]) -> SweepSet:
 
 
 def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
-    """Return the sweeps' values padded to `lead` samples before the touch and `after` from then."""
+    """Return values padded to `lead` samples before the touch and `after` samples from then on."""
     own, samples = data.manifest.lead, data.sweeps.values.shape[1]
     if (own, samples) == (lead, lead + after):
         return data.sweeps.values

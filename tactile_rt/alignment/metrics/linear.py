@@ -24,7 +24,7 @@ PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel
 
 
 def linear(animal: Animal) -> Measure:
-    """Prepare a measure: the animal's share of variance that a layer predicts for held-out stimuli."""
+    """Prepare a measure: the share of variance that a layer predicts for held-out stimuli."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING

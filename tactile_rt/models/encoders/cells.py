@@ -122,7 +122,7 @@ class VanillaCell(Cell):
 
 
 class VanillaELUCell(VanillaCell):
-    """Vanilla cell of the published code, with ELU. Layer norm ("-ln") is the default there."""
+    """Vanilla cell with ELU in place of tanh, from the published code. Its default is "-ln"."""
 
     elu = True
 

@@ -20,7 +20,7 @@ def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
 
 
 def conditions(data: SweepSet) -> dict[str, Disturbance]:
-    """Return the disturbances to test by name; the name states amounts for the set's sensor."""
+    """Return the disturbances to test, by names that state amounts for the set's sensor."""
     rated, whiskers = rated_amount(data), len(data.manifest.spec.elements)
     found = {
         "noise at a quarter of the rated": Disturbance(noise=0.25),

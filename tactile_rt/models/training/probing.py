@@ -150,7 +150,7 @@ def _extract(
 
 
 def _extract_clean(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[Tensor, Tensor]:
-    """Return features and labels of the noise-free sweeps in which contact is detected."""
+    """Return features and labels of the sweeps, without added noise, that show contact."""
     found = data.onsets(data.sweeps.values)
     usable = torch.from_numpy(found.start >= 0).nonzero().flatten()
     if not len(usable):
